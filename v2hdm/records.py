@@ -1,13 +1,8 @@
 """The records that travel between the parts: plain frozen dataclasses over numpy arrays.
 
-Frames are those of :mod:`v2hdm.geometry`: ``map`` (ENU, metres, z up, ground near
-z = 0), ``vehicle`` (x forward, y left, z up, origin on the ground under the rear axle), ``cam``
-(optical: z forward, x right, y down), ``px`` (u right, v down, the centre of the top-left pixel
-is (0, 0)). Transforms are 4 x 4 float64 matrices named ``dst_from_src``. Image points come in two
-flavours: ``_px`` are pixels of the image as recorded, ``_pinhole_px`` are the same points with the
-lens distortion removed, on the pinhole image of the same intrinsic matrix.
-
-Index letters, everywhere: ``i`` image, ``j`` marking, ``k`` corner observation.
+Frames, names and index letters are those of :mod:`v2hdm.geometry`. Image points come in two flavours: ``_px``
+are pixels of the image as recorded, ``_pinhole_px`` the same points with the lens distortion removed, on the
+pinhole image of the same intrinsic matrix.
 """
 
 from __future__ import annotations
@@ -77,12 +72,11 @@ class CentrePrior:
 class Camera:
     """One camera of a drive: its intrinsics and what is roughly known of its mounting.
 
-    ``ipm`` maps a name (``calibrated``: from a manual calibration of this vehicle; ``estimated``:
-    borrowed from another vehicle) to a coarse IPM homography ``vehicle_from_pinhole_px`` (3 x 3).
-    ``initial_ipm`` names the one that the mapping starts from. ``roi_vehicle`` (N x 2, m) is the
-    convex polygon on the ground within which the IPM is trusted. ``linear_response`` says that the
-    grey values are proportional to radiance; otherwise sRGB coding is assumed. ``own_vehicle`` (height,
-    width) says which pixels show the vehicle itself, None where nobody has told.
+    ``ipm`` maps a name (``calibrated``: from a manual calibration of this vehicle; ``estimated``: borrowed
+    from another one) to a coarse IPM homography ``vehicle_from_pinhole_px`` (3 x 3); the mapping starts from
+    ``initial_ipm``. ``roi_vehicle`` (N x 2, m) is the convex polygon on the ground within which the IPM is
+    trusted. ``linear_response``: grey values are proportional to radiance; otherwise sRGB coding is assumed.
+    ``own_vehicle`` (height, width) says which pixels show the vehicle itself, None if unknown.
     """
 
     info: CameraInfo
@@ -111,7 +105,7 @@ class PoseNoise:
 
     Of each, ``..._drift_...`` is the part that changes only slowly, as RTK's errors do: a first-order
     Gauss-Markov process that fades to 1 / e over ``..._drift_over_m`` of driving. The rest, in quadrature, is
-    drawn anew at every image; without a drift all of it is.
+    drawn anew at every image.
     """
 
     position_m: float = 0.02
@@ -170,10 +164,8 @@ class Trajectory:
 class Road:
     """The recorded ground along the route, which the drive's poses have laid flat into z = 0.
 
-    Attributes:
-        points_map: (P, 2) m, places along the route in driving order.
-        height_m: (P,) recorded height of the ground there.
-        slope: (P, 2) its derivative by x and by y.
+    ``points_map`` (P, 2) m along the route in driving order, the ground's ``height_m`` (P,) and ``slope`` (P,
+    2) by x and y there.
     """
 
     points_map: FloatArray
@@ -185,8 +177,8 @@ class Road:
 class Image:
     """One image of a drive and the vehicle's pose (4 x 4) when it was taken.
 
-    ``stamp_s`` is its recorded time; ``clock_offset_s`` is how much later it was taken, as far as that is
-    known. ``visit`` is an index into ``Drive.visits``.
+    ``stamp_s`` is its recorded time, ``clock_offset_s`` how much later it was taken as far as known,
+    ``visit`` an index into ``Drive.visits``.
     """
 
     camera: str
@@ -222,12 +214,12 @@ class Visit:
 class Drive:
     """Everything the mapper may know of a drive; images are sorted by visit, time, then camera.
 
-    ``truth_dir`` only tells the report where ground truth lies, if there is any. ``trajectory`` holds the
-    poses that those of the images were interpolated from, at the receiver's rate, with the road laid flat;
-    ``recorded`` the same poses as they were recorded. ``road`` is the recorded ground, None where it was
-    recorded as the plane z = 0. ``unposed`` counts, by camera, the images left out for want of a pose.
-    ``joined`` are the drives that it was made of (:func:`v2hdm.io.drive.join.join_drives`), empty for one that
-    was recorded in one piece; a joined drive has no trajectory of its own, and the largest of each noise.
+    ``truth_dir`` only tells the report where ground truth lies. ``trajectory`` holds the poses at the
+    receiver's rate that those of the images were interpolated from, with the road laid flat; ``recorded`` the
+    same as recorded. ``road`` is the recorded ground, None for the plane z = 0. ``unposed`` counts, by
+    camera, the images left out for want of a pose. ``joined`` are the drives that it was made of
+    (:func:`v2hdm.io.drive.join.join_drives`), if any: a joined drive has no trajectory of its own, and the
+    largest of each noise.
     """
 
     name: str
@@ -259,14 +251,13 @@ class Drive:
 class MarkingDetection:
     """One quadrilateral marking in one image.
 
-    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, which is also how
-    they run on the screen (in (u, v) coordinates their shoelace area is negative, since v points
-    down); which corner comes first is arbitrary.
-    ``covariance_px`` (8, 8) is that of the stacked corners (u0, v0, u1, ...), px^2: of a direction that the
-    image hides it is large, as along a dash whose end lies beyond the image's border. ``corner_valid`` (4,)
+    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, which is also how they run on
+    the screen (their shoelace area in (u, v) is negative, since v points down); which comes first is
+    arbitrary. ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is large in a
+    direction that the image hides, as along a dash whose end lies beyond the border. ``corner_valid`` (4,)
     says which corners are points: known well in every direction.
 
-    Symbols, as arrows and chevrons, are no quadrilaterals: of their corners, all nan, none is valid, and
+    Symbols, as arrows and chevrons, are no quadrilaterals: their corners are nan and not valid, and
     ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals.
     """
 
@@ -307,11 +298,11 @@ class ImageDetections:
 class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
-    ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
-    ``relative_sigma_m`` is what the marking contributes to the error of a distance to one about 10 m away,
-    one standard deviation a coordinate: without the drift and the survey that both share. None if unknown.
-    ``heights_m`` (4,) are the recorded heights of the ground there, None where it was recorded as z = 0.
-    ``id`` is positive and no other feature's of its map; None until the map is written.
+    ``covariance_m2`` (8, 8) is that of the stacked corners, None if unknown. ``relative_sigma_m`` is what the
+    marking contributes to the error of a distance to one about 10 m away, one standard deviation a
+    coordinate: without the drift and the survey that both share. ``heights_m`` (4,) are the recorded heights
+    of the ground, None where it was recorded as z = 0. ``id`` is positive and no other feature's of its map;
+    None until the map is written.
     """
 
     kind: str
@@ -327,9 +318,8 @@ class Marking:
 class Symbol:
     """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
 
-    ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter. ``heights_m``
-    (N,) are the recorded heights of the ground there, None where it was recorded as z = 0. ``id`` is positive
-    and no other feature's of its map; None until the map is written.
+    ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter; ``heights_m``
+    (N,) and ``id`` are as a :class:`Marking` has them.
     """
 
     kind: str
@@ -344,8 +334,7 @@ class Symbol:
 class Lane:
     """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
 
-    ``heights_m`` (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
-    ``id`` is positive and no other feature's of its map; None until the map is written.
+    ``heights_m`` (N,) and ``id`` are as a :class:`Marking` has them.
     """
 
     kind: str
@@ -359,9 +348,8 @@ class Lane:
 class HdMap:
     """Markings, lanes and symbols of a site in its map frame.
 
-    ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None where
-    it is not known. ``largest_id`` is the largest id that was ever given, also to what is gone; 0 where it
-    is a feature's.
+    ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None if
+    unknown; ``largest_id`` the largest id ever given, also to what is gone, 0 where it is a feature's.
     """
 
     markings: tuple[Marking, ...]
@@ -388,18 +376,11 @@ class Fate(Enum):
 class Change:
     """One marking that is not what the earlier map says, and the evidence.
 
-    Attributes:
-        id: in the map; that of a vanished one is never given again.
-        kind: its class.
-        fate: what became of it.
-        before: corners (4, 2) in the earlier map's place for it, m; None if it had none.
-        after: corners (4, 2) now; None if it is gone.
-        shift_m: (2,) how far its centre moved beyond what the two maps are apart there; None if it did not.
-        shift_sigma_m: (2,) of that.
-        probability: of its fate.
-        views: images of the drive that had its place in near view; of a new one, images of the earlier drive.
-        found: in how many of them it was found.
-        sightings: images that show it, of the map that has it.
+    ``id``, ``kind`` and ``fate`` of the marking; its corners ``before`` and ``after`` (4, 2), None where
+    there was or is none; how far its centre moved, ``shift_m`` (2,), beyond what the maps are apart there,
+    and that shift's sigma. ``probability`` is that of its fate; ``views`` images of the drive (of a new one,
+    of the earlier drive) had its place in near view and ``found`` of them showed it; ``sightings`` are of the
+    map that has it.
     """
 
     id: int
@@ -417,10 +398,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Changes:
-    """An earlier map against a new drive.
+    """An earlier map against a new drive: the ``changes``, and how many markings are the ``same``.
 
-    ``changes`` are the markings that are not the same any more, ``same`` counts those seen again in their
-    places. ``shift_m`` (2,) is how far the drive's own map lay from the earlier one, as a mean.
+    ``shift_m`` (2,) is how far the drive's own map lay from the earlier one, as a mean.
     """
 
     changes: tuple[Change, ...]
@@ -436,9 +416,9 @@ class Changes:
 class Truth:
     """Ground truth of a rendered drive. Only the report reads it; the mapper never does.
 
-    ``map_from_vehicle`` (I, 4, 4) are the true poses, one per ``Drive.images``. ``visibility`` (I, J)
-    is the fraction of marking j (an index into ``map.markings``) that image i shows, unoccluded.
-    ``lane_visible`` holds per lane a flag per vertex: seen by some camera of the drive.
+    ``map_from_vehicle`` (I, 4, 4) are the true poses, one per ``Drive.images``. ``visibility`` (I, J) is the
+    fraction of marking j of ``map.markings`` that image i shows, unoccluded. ``lane_visible`` flags, per
+    lane, the vertices seen by some camera of the drive.
     """
 
     map: HdMap
@@ -453,8 +433,8 @@ class Truth:
 class Calibration:
     """Where one camera sits: ``cam_from_vehicle`` (4 x 4).
 
-    ``covariance`` (6, 6) is that of the left-perturbation tangent of ``cam_from_vehicle``, in the
-    order translation (m), rotation (rad); None where the method has none.
+    ``covariance`` (6, 6) is that of its left-perturbation tangent, translation (m) then rotation (rad); None
+    if unknown.
     """
 
     info: CameraInfo

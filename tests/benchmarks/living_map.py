@@ -25,8 +25,8 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import join_drives, read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.mapping.changes.update import Base
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader, read_base
@@ -36,6 +36,7 @@ from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import AlteredConfig, RouteConfig, YardConfig
 from v2hdm.simulate.port.paint import Alteration
+from v2hdm.site.changes import Base
 
 CACHE = Path("~/.cache/v2hdm/living").expanduser()
 

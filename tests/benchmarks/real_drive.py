@@ -26,15 +26,15 @@ import numpy as np
 
 from tests.benchmarks.real_reference import Painted, Reference, centre_of_area, make_reference
 from tests.benchmarks.real_view import View, shaded_share
+from v2hdm.association.ground import views_of
+from v2hdm.association.sightings import collect_sightings, frames_of
 from v2hdm.detection.batch import detect_all, read_image
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import draw_detections
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.mapping.markings.conclude import Optimised
+from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings.table import collect_sightings, frames_of
-from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import (
     ARROW,
     LANE_DASH,

@@ -24,13 +24,13 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping.markings.relative import neighbours
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking, PoseNoise, Truth
 from v2hdm.report.metrics import match_markings
 from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.site.markings import neighbours
 
 QUANTITIES = ("corners", "sides", "distances", "height", "roll", "pitch", "yaw")
 CACHE = Path("~/.cache/v2hdm/uncertainty").expanduser()

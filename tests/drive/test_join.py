@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from tests.drive.example import make_drive
+from v2hdm.association.sightings import frames_of
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.drive import join_drives, read_drive, with_clock_offsets
-from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.records import Drive, GeodeticOrigin, PoseNoise
 
 ORIGIN = GeodeticOrigin(50.0, 8.0, 120.0)

@@ -13,7 +13,7 @@ from v2hdm.geometry.rigid import (
     rotation_from_quaternion,
     slerp,
 )
-from v2hdm.io.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import FloatArray, Trajectory
 
 SEEDS = st.integers(0, 2**32 - 1)

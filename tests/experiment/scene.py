@@ -50,7 +50,7 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
         "expected": {name: [True] * 5 for name in maps},
         "maps": maps,
         "lanes": {"Opt": [[[0.0, 1.01], [20.0, 1.01]]]},
-        "growth": {"ours": {"Opt": steps, "CNI": steps, "ENI": steps}, "incremental": {"Opt": steps}},
+        "growth": {"incremental": {"Opt": steps, "CNI": steps, "ENI": steps}},
         "extrinsics": {"ours": found, "paper": found},
         "residuals": {
             "front": {"field": {"size_px": [640, 480], "before": field, "after": field}, "range": bins}

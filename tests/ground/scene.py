@@ -11,7 +11,7 @@ import numpy as np
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import (
     Camera,
     CameraInfo,

@@ -7,7 +7,7 @@ gets a :class:`v2hdm.records.Drive` and detections.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from v2hdm.records import (
     CentrePrior,
     Drive,
     FloatArray,
+    HdMap,
     Image,
     ImageDetections,
     Lane,
@@ -264,3 +265,42 @@ def _detection(
     shift = int(rng.integers(4))
     covariance = np.eye(8) * options.pixel_sigma**2
     return MarkingDetection(kind, 0.9, np.roll(noisy, shift, axis=0), covariance, np.roll(valid, shift))
+
+
+MATCH_M = 0.3
+"""How far apart, m, a mapped and a true marking are one."""
+
+
+def match(hd_map: HdMap, truth: list[Marking], gate_m: float) -> tuple[list[tuple[int, int]], float]:
+    """Pairs (mapped, true) of nearest centres within the gate, and the corner RMSE over them."""
+    centres = np.array([m.corners_map.mean(axis=0) for m in truth])
+    pairs, squared = [], []
+    for a, mapped in enumerate(hd_map.markings):
+        distance = np.linalg.norm(centres - mapped.corners_map.mean(axis=0), axis=1)
+        b = int(distance.argmin())
+        if distance[b] <= gate_m and truth[b].kind == mapped.kind:
+            errors = [np.roll(mapped.corners_map, s, axis=0) - truth[b].corners_map for s in range(4)]
+            pairs.append((a, b))
+            squared.append(min(np.sum(error**2) / 4 for error in errors))
+    return pairs, float(np.sqrt(np.mean(squared)))
+
+
+def rotation_error_deg(a: np.ndarray, b: np.ndarray) -> float:
+    cosine = (np.trace(a[:3, :3] @ b[:3, :3].T) - 1) / 2
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
+
+
+MOVED = {3: (0.1, 0.02), 7: (-0.25, 0.1), 12: (0.4, 0.5), 16: (0.0, -0.9)}
+REMOVED = (5, 10, 14, 21)
+ADDED = ((14.0, 3.0), (30.0, 9.5), (22.0, 6.0))
+DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
+
+
+def repainted(markings: list[Marking]) -> list[Marking]:
+    """Some diamonds moved, some removed, some added."""
+    out = [
+        replace(one, corners_map=one.corners_map + MOVED.get(k, (0.0, 0.0)))
+        for k, one in enumerate(markings)
+        if k not in REMOVED
+    ]
+    return out + [Marking("diamond", DIAMOND + place, 0) for place in ADDED]

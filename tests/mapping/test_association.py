@@ -8,15 +8,21 @@ import numpy as np
 import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.association.ground import Located, locate
+from v2hdm.association.groups import (
+    Association,
+    FusedGroups,
+    fuse_groups,
+    keep_rows,
+    merge_groups,
+    same_groups,
+)
+from v2hdm.association.options import AssociationOptions
+from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.geometry.quadrilateral import align
-from v2hdm.mapping.association.groups import Association, FusedGroups, fuse_groups, keep_rows, same_groups
-from v2hdm.mapping.association.merge import merge_groups
-from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
+from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.mapping.optimise import initial_rig
-from v2hdm.mapping.options import AssociationOptions
-from v2hdm.mapping.sightings.location import Located, locate
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 
 MAX_RANGE_M = 16.0
 
@@ -168,3 +174,19 @@ def test_merging_no_groups_gives_none(scene: Scene, sightings: Sightings) -> Non
     )
     assert merged.count == 0
     assert (merged.group == -1).all()
+
+
+def test_a_steady_turn_has_one_twist_everywhere() -> None:
+    """5 m/s on a circle of 10 m radius: half a radian a second to the left."""
+    stamp_s = np.array([0.0, 0.2, 0.5, 0.6, 1.0])
+    heading = 0.5 * stamp_s
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 0], poses[:, 0, 1] = np.cos(heading), -np.sin(heading)
+    poses[:, 1, 0], poses[:, 1, 1] = np.sin(heading), np.cos(heading)
+    poses[:, 0, 3], poses[:, 1, 3] = 10 * np.sin(heading), 10 * (1 - np.cos(heading))
+    expected = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.5], (5, 1))
+    np.testing.assert_allclose(vehicle_twists(poses, stamp_s), expected, atol=1e-9)
+
+
+def test_a_single_pose_stands_still() -> None:
+    np.testing.assert_array_equal(vehicle_twists(np.eye(4)[None], np.zeros(1)), np.zeros((1, 6)))

@@ -8,35 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.mapping.scene import Scene, SceneOptions, make_scene
-from tests.mapping.test_methods import match
+from tests.mapping.scene import (
+    ADDED,
+    DIAMOND,
+    MOVED,
+    REMOVED,
+    Scene,
+    SceneOptions,
+    make_scene,
+    match,
+    repainted,
+)
 from v2hdm.errors import MappingError
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.mapping.changes.decide import Decision, Watched, decide
-from v2hdm.mapping.changes.field import Errors
-from v2hdm.mapping.changes.fuse import fused_markings
-from v2hdm.mapping.changes.lanes import updated_lanes
-from v2hdm.mapping.changes.update import Base
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Changes, Fate, Lane, Marking
-
-MOVED = {3: (0.1, 0.02), 7: (-0.25, 0.1), 12: (0.4, 0.5), 16: (0.0, -0.9)}
-REMOVED = (5, 10, 14, 21)
-ADDED = ((14.0, 3.0), (30.0, 9.5), (22.0, 6.0))
-DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
-
-
-def repainted(markings: list[Marking]) -> list[Marking]:
-    """Some diamonds moved, some removed, some added."""
-    out = [
-        replace(one, corners_map=one.corners_map + MOVED.get(k, (0.0, 0.0)))
-        for k, one in enumerate(markings)
-        if k not in REMOVED
-    ]
-    return out + [Marking("diamond", DIAMOND + place, 0) for place in ADDED]
+from v2hdm.site.changes import Base, fused_markings
+from v2hdm.site.fates import Decision, Watched, decide
+from v2hdm.site.map_errors import Errors, updated_lanes
 
 
 def base_of(result: MethodResult, folder: Path) -> Base:

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.mapping.scene import SceneOptions, make_scene
+from v2hdm.association.ground import views_of
+from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.bundle import full_model, solve_bundle
-from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, SizeOptions, check_options
-from v2hdm.mapping.sightings.table import collect_sightings
-from v2hdm.mapping.sightings.views import views_of
+from v2hdm.mapping.stated import known_lengths
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 SIZES = SizeOptions(by_class_m={DIAMOND: [1.2, 0.6], LANE_DASH: [3.0, 0.15]})

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.mapping.lanes.fuse import map_lanes
-from v2hdm.mapping.lanes.points import Guides, LaneCloud
-from v2hdm.mapping.options import LaneOptions
 from v2hdm.records import FloatArray, Lane
+from v2hdm.site.lane_points import Guides, LaneCloud
+from v2hdm.site.lanes import map_lanes
+from v2hdm.site.options import LaneOptions
 
 OPTIONS = LaneOptions()
 

@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mapping.scene import Scene, SceneOptions, make_scene
+from tests.mapping.scene import MATCH_M, Scene, SceneOptions, make_scene, match, rotation_error_deg
 from v2hdm.errors import ConfigError, MappingError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import HdMap, Marking
-
-MATCH_M = 0.3
 
 
 @pytest.fixture(scope="module")
@@ -24,26 +21,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def results(scene: Scene) -> dict[str, MethodResult]:
-    return run_methods(scene.drive, scene.detections, ("front", "rear"), growth_steps=4)
-
-
-def match(hd_map: HdMap, truth: list[Marking], gate_m: float) -> tuple[list[tuple[int, int]], float]:
-    """Pairs (mapped, true) of nearest centres within the gate, and the corner RMSE over them."""
-    centres = np.array([m.corners_map.mean(axis=0) for m in truth])
-    pairs, squared = [], []
-    for a, mapped in enumerate(hd_map.markings):
-        distance = np.linalg.norm(centres - mapped.corners_map.mean(axis=0), axis=1)
-        b = int(distance.argmin())
-        if distance[b] <= gate_m and truth[b].kind == mapped.kind:
-            errors = [np.roll(mapped.corners_map, s, axis=0) - truth[b].corners_map for s in range(4)]
-            pairs.append((a, b))
-            squared.append(min(np.sum(error**2) / 4 for error in errors))
-    return pairs, float(np.sqrt(np.mean(squared)))
-
-
-def rotation_error_deg(a: np.ndarray, b: np.ndarray) -> float:
-    cosine = (np.trace(a[:3, :3] @ b[:3, :3].T) - 1) / 2
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
+    return run_methods(scene.drive, scene.detections, ("front", "rear"))
 
 
 def test_every_method_ran(results: dict[str, MethodResult]) -> None:
@@ -109,16 +87,6 @@ def test_each_exclusion_has_a_place_and_a_reason(results: dict[str, MethodResult
     for exclusion in results["Opt"].excluded:
         assert np.isfinite(exclusion.position_map).all()
         assert exclusion.reason
-
-
-def test_growth_ends_at_the_whole_map(results: dict[str, MethodResult]) -> None:
-    growth = results["Opt"].growth
-    counts = [len(step.markings) for step in growth]
-    assert counts == sorted(counts)
-    assert counts[0] == 2
-    ends = np.stack([marking.corners_map for marking in growth[-1].markings])
-    whole = np.stack([marking.corners_map for marking in results["Opt"].hd_map.markings])
-    np.testing.assert_array_equal(np.sort(ends, axis=0), np.sort(whole, axis=0))
 
 
 def test_lanes_follow_their_lines(scene: Scene, results: dict[str, MethodResult]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2hdm.mapping.site_model.paint_error import PaintError, learn_paint_error
+from v2hdm.site.shapes import PaintError, learn_paint_error
 
 FORMAL = (0.001**2) * np.eye(5)
 

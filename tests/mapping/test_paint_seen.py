@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.mapping.scene import MOUNTS, extrinsic
+from v2hdm.association.ground import Views, easy_views
+from v2hdm.association.sightings import Rig
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.mapping.changes.paint import Paint, Pictures, learn_paint
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.views import Views, easy_views
 from v2hdm.records import Camera, CameraInfo, Marking
+from v2hdm.site.looks import Paint, Pictures, learn_paint
 
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])
 INFO = CameraInfo("front", 1280, 720, INTRINSIC, "plumb_bob", (-0.1, 0.02, 1e-4, -2e-4, 0.0))

@@ -9,16 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.mapping.scene import Scene, SceneOptions, make_scene
-from tests.mapping.test_methods import MATCH_M, match
-from v2hdm.mapping.association.attach import attach
-from v2hdm.mapping.association.groups import fuse_groups, in_view
+from tests.mapping.scene import MATCH_M, Scene, SceneOptions, make_scene, match
+from v2hdm.association.ground import locate, views_of
+from v2hdm.association.groups import attach, fuse_groups, in_view
+from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser, initial_rig
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings.location import locate
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
-from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import HdMap, ImageDetections, Marking, MarkingDetection
 
 CAMERAS = ("front", "rear")
@@ -83,6 +80,11 @@ def sightings(scene: Scene) -> Sightings:
     return collect_sightings(scene.drive, with_cut_dashes(scene, 1.0), CAMERAS)
 
 
+def optimiser_of(scene: Scene, sightings: Sightings, options: MappingOptions) -> Optimiser:
+    drive = scene.drive
+    return Optimiser(sightings, views_of(drive, CAMERAS), drive.cameras, drive.pose_noise, options)
+
+
 def test_corners_on_a_line_inform_and_are_no_points(sightings: Sightings) -> None:
     lines = sightings.informs & ~sightings.valid
     assert lines.any()
@@ -114,14 +116,7 @@ def test_a_dash_of_which_every_image_hides_an_end_is_mapped_as_a_whole(scene: Sc
 
 
 def test_a_line_that_no_image_ends_is_known_across_and_not_along(scene: Scene, sightings: Sightings) -> None:
-    drive = scene.drive
-    optimiser = Optimiser(
-        sightings,
-        views_of(drive, CAMERAS),
-        drive.cameras,
-        drive.pose_noise,
-        MappingOptions(rounds=1, pose_model="heave"),
-    )
+    optimiser = optimiser_of(scene, sightings, MappingOptions(rounds=1, pose_model="heave"))
     bundle = optimiser.settle(optimiser.initial_tracks())
     order = bundle.association.corner_order()
     point = np.zeros((bundle.association.count, 4), dtype=bool)
@@ -138,13 +133,7 @@ def test_a_line_that_no_image_ends_is_known_across_and_not_along(scene: Scene, s
 
 def test_a_corner_behind_the_camera_is_not_observed_by_its_line(scene: Scene, sightings: Sightings) -> None:
     rig = initial_rig(scene.drive.cameras, sightings.map_from_vehicle)
-    optimiser = Optimiser(
-        sightings,
-        views_of(scene.drive, CAMERAS),
-        scene.drive.cameras,
-        scene.drive.pose_noise,
-        MappingOptions(),
-    )
+    optimiser = optimiser_of(scene, sightings, MappingOptions())
     tracks, located = optimiser.initial_tracks(), locate(sightings, rig)
     usable = in_view(tracks, located, sightings, rig, 0.003)
     assert (usable <= located.informs).all()
@@ -168,13 +157,7 @@ def test_sides_without_ends_are_attached_to_the_dash_that_they_are_of(scene: Sce
     assert len(sightings) == len(whole)
     truth = np.stack([scene.cam_from_vehicle[name] for name in CAMERAS])
     rig = replace(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), cam_from_vehicle=truth)
-    optimiser = Optimiser(
-        sightings,
-        views_of(scene.drive, CAMERAS),
-        scene.drive.cameras,
-        scene.drive.pose_noise,
-        MappingOptions(),
-    )
+    optimiser = optimiser_of(scene, sightings, MappingOptions())
     tracks, located = optimiser.initial_tracks(), locate(sightings, rig)
     fused = fuse_groups(tracks, located, 0.002)
     found = attach(tracks, sightings, located, rig, fused, 0.002)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2hdm.mapping.markings.relative import neighbours, with_relative_sigma
 from v2hdm.records import FloatArray, Marking
+from v2hdm.site.markings import neighbours, with_relative_sigma
 
 SQUARE = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
 DRIFT_M, CORNER_M, PAINT_M = 0.05, 0.002, 0.006

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.mapping.site_model.class_shapes import learn_shapes
-from v2hdm.mapping.site_model.places import Counts, Places
-from v2hdm.mapping.site_model.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
-from v2hdm.mapping.site_model.verdict import Judged, judge
+from v2hdm.site.candidates import Candidates, Counts
+from v2hdm.site.markings import Classified, classify
+from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
+from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
 DASH = np.array([[1.5, 0.06], [-1.5, 0.06], [-1.5, -0.06], [1.5, -0.06]])
@@ -27,11 +27,11 @@ def painted(shapes: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.roll(one, int(rng.integers(4)), axis=0) for one in placed])
 
 
-def solved(true: np.ndarray, rng: np.random.Generator, sigma_m: float = 0.01) -> Places:
+def solved(true: np.ndarray, rng: np.random.Generator, sigma_m: float = 0.01) -> Candidates:
     """The markings as a drive would map them: each corner off by ``sigma_m``, all of it by 2 cm more."""
     corners = true + 0.02 * rng.standard_normal((len(true), 1, 2)) + sigma_m * rng.standard_normal(true.shape)
     block = sigma_m**2 * np.eye(8) + 0.02**2 * np.kron(np.ones((4, 4)), np.eye(2))
-    return Places(corners, np.tile(block, (len(true), 1, 1)))
+    return Candidates(corners, np.tile(block, (len(true), 1, 1)))
 
 
 def well_seen(count: int) -> Counts:
@@ -40,15 +40,17 @@ def well_seen(count: int) -> Counts:
     return Counts(ten, 4 * ten, 4 * ten, ten - 2, ten - 2, 0 * ten)
 
 
-def of_one_class(places: Places, counts: Counts | None = None) -> Posterior:
-    return posterior(places, np.zeros(len(places), dtype=np.int64), counts or well_seen(len(places)))
+def of_one_class(candidates: Candidates, counts: Counts | None = None) -> Posterior:
+    return posterior(
+        candidates, np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates))
+    )
 
 
-def without(places: Places, place: int, corners: list[int]) -> Places:
-    """The places, of which one has ``corners`` that nobody saw."""
-    seen, covariance = places.corners_map.copy(), places.covariance_m2.copy()
+def without(candidates: Candidates, place: int, corners: list[int]) -> Candidates:
+    """The candidates, of which one has ``corners`` that nobody saw."""
+    seen, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     seen[place, corners] = np.nan
-    return Places.seen(seen, covariance)
+    return Candidates.seen(seen, covariance)
 
 
 def shape_rmse(corners: np.ndarray, true: np.ndarray) -> float:
@@ -59,17 +61,17 @@ def shape_rmse(corners: np.ndarray, true: np.ndarray) -> float:
 
 def normalised(found: Posterior, true: np.ndarray) -> np.ndarray:
     """Squared errors (N,) of all eight coordinates, in the stated covariance."""
-    error = (found.places.corners_map - true).reshape(-1, 8, 1)
-    return (error.transpose(0, 2, 1) @ np.linalg.solve(found.places.covariance_m2, error))[:, 0, 0]
+    error = (found.candidates.corners_map - true).reshape(-1, 8, 1)
+    return (error.transpose(0, 2, 1) @ np.linalg.solve(found.candidates.covariance_m2, error))[:, 0, 0]
 
 
 @pytest.mark.parametrize("shape", [DIAMOND, DASH])
 def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape: np.ndarray) -> None:
     rng = np.random.default_rng(0)
     true = painted([shape] * 60, rng)
-    places = solved(true, rng, 0.02)
-    found = of_one_class(places)
-    assert shape_rmse(found.places.corners_map, true) < 0.7 * shape_rmse(places.corners_map, true)
+    candidates = solved(true, rng, 0.02)
+    found = of_one_class(candidates)
+    assert shape_rmse(found.candidates.corners_map, true) < 0.7 * shape_rmse(candidates.corners_map, true)
     assert normalised(found, true).mean() / 8 < 1.1
     assert (found.log_odds > 5).all()
 
@@ -78,33 +80,33 @@ def test_a_corner_that_nobody_saw_is_where_the_class_has_it() -> None:
     rng = np.random.default_rng(1)
     true = painted([DIAMOND] * 30, rng)
     found = of_one_class(without(solved(true, rng), 4, [2]))
-    assert np.linalg.norm(found.places.corners_map[4] - true[4], axis=1).max() < 0.08
+    assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
     assert normalised(found, true)[4] < 20
 
 
 def test_a_corner_on_a_known_line_is_found_along_it() -> None:
     rng = np.random.default_rng(2)
     true = painted([DASH] * 30, rng)
-    places = solved(true, rng)
+    candidates = solved(true, rng)
     side = true[4, 1] - true[4, 0]
     long = [0, 1, 2, 3] if np.linalg.norm(side) > 1 else [1, 2, 3, 0]
     along = (true[4, long[1]] - true[4, long[0]]) / 3.0
     for corner in (long[1], long[2]):
-        places.corners_map[4, corner] -= 1.2 * along
+        candidates.corners_map[4, corner] -= 1.2 * along
         rows = slice(2 * corner, 2 * corner + 2)
-        places.covariance_m2[4, rows, rows] += 5.0**2 * np.outer(along, along)
-    found = of_one_class(places)
-    assert np.linalg.norm(found.places.corners_map[4] - true[4], axis=1).max() < 0.08
+        candidates.covariance_m2[4, rows, rows] += 5.0**2 * np.outer(along, along)
+    found = of_one_class(candidates)
+    assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
     assert found.probability[4, OF_CLASS] > 0.5
 
 
 def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it() -> None:
     rng = np.random.default_rng(3)
     true = painted([DIAMOND] * 40, rng)
-    places = solved(true, rng)
-    places.corners_map[7, 2] += 0.4 * (true[7, 2] - true[7].mean(axis=0))
-    found = of_one_class(places)
-    assert np.linalg.norm(found.places.corners_map[7] - true[7], axis=1).max() < 0.08
+    candidates = solved(true, rng)
+    candidates.corners_map[7, 2] += 0.4 * (true[7, 2] - true[7].mean(axis=0))
+    found = of_one_class(candidates)
+    assert np.linalg.norm(found.candidates.corners_map[7] - true[7], axis=1).max() < 0.08
 
 
 def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_differ() -> None:
@@ -112,7 +114,7 @@ def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_d
     lengths = [1.0] * 34 + [0.9, 0.92, 0.94, 1.06, 1.08, 1.1]
     true = painted([DASH * [length, 1.0] for length in lengths], rng)
     found = of_one_class(solved(true, rng, 0.005))
-    sides = np.linalg.norm(np.diff(found.places.corners_map, axis=1), axis=2).max(axis=1)
+    sides = np.linalg.norm(np.diff(found.candidates.corners_map, axis=1), axis=2).max(axis=1)
     np.testing.assert_allclose(sides, 3.0 * np.array(lengths), atol=0.08)
     assert (normalised(found, true) < 25).all()
 
@@ -120,20 +122,20 @@ def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_d
 def test_a_worn_end_is_not_taken_for_the_end_of_the_paint() -> None:
     rng = np.random.default_rng(5)
     true = painted([DASH] * 60, rng)
-    places = solved(true, rng, 0.005)
+    candidates = solved(true, rng, 0.005)
     for worn in (10, 20, 30, 40):
         k = int(np.argmax(np.linalg.norm(np.roll(true[worn], -1, axis=0) - true[worn], axis=1)))
         for corner, other in ((k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)):
-            places.corners_map[worn, corner] += 0.12 * (true[worn, other] - true[worn, corner])
-    found = of_one_class(places)
-    error = np.linalg.norm(found.places.corners_map - true, axis=2)
-    assert (error < 3 * found.places.sigma_m).all()
+            candidates.corners_map[worn, corner] += 0.12 * (true[worn, other] - true[worn, corner])
+    found = of_one_class(candidates)
+    error = np.linalg.norm(found.candidates.corners_map - true, axis=2)
+    assert (error < 3 * found.candidates.sigma_m).all()
     assert (found.log_odds > 5).all()
 
 
-def moved_end(places: Places, place: int, along: float, slant: float = 0.0) -> None:
+def moved_end(candidates: Candidates, place: int, along: float, slant: float = 0.0) -> None:
     """Move one end of a dash outwards by ``along`` of its length, one of its corners by ``slant`` more."""
-    corners = places.corners_map[place]
+    corners = candidates.corners_map[place]
     k = int(np.argmax(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)))
     for corner, other, part in ((k, (k + 1) % 4, along), ((k + 3) % 4, (k + 2) % 4, along + slant)):
         corners[corner] += part * (corners[corner] - corners[other])
@@ -142,38 +144,38 @@ def moved_end(places: Places, place: int, along: float, slant: float = 0.0) -> N
 def test_a_piece_of_a_dash_is_not_taken_for_a_short_dash() -> None:
     rng = np.random.default_rng(15)
     true = painted([DASH] * 30, rng)
-    places = solved(true, rng, 0.005)
-    moved_end(places, 12, -0.7)
-    found = of_one_class(places)
-    assert (np.linalg.norm(found.places.corners_map - true, axis=2) < 3 * found.places.sigma_m).all()
+    candidates = solved(true, rng, 0.005)
+    moved_end(candidates, 12, -0.7)
+    found = of_one_class(candidates)
+    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
 def test_an_end_that_runs_on_into_a_slanted_stroke_is_no_end() -> None:
     rng = np.random.default_rng(16)
     true = painted([DASH] * 30, rng)
-    places = solved(true, rng, 0.005)
-    moved_end(places, 12, 0.15, 0.04)
-    found = of_one_class(places)
-    assert (np.linalg.norm(found.places.corners_map - true, axis=2) < 3 * found.places.sigma_m).all()
+    candidates = solved(true, rng, 0.005)
+    moved_end(candidates, 12, 0.15, 0.04)
+    found = of_one_class(candidates)
+    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
 def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape() -> None:
     rng = np.random.default_rng(17)
     true = painted([DIAMOND] * 60, rng)
-    places = solved(true, rng, 0.01)
+    candidates = solved(true, rng, 0.01)
     shift = 0.1 * (true[12, 1] - true[12, 0])
-    places.corners_map[12, 0] += shift
-    places.corners_map[12, 2] -= shift
-    found = of_one_class(places)
-    assert (np.linalg.norm(found.places.corners_map - true, axis=2) < 3 * found.places.sigma_m).all()
+    candidates.corners_map[12, 0] += shift
+    candidates.corners_map[12, 2] -= shift
+    found = of_one_class(candidates)
+    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
 def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it() -> None:
     rng = np.random.default_rng(6)
     true = painted([DIAMOND] * 30, rng)
     found = of_one_class(without(solved(true, rng), 4, [0, 1]))
-    assert found.places.sigma_m[4].max() > 0.15
-    assert found.places.sigma_m[[3, 5]].max() < 0.1
+    assert found.candidates.sigma_m[4].max() > 0.15
+    assert found.candidates.sigma_m[[3, 5]].max() < 0.1
 
 
 def test_one_end_says_nothing_of_the_other_where_lengths_differ() -> None:
@@ -181,7 +183,7 @@ def test_one_end_says_nothing_of_the_other_where_lengths_differ() -> None:
     true = painted([DASH * [(1.0, 0.8)[k % 2], 1.0] for k in range(40)], rng)
     ends = np.argsort(np.linalg.norm(true[4] - true[4, 0], axis=1))[2:].tolist()
     found = of_one_class(without(solved(true, rng, 0.005), 4, ends))
-    assert found.places.sigma_m[4].max() > 0.15
+    assert found.candidates.sigma_m[4].max() > 0.15
 
 
 def test_a_class_may_have_several_shapes() -> None:
@@ -195,30 +197,30 @@ def test_a_class_may_have_several_shapes() -> None:
 def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelograms() -> None:
     rng = np.random.default_rng(9)
     true = painted([DIAMOND * rng.uniform(0.5, 2.0) for _ in range(12)], rng)
-    places = solved(true, rng, 0.02)
-    found = of_one_class(places)
-    corners = found.places.corners_map
+    candidates = solved(true, rng, 0.02)
+    found = of_one_class(candidates)
+    corners = found.candidates.corners_map
     closure = corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]
     assert np.linalg.norm(closure, axis=1).max() < 0.05
-    assert shape_rmse(corners, true) < shape_rmse(places.corners_map, true)
+    assert shape_rmse(corners, true) < shape_rmse(candidates.corners_map, true)
     assert (found.log_odds > 3).all()
 
 
 def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it() -> None:
     rng = np.random.default_rng(10)
-    places, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
+    candidates, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
     counts.found[7], counts.images[7] = 1, 3
-    assert of_one_class(places, counts).log_odds[7] > 2
+    assert of_one_class(candidates, counts).log_odds[7] > 2
 
 
-def odd_and_seldom() -> tuple[Places, Counts]:
-    """Forty places, of which number 7 is of no marking's shape and seen in three images of many."""
+def odd_and_seldom() -> tuple[Candidates, Counts]:
+    """Forty candidates, of which number 7 is of no marking's shape and seen in three images of many."""
     rng = np.random.default_rng(11)
-    places, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
-    places.corners_map[7] += rng.normal(0, 0.25, (4, 2))
+    candidates, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
+    candidates.corners_map[7] += rng.normal(0, 0.25, (4, 2))
     counts.found[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
     counts.observations[7], counts.agreeing[7] = 12, 8
-    return places, counts
+    return candidates, counts
 
 
 def test_what_has_no_shape_and_is_seldom_found_is_clutter() -> None:
@@ -256,45 +258,45 @@ class Told:
         return self.known
 
 
-def verdict(places: Places, counts: Counts | None = None) -> Judged:
-    told = Told(np.zeros(len(places), dtype=np.int64), counts or well_seen(len(places)))
-    return judge(places, told, AcceptanceOptions())
+def verdict(candidates: Candidates, counts: Counts | None = None) -> Classified:
+    told = Told(np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates)))
+    return classify(candidates, told, AcceptanceOptions())
 
 
 def test_reasons_name_what_has_won() -> None:
-    places, counts = odd_and_seldom()
+    candidates, counts = odd_and_seldom()
     counts.as_symbol[3] = 40
-    judged = verdict(without(places, 5, [0, 1, 2]), counts)
-    reasons = {place: reason for place, reason in enumerate(judged.verdict) if reason is not None}
+    classified = verdict(without(candidates, 5, [0, 1, 2]), counts)
+    reasons = {place: reason for place, reason in enumerate(classified.verdict) if reason is not None}
     assert set(reasons) == {3, 5, 7}
     assert reasons[3] == "part of a symbol, such as an arrow"
     assert reasons[5] == "a corner was never seen twice"
     assert reasons[7] in ("found in too few of its images", "not shaped like a marking of its class")
-    assert len(judged.markings()) == 37
-    assert [one.reason for one in judged.exclusions()] == list(reasons.values())
+    assert len(classified.markings()) == 37
+    assert [one.reason for one in classified.exclusions()] == list(reasons.values())
 
 
 def test_of_two_markings_on_one_spot_the_likelier_stays() -> None:
     rng = np.random.default_rng(14)
-    places, counts = solved(painted([DIAMOND] * 20, rng), rng), well_seen(20)
-    places.corners_map[2] = places.corners_map[1] + [0.1, 0.0]
+    candidates, counts = solved(painted([DIAMOND] * 20, rng), rng), well_seen(20)
+    candidates.corners_map[2] = candidates.corners_map[1] + [0.1, 0.0]
     counts.images[2] = 4
-    judged = verdict(places, counts)
-    assert [k for k, reason in enumerate(judged.verdict) if reason] == [2]
-    assert judged.verdict[2] == "lies on a better supported marking"
+    classified = verdict(candidates, counts)
+    assert [k for k, reason in enumerate(classified.verdict) if reason] == [2]
+    assert classified.verdict[2] == "lies on a better supported marking"
 
 
 def test_a_shift_that_all_markings_share_speaks_against_none() -> None:
     rng = np.random.default_rng(15)
-    places = solved(painted([DIAMOND] * 20, rng), rng)
+    candidates = solved(painted([DIAMOND] * 20, rng), rng)
     shared = replace(
-        places, covariance_m2=places.covariance_m2 + 0.4**2 * np.kron(np.ones((4, 4)), np.eye(2))
+        candidates, covariance_m2=candidates.covariance_m2 + 0.4**2 * np.kron(np.ones((4, 4)), np.eye(2))
     )
     assert not any(verdict(shared).verdict)
 
 
 def test_a_place_less_certain_than_allowed_is_left_out() -> None:
     rng = np.random.default_rng(16)
-    places = solved(painted([DIAMOND] * 20, rng), rng)
-    places.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
-    assert verdict(places).verdict[3] == "its position is too uncertain"
+    candidates = solved(painted([DIAMOND] * 20, rng), rng)
+    candidates.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
+    assert verdict(candidates).verdict[3] == "its position is too uncertain"

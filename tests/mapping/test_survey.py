@@ -9,13 +9,13 @@ import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from v2hdm.adjust import Drift, PoseSigma
+from v2hdm.association.ground import views_of
+from v2hdm.association.sightings import collect_sightings
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SurveyOptions
-from v2hdm.mapping.sightings.table import collect_sightings
-from v2hdm.mapping.sightings.views import views_of
-from v2hdm.mapping.survey import control_points, without_corner
+from v2hdm.mapping.stated import control_points, without_corner
 from v2hdm.records import FloatArray
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from tests.docs.blocks import blocks, document
-from tests.mapping.scene import Scene, SceneOptions, make_scene
-from tests.mapping.test_changes import repainted
+from tests.mapping.scene import Scene, SceneOptions, make_scene, repainted
 from v2hdm import map as door
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive

@@ -18,14 +18,16 @@ from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.calibration import CALIBRATION_FORMATS, read_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.maps import FORMATS, read_geojson
+from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.evidence import read_residuals
+from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.trajectory import read_tum, write_tum
-from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import run
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
 from v2hdm.records import Trajectory
+from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.verdict import Status
 
 
@@ -100,7 +102,7 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
             assert "# drive: short\n# date: " in text
     for one in FORMATS.values():
         assert (result / one.file.format(name="map")).stat().st_size > 1000
-    for picture in ("birdseye.png", "growth.png", "overlay_front.png", "overlay_rear.png"):
+    for picture in ("birdseye.png", "overlay_front.png", "overlay_rear.png"):
         image = cv2.imread(str(result / picture))
         assert image is not None, picture
         assert image.std() > 5.0

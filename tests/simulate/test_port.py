@@ -15,7 +15,7 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
-from v2hdm.io.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.pipeline import RunConfig
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
 from v2hdm.simulate import simulate_port

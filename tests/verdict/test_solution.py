@@ -9,9 +9,9 @@ import pytest
 
 from tests.mapping.scene import SceneOptions, extrinsic, make_scene
 from v2hdm.adjust import Fault
-from v2hdm.mapping.evidence import CameraFit, Contradiction, SolveEvidence
-from v2hdm.mapping.results import Exclusion, MethodResult
+from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, CameraInfo, Drive, HdMap, Marking
+from v2hdm.site.candidates import Exclusion
 from v2hdm.verdict import Finding, Status
 from v2hdm.verdict.results.solution import check_inputs, check_solution
 

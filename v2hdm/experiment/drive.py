@@ -21,7 +21,7 @@ import numpy as np
 
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.measures import residuals
-from v2hdm.experiment.plan import OURS, PAPER, Job
+from v2hdm.experiment.plan import OURS, Job
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
@@ -61,8 +61,6 @@ Progress = Callable[[str, int, int], None]
 """Called with a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
-GROWTH_STEPS = 8
-"""Sizes of the growing map at which its error is stated."""
 
 
 def setting_key(job: Job) -> str:
@@ -205,9 +203,8 @@ def _mapped(
     for done, (name, members) in enumerate(sets.items()):
         progress(f"map, {recipe}", done, len(sets))
         last = name == list(sets)[-1]
-        steps = GROWTH_STEPS if last and recipe != PAPER else 0
         try:
-            methods = run_methods(drive, detections, members, job.options[recipe], growth_steps=steps)
+            methods = run_methods(drive, detections, members, job.options[recipe])
         except (MappingError, AdjustError) as failure:
             out["failures"].append([name, str(failure)])
             continue
@@ -241,11 +238,11 @@ def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
 def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:
     """Number of markings and corner RMSE (m) while the map grows, by method."""
     steps = methods["Opt"].growth
-    growth = {"Opt": growth_figures([HdMap(step.markings) for step in steps], truth)}
+    growth = {"Opt": growth_figures([HdMap(step) for step in steps], truth)}
     for name in NAIVE_IPMS:
         if name in methods:
             markings = methods[name].hd_map.markings
-            growth[name] = growth_figures([HdMap(markings[: len(step.markings)]) for step in steps], truth)
+            growth[name] = growth_figures([HdMap(markings[: len(step)]) for step in steps], truth)
     return growth
 
 

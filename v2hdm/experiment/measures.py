@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.errors import MappingError
 from v2hdm.experiment.plan import OURS, RECIPES
 from v2hdm.geometry.ipm import (
@@ -20,7 +21,6 @@ from v2hdm.geometry.ipm import (
 )
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, ImageDetections, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS

@@ -1,7 +1,7 @@
 """Rigid motions in numpy: transforms, their tangents, and the angles and quaternions of rotations.
 
 Frames, names and tangents are those of :mod:`v2hdm.geometry`; unit quaternions are in the order x, y, z, w
-(TUM's and ROS'). :mod:`v2hdm.geometry.tensors` has the differentiable twins.
+(TUM's and ROS').
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The twins in torch of :mod:`~v2hdm.geometry.rigid`, :mod:`~v2hdm.geometry.ipm` and the lens.
+"""IPM, rigid motions and lenses in torch and kornia, for the mapping, the adjustment and the mosaic.
 
 Functions take any leading ``*batch`` dimensions, float32 or float64, and are differentiable everywhere
-within their stated domain, the identity included. Homographies, projection, lenses, warps and logarithms
+within their stated domain, the identity included. Points on the ground and their derivatives, and lenses,
 are kornia's. :func:`exp`, :func:`inverse`, :func:`adjoint`, :func:`left_jacobian` and
 :func:`inverse_depth` stand in the solver's inner loop and are written in closed form.
 """
@@ -10,22 +10,13 @@ from __future__ import annotations
 
 import torch
 from kornia.geometry import calibration as brown_conrady
-from kornia.geometry.camera.distortion_kannala_brandt import (
-    distort_points_kannala_brandt,
-    undistort_points_kannala_brandt,
-)
-from kornia.geometry.camera.perspective import project_points
-from kornia.geometry.liegroup import Se3
+from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
+from kornia.geometry.conversions import Rt_to_matrix4x4, convert_points_to_homogeneous
 from kornia.geometry.linalg import transform_points
-from kornia.geometry.transform import remap
 from torch import Tensor
 
 from v2hdm.geometry.rigid import EXP_SERIES, LEFT_JACOBIAN_SERIES
 from v2hdm.records import CameraInfo
-
-UNDISTORT_STEPS = 50
-"""Fixed-point steps of :func:`undistort_points`, as many as :func:`v2hdm.geometry.lens.undistort_points`
-takes; kornia's default of 5 errs by tenths of a pixel near the corners."""
 
 _EXP_SERIES = torch.tensor(EXP_SERIES, dtype=torch.float64)
 _LEFT_JACOBIAN_SERIES = torch.tensor(LEFT_JACOBIAN_SERIES, dtype=torch.float64)
@@ -98,13 +89,6 @@ def exp(tangent: Tensor) -> Tensor:
     return make_transform(eye + sine * omega + cosine * omega_squared, moved[..., 0])
 
 
-def log(dst_from_src: Tensor) -> Tensor:
-    """The tangent (*batch, 6) of a rigid motion, with a rotation of at most pi."""
-    matrices = dst_from_src.reshape(-1, 4, 4)
-    tangent: Tensor = Se3.from_matrix(matrices).log()
-    return tangent.reshape(*dst_from_src.shape[:-2], 6)
-
-
 def adjoint(dst_from_src: Tensor) -> Tensor:
     """The matrix (*batch, 6, 6) that takes tangents of ``src`` to ``dst``.
 
@@ -130,45 +114,53 @@ def left_jacobian(tangent: Tensor) -> Tensor:
     return eye + ad @ (first * eye + ad @ (second * eye + ad @ (third * eye + fourth * ad)))
 
 
-def ipm_from_extrinsic(intrinsic: Tensor, cam_from_vehicle: Tensor) -> Tensor:
-    """The IPM ``vehicle_from_pinhole_px`` (*batch, 3, 3), of unit norm, of a camera's pose.
+def extrinsic_from_ipm(intrinsic: Tensor, ipm: Tensor) -> Tensor:
+    """The rigid ``cam_from_vehicle`` (C, 4, 4) nearest to IPMs (C, 3, 3), their cameras above the ground.
+
+    As :func:`v2hdm.geometry.ipm.extrinsic_from_ipm`, which has the source.
 
     Args:
-        intrinsic: K, (*batch, 3, 3), px.
-        cam_from_vehicle: (*batch, 4, 4).
+        intrinsic: K, (C, 3, 3), px.
+        ipm: ``vehicle_from_pinhole_px``, of any scale and sign.
     """
-    ipm: Tensor = torch.linalg.inv(intrinsic @ cam_from_vehicle[..., :3, [0, 1, 3]])
-    norm: Tensor = torch.linalg.matrix_norm(ipm, keepdim=True)
-    return ipm / norm
+    columns = torch.linalg.solve(intrinsic, torch.linalg.inv(ipm))
+    left, singular, right = torch.linalg.svd(columns[..., :2], full_matrices=False)
+    plane, translation = left @ right, columns[..., 2] / singular.mean(dim=-1, keepdim=True)
+    normal = torch.linalg.cross(plane[..., 0], plane[..., 1])
+    above = (normal * translation).sum(dim=-1, keepdim=True) <= 0
+    sign = torch.where(above, 1.0, -1.0).to(ipm)
+    rotation = torch.cat([sign[..., None] * plane, normal[..., None]], dim=-1)
+    cam_from_vehicle: Tensor = Rt_to_matrix4x4(rotation, (sign * translation)[..., None])
+    return cam_from_vehicle
 
 
-def apply_homography(dst_from_src: Tensor, points_src: Tensor) -> Tensor:
-    """Points (*batch, n, 2) mapped by a homography (*batch, 3, 3), not at infinity."""
-    mapped: Tensor = transform_points(dst_from_src, points_src)
-    return mapped
+def back_project(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> Tensor:
+    """Ground points (N, K, 2) of pixels (N, K, 2) by IPMs (N, 3, 3); nan at and above the horizon.
+
+    Below the horizon the third homogeneous coordinate is positive, as :mod:`v2hdm.geometry.ipm` has it.
+    """
+    third = convert_points_to_homogeneous(pinhole_px) @ ground_from_pinhole_px[:, 2, :, None]
+    return torch.where(third > 0, transform_points(ground_from_pinhole_px, pinhole_px), torch.nan)
 
 
-def project(intrinsic: Tensor, points_cam: Tensor) -> Tensor:
-    """Pinhole pixels (*batch, n, 2) of points (*batch, n, 3) in front of the camera; K is (*batch, 3, 3)."""
-    pinhole_px: Tensor = project_points(points_cam, intrinsic[..., None, :, :])
-    return pinhole_px
+def back_project_with_jacobian(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`back_project`, and its derivative (N, K, 2, 2) by the pixels, nan where it is nan itself.
 
-
-def undistort_points(info: CameraInfo, points_px: Tensor) -> Tensor:
-    """Recorded pixels (n, 2) to pinhole pixels (n, 2) of the same intrinsic matrix."""
-    intrinsic, coefficients = _lens(info, points_px)
-    if info.distortion_model == "equidistant":
-        parameters = torch.cat([_focal_and_centre(intrinsic), coefficients])
-        at_depth_one = undistort_points_kannala_brandt(points_px, parameters)
-        return at_depth_one @ intrinsic[:2, :2].mT + intrinsic[:2, 2]
-    pinhole_px: Tensor = brown_conrady.undistort_points(
-        points_px, intrinsic, coefficients, num_iters=UNDISTORT_STEPS
-    )
-    return pinhole_px
+    Each point depends on its own pixel alone, so that one backward pass per coordinate gives all of it.
+    """
+    with torch.enable_grad():
+        leaves = pinhole_px.detach().requires_grad_()
+        points = back_project(ground_from_pinhole_px, leaves)
+        x, y = (
+            torch.autograd.grad(points[..., axis].nansum(), leaves, retain_graph=axis == 0)[0]
+            for axis in (0, 1)
+        )
+    points = points.detach()
+    return points, torch.where(points[..., None].isfinite(), torch.stack([x, y], dim=-2), torch.nan)
 
 
 def distort_points(info: CameraInfo, points_pinhole_px: Tensor) -> Tensor:
-    """Pinhole pixels (n, 2) to recorded pixels (n, 2): the inverse of :func:`undistort_points`."""
+    """Pinhole pixels (n, 2) to recorded pixels (n, 2): as :func:`v2hdm.geometry.lens.distort_points`."""
     intrinsic, coefficients = _lens(info, points_pinhole_px)
     points_px: Tensor
     if info.distortion_model == "equidistant":
@@ -179,26 +171,6 @@ def distort_points(info: CameraInfo, points_pinhole_px: Tensor) -> Tensor:
     else:
         points_px = brown_conrady.distort_points(points_pinhole_px, intrinsic, coefficients)
     return points_px
-
-
-def warp_to_ground(image: Tensor, pinhole_px_from_ground: Tensor, points_ground: Tensor) -> Tensor:
-    """Values (*batch, channels, rows, columns) that undistorted images show at a grid of ground points.
-
-    Points outside an image are zero. Ground behind the camera is not told apart from ground before it.
-
-    Args:
-        image: (*batch, channels, height, width) without lens distortion.
-        pinhole_px_from_ground: K [r1 r2 t], (*batch, 3, 3).
-        points_ground: (rows, columns, 2) m.
-    """
-    rows, columns = points_ground.shape[:2]
-    batch = image.shape[:-3]
-    at_px = apply_homography(pinhole_px_from_ground, points_ground.reshape(-1, 2).expand(*batch, -1, 2))
-    at_px = at_px.reshape(-1, rows, columns, 2)
-    values: Tensor = remap(
-        image.reshape(-1, *image.shape[-3:]), at_px[..., 0], at_px[..., 1], align_corners=True
-    )
-    return values.reshape(*batch, -1, rows, columns)
 
 
 def _lens(info: CameraInfo, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.ground.results import Reading
-from v2hdm.io.trajectory import interpolate
 from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
 # Half width of the parabola fitted to the poses: steering and pedals change the motion no faster.

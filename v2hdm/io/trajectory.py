@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion, slerp
-from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Trajectory
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion
+from v2hdm.records import FloatArray, GeodeticOrigin, IntArray, Trajectory
 from v2hdm.store.files import read_text, replace_text
 
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
@@ -36,31 +36,6 @@ def pose_matrices(rotation: FloatArray, points: FloatArray) -> FloatArray:
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = points
     return poses
-
-
-def interpolate(
-    trajectory: Trajectory, stamp_s: FloatArray, max_gap_s: float
-) -> tuple[FloatArray, BoolArray]:
-    """The poses at ``stamp_s`` (N,): position linear, rotation by slerp, never extrapolated.
-
-    Returns ``map_from_vehicle`` (N, 4, 4) and flags (N,). A flag is False, and the pose the nearest recorded
-    one, before the first pose, after the last, and in a gap longer than ``max_gap_s``; the time of a recorded
-    pose itself is never in a gap.
-    """
-    recorded = trajectory.stamp_s
-    stamp_s = np.asarray(stamp_s, dtype=np.float64)
-    after = np.clip(np.searchsorted(recorded, stamp_s, side="left"), 0, len(recorded) - 1)
-    before = np.where(recorded[after] == stamp_s, after, np.maximum(after - 1, 0))
-    span_s = recorded[after] - recorded[before]
-    inside = (stamp_s >= recorded[0]) & (stamp_s <= recorded[-1]) & (span_s <= max_gap_s)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        linear = np.where(span_s > 0, (stamp_s - recorded[before]) / span_s, 0.0)
-    fraction = np.clip(np.where(inside, linear, np.round(linear)), 0.0, 1.0)
-
-    first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
-    points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    begin, end = (quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second))
-    return pose_matrices(rotation_from_quaternion(slerp(begin, end, fraction)), points), inside
 
 
 def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, where: str) -> None:

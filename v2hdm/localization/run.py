@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
@@ -26,7 +27,6 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.maps import read_geojson
 from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import (
     BoolArray,
     Calibration,

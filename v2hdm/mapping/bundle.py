@@ -1,4 +1,7 @@
-"""One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back."""
+"""How the vehicle moves, from its recorded poses.
+
+One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
+"""
 
 from __future__ import annotations
 
@@ -21,25 +24,39 @@ from v2hdm.adjust import (
     solve,
     with_model,
 )
+from v2hdm.association.ground import locate
+from v2hdm.association.groups import Association, fuse_groups, group_kinds, known_elsewhere, line_only
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
-from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.association.groups import Association, fuse_groups, known_elsewhere, line_only
-from v2hdm.mapping.association.merge import group_kinds
-from v2hdm.mapping.known_sizes import known_lengths
-from v2hdm.mapping.motion import vehicle_twists
+from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.mapping.sightings.location import locate
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.survey import control_points
+from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
+
+def vehicle_twists(
+    map_from_vehicle: FloatArray, stamp_s: FloatArray, visit: IntArray | None = None
+) -> FloatArray:
+    """Twists (F, 6) of the vehicle in its own frame, m/s then rad/s, at poses (F, 4, 4) at times (F,).
+
+    Central differences, one-sided at the ends of each ``visit`` (F,); a single pose has no motion.
+    """
+    count = len(stamp_s)
+    before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
+    if visit is not None:
+        own = np.arange(count)
+        before = np.where(visit[before] == visit, before, own)
+        after = np.where(visit[after] == visit, after, own)
+    moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
+    elapsed_s = stamp_s[after] - stamp_s[before]
+    return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
+
+
 UNSURVEYED_CENTRE_SIGMA_M = 0.3
-"""How well a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
+"""How well, m, a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
 
 HEAVE_SIGMA_M = 0.01
-"""How far a vehicle's body moves up and down on its suspension on paved ground."""
-
+"""How far, m, a vehicle's body moves up and down on its suspension on paved ground."""
 
 Solve = Callable[[Problem, SolveOptions], Solution]
 
@@ -55,11 +72,11 @@ VARIANCE_FACTORS = (0.05, 20.0)
 
 @dataclass(frozen=True)
 class Model:
-    """What a solve estimates and how much noise it reckons with beyond that of the corners.
+    """What a solve estimates, and its noise beyond that of the corners.
 
-    ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
-    ``sizes`` are those that the user knows, ``survey`` the corners; ``clock_sigma_s`` holds clock offsets.
-    ``pose_sigma`` is that of each visit.
+    ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``.
+    ``sizes`` and ``survey`` are stated by the user; ``clock_sigma_s`` is the prior of clock offsets,
+    ``pose_sigma`` that of each visit's poses.
     """
 
     pose_sigma: tuple[PoseSigma, ...]
@@ -101,6 +118,11 @@ class Bundle:
         return out
 
     @property
+    def own_corner(self) -> IntArray:
+        """Which corner (K,) of its sighting each observation is."""
+        return np.asarray(self.association.corner_order()[self.row, self.corner])
+
+    @property
     def inliers(self) -> BoolArray:
         """Which observations (K,) nothing contradicts."""
         return np.isin(self.solution.verdict, (Verdict.ACCEPTED, Verdict.UNCONFIRMED))
@@ -109,22 +131,10 @@ class Bundle:
 def full_model(
     pose_noise: Sequence[PoseNoise], options: MappingOptions, poses: str, variance_factor: float = 1.0
 ) -> Model:
-    """Every frame has its own deviation from its recorded pose, in what the pose model ``poses`` says.
-
-    Args:
-        pose_noise: How far the recorded poses of each visit are off.
-        options: Loss and device.
-        poses: One of :data:`v2hdm.adjust.MODELS`.
-        variance_factor: How many times as large as stated the variances of corners are.
-    """
-    solver = SolveOptions(
-        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
-    )
-    solver = with_model(solver, MODELS[poses])
-    pose_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
-    return Model(
-        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
-    )
+    """Every frame deviates from its recorded pose by the states of the pose model ``poses``."""
+    solver = with_model(replace(_solver(options), coarse=False), MODELS[poses])
+    sigma, floor_px = tuple(pose_sigma_of(one) for one in pose_noise), options.model_floor_px
+    return Model(sigma, floor_px, solver, variance_factor, options.known_sizes, options.survey)
 
 
 def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
@@ -141,17 +151,15 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
 
 
 def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:
-    """The recorded poses taken at their word, and their errors as so much noise in the image.
-
-    Only the extrinsics and corners are left to estimate, which takes a fraction of the time and
-    is amply exact for telling markings apart.
-    """
+    """The recorded poses are exact, their errors noise in the image: enough to tell markings apart."""
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
     jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
-    solver = SolveOptions(
-        pose_states=(), loss=options.loss, loss_scale=options.loss_scale, device=options.device
-    )
-    return Model(len(pose_noise) * (PoseSigma(),), float(np.hypot(options.model_floor_px, jitter_px)), solver)
+    floor_px = float(np.hypot(options.model_floor_px, jitter_px))
+    return Model(len(pose_noise) * (PoseSigma(),), floor_px, replace(_solver(options), pose_states=()))
+
+
+def _solver(options: MappingOptions) -> SolveOptions:
+    return SolveOptions(loss=options.loss, loss_scale=options.loss_scale, device=options.device)
 
 
 def solve_bundle(
@@ -166,16 +174,16 @@ def solve_bundle(
     """Estimate extrinsics, poses and the corners of all groups together.
 
     Args:
-        sightings: The table of sightings.
-        association: Groups to estimate.
-        usable: Which corners (S, 4), in the sightings' own order, may be used.
-        rig: Extrinsics to start from; the poses are always the recorded ones.
-        cameras: Cameras by name, for the priors on their centres.
-        model: Noise and what is estimated.
+        sightings: the table of sightings.
+        association: groups to estimate.
+        usable: corners (S, 4), in the sightings' own order, that may be used.
+        rig: extrinsics to start from; the poses are always the recorded ones.
+        cameras: by name, for the priors on their centres.
+        model: noise and what is estimated.
         solve: takes the place of :func:`v2hdm.adjust.solve`.
 
     Raises:
-        MappingError: No corner was seen twice.
+        MappingError: no corner was seen twice.
     """
     row, group, corner, corner_index = _observed_corners(association, usable)
     if not len(row):
@@ -191,34 +199,20 @@ def solve_bundle(
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
     covariance_px[on_line] = line_only(covariance_px[on_line], OPEN_END_PX)
-    covariance_px = covariance_px + model.floor_px**2 * np.eye(2)
     observations = Observations(
         camera=used.camera.astype(np.int64),
         frame=used.frame.astype(np.int64),
         corner=corner_index[group, corner],
         pinhole_px=sightings.corners_pinhole_px[row, own_corner],
-        covariance_px=model.variance_factor * covariance_px,
+        covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
     )
     names = [sightings.cameras[c] for c in used.cameras]
-    lengths, control = _known(sightings, association, usable, rig, corner_index, model)
-    problem = replace(
-        _problem(sightings, rig, used, [cameras[name] for name in names], observations, model),
-        lengths=lengths,
-        control=control,
-    )
+    lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
+    problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
+    problem = replace(problem, lengths=lengths, control=control)
     solution = solve(problem, model.solver)
-    return Bundle(
-        rig=_adjusted_rig(rig, sightings, used, solution),
-        model=model,
-        problem=problem,
-        solution=solution,
-        association=association,
-        row=row,
-        group=group,
-        corner=corner,
-        corner_index=corner_index,
-        camera_index={name: c for c, name in enumerate(names)},
-    )
+    adjusted, index = _adjusted_rig(rig, sightings, used, solution), {name: c for c, name in enumerate(names)}
+    return Bundle(adjusted, model, problem, solution, association, row, group, corner, corner_index, index)
 
 
 @dataclass(frozen=True)
@@ -242,6 +236,7 @@ def _problem(
     """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
     centre, sigma = centre_priors(cameras, rig.cam_from_vehicle[used.cameras])
     intrinsic = rig.intrinsic[used.cameras]
+    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     return Problem(
         intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
         cam_from_vehicle=rig.cam_from_vehicle[used.cameras],
@@ -251,14 +246,10 @@ def _problem(
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
-        twist_vehicle=_twists(sightings)[used.frames],
+        twist_vehicle=twists[used.frames],
         visit=sightings.visit[used.frames],
         clock_sigma_s=model.clock_sigma_s,
     )
-
-
-def _twists(sightings: Sightings) -> FloatArray:
-    return vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
 
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
@@ -269,7 +260,7 @@ def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera],
     return _problem(sightings, rig, used, [cameras[name] for name in sightings.cameras], nothing, model)
 
 
-def _known(
+def _constraints(
     sightings: Sightings,
     association: Association,
     usable: BoolArray,
@@ -277,10 +268,7 @@ def _known(
     corner_index: IntArray,
     model: Model,
 ) -> tuple[KnownLengths | None, ControlPoints | None]:
-    """What sizes of classes and a survey say about the corners.
-
-    ``rig`` is good enough to tell length from width, and one corner from the next.
-    """
+    """The constraints by stated sizes and a survey; ``rig`` must tell one corner from the next."""
     if not model.sizes.by_class_m and not model.survey.control:
         return None, None
     located = locate(sightings, rig)

@@ -8,8 +8,8 @@ import numpy as np
 
 from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.evidence import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
-from v2hdm.mapping.survey import name_of
+from v2hdm.mapping.results import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
+from v2hdm.mapping.stated import name_of
 from v2hdm.records import FloatArray, IntArray
 
 MEDIAN_SQUARED = 2 * float(np.log(2))
@@ -73,12 +73,9 @@ def camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
 
 
 def along_route(bundle: Bundle, frame: IntArray, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance factors (W,) of windows along the route and when they begin, s.
+    """Variance factors (W,) of windows along the route, and when they begin (W,), s.
 
-    Args:
-        bundle: a solve before anything was left out.
-        frame: (K,) that of each observation.
-        stamp_s: (F,) the frames' times.
+    ``frame`` (K,) is that of each observation, ``stamp_s`` (F,) the frames' times.
     """
     order = np.argsort(frame, kind="stable")
     count = max(len(order) // WINDOW_OBSERVATIONS, 1)

@@ -18,17 +18,15 @@ import numpy as np
 
 from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
+from v2hdm.association.groups import LEAST_TOLERANCE_M, Association, group_kinds
+from v2hdm.association.options import LEAST_SIGHTINGS
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
-from v2hdm.mapping.association.groups import Association
-from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Model, drive_problem
-from v2hdm.mapping.known_sizes import known_lengths
-from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.survey import control_points
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.stated import control_points, known_lengths
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 """Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""
@@ -42,6 +40,9 @@ _FIRST_LINK_MARKINGS = 12
 _LINK_GROWTH = 4
 """How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
 more than the last time alone."""
+
+_RECORD_GROWTH = 1.6
+"""How many times as large the map is whenever its markings are kept for the figure of its growth."""
 
 _LEAST_CORNERS = 3
 """Corners that fix a marking: all are parallelograms."""
@@ -61,10 +62,9 @@ class Grown:
 
 @dataclass
 class _Place:
-    """A marking of the map: the number of each of its corners (4,) there, -1 if it has none.
+    """A mapped marking: the number of each corner (4,) there, -1 for none.
 
-    ``images`` are those that showed it, ``point`` (4,) the corners that they showed as points; ``preview``
-    (4, 2) is where these lay before the marking was solved.
+    ``images`` showed it, ``point`` (4,) corners as points, at ``preview`` (4, 2) before it was solved.
     """
 
     corner: IntArray
@@ -76,10 +76,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Track:
-    """The sightings ``rows`` of one track, what they say of the corners 0 to 3, and where these lie alone.
-
-    Corners that none of them shows as a point are nan.
-    """
+    """The ``rows`` of one track, its observations, and its corners (4, 2), nan where none is a point."""
 
     rows: IntArray
     kind: int
@@ -104,28 +101,41 @@ class IncrementalMapper:
         """Begin with an empty map.
 
         Args:
-            sightings: The table of sightings.
-            rig: Extrinsics to start from, and the recorded poses.
-            cameras: The rig's cameras by name.
-            position_sigma_m: How far the recorded positions are off.
-            options: Settings of the mapping.
-            link: Finds the tracks.
-            solve: Solves for all markings together.
-            model: What each marking is solved for under; of the poses it estimates nothing.
+            sightings: the table of sightings.
+            rig: extrinsics to start from, and the recorded poses.
+            cameras: the rig's cameras by name.
+            position_sigma_m: how far the recorded positions are off.
+            options: settings of the mapping.
+            link: finds the tracks.
+            solve: solves for all markings together.
+            model: of the solve for each marking, which estimates no pose.
         """
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
         self._drive = drive_problem(sightings, rig, cameras, model)
+        self.growth: list[tuple[Marking, ...]] = []
+        self._record_at = 2
         self._begin(rig, 0)
 
-    def run(self, progress: Callable[[str], None]) -> Grown:
-        """Take up all tracks in the order in which they end.
+    def _record(self) -> None:
+        """Keep the whole markings of the map whenever it has grown by so much: how its error settles."""
+        if len(self._places) < max(self._record_at, self._known):
+            return
+        corners = [self._corners(marking) for marking in range(len(self._places))]
+        self.growth.append(
+            tuple(
+                Marking(self._sightings.kinds[place.kind], own, len(place.images))
+                for own, place in zip(corners, self._places, strict=True)
+                if np.isfinite(own).all()
+            )
+        )
+        self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
-        Args:
-            progress: Told in words how large the map is whenever the drive is linked anew.
+    def run(self, progress: Callable[[str], None]) -> Grown:
+        """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
 
         Raises:
-            MappingError: Nothing can be solved for.
+            MappingError: nothing can be solved for.
         """
         tracks, usable = self._link(self._rig, True)
         due, ended = _FIRST_LINK_MARKINGS, False
@@ -140,10 +150,7 @@ class IncrementalMapper:
         return Grown(association, usable, self._present_rig())
 
     def _begin(self, rig: Rig, known: int) -> None:
-        """An empty map with a rig to start from, of a drive that showed ``known`` markings.
-
-        So many need not be up to date one by one again: they are solved together.
-        """
+        """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""
         self._rig, self._known = rig, known
         # Only the IPM that the first map starts from may be far off, and all that is located by it.
         self._coarse = rig is self._first_rig
@@ -163,10 +170,7 @@ class IncrementalMapper:
             return self._take_up(tracks, usable, most)
 
     def _take_up(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
-        """Take tracks into the map until it has ``most`` markings or the drive ends; and whether it did.
-
-        Returns which marking (S,) of the map each sighting became part of, and its corners' order.
-        """
+        """Map tracks up to ``most`` markings; returns them as groups, and whether the drive ended."""
         number = np.full(len(self._sightings), -1, dtype=np.int64)
         shift = tracks.shift.copy()
         rows = np.flatnonzero(tracks.group >= 0)
@@ -184,6 +188,7 @@ class IncrementalMapper:
             marking, turn = self._same_as(track)
             if self._take(track, marking, turn):
                 number[own] = len(self._places) - 1 if marking is None else marking
+                self._record()
                 shift[own] = (shift[own] + turn) % 4
         return Association(number, shift, len(self._places)), ended
 
@@ -272,15 +277,12 @@ class IncrementalMapper:
         return _Track(rows, kind, replace(seen, corner=corner), corners)
 
     def _same_as(self, track: _Track) -> tuple[int | None, int]:
-        """The marking of the map that lies where a track does, None if none; and how to turn the track.
-
-        Corner c of the marking is corner (c + turn) mod 4. Two things seen in one image are two markings.
-        """
+        """The mapped marking where a track lies, if any: its corner c is the track's (c + turn) mod 4."""
         corners = track.corners_map
         valid = np.asarray(np.isfinite(corners).all(axis=1))
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
-        tolerance_m = max(self._options.association.shape_tolerance * size_m, 0.05)
+        tolerance_m = max(self._options.association.shape_tolerance * size_m, LEAST_TOLERANCE_M)
         best: tuple[float, int | None, int] = (self._gate_m(track.rows), None, 0)
         near = np.linalg.norm(self._centres - np.nanmean(corners, axis=0), axis=1) < best[0] + size_m
         for marking in np.flatnonzero(near).tolist():

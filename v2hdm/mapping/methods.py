@@ -1,7 +1,7 @@
 """The four methods of the paper, side by side on one set of cameras.
 
-CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint
-optimisation; ONI is the naive strategy under the IPM that the optimisation found.
+CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint optimisation; ONI
+is the naive strategy under the IPM that the optimisation found.
 """
 
 from __future__ import annotations
@@ -9,32 +9,154 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust import Status, observability
+from v2hdm.adjust import Fault, Status, observability
+from v2hdm.association.ground import views_of
+from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
+from v2hdm.io.maps.evidence import Residuals
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.changes.update import Base, update_map
-from v2hdm.mapping.changes.watched import Observer
+from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.crew import ALONE, Crew
-from v2hdm.mapping.growth import grow_map
-from v2hdm.mapping.lanes.fuse import map_lanes
-from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
-from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
+from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
-from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.outputs import JointCorners, StatedCorners, adjusted_poses, clock_offsets, residuals_of
-from v2hdm.mapping.remedy import Inputs, Outcome, optimise
-from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sightings.table import camera_of
-from v2hdm.mapping.sightings.views import views_of
-from v2hdm.mapping.survey import without_corner
-from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, Lane
+from v2hdm.mapping.recovery import Inputs, Outcome, optimise
+from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
+from v2hdm.mapping.stated import without_corner
+from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
+from v2hdm.site.changes import Base, update_map
+from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
+from v2hdm.site.lanes import map_lanes
+from v2hdm.site.looks import Observer
+from v2hdm.site.symbols import map_symbols
+
+
+def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
+    """The poses of all frames of the drive."""
+    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
+    sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
+    used = np.unique(sightings.frame[bundle.row])
+    if bundle.model.solver.pose_states:
+        inflation = max(1.0, bundle.solution.chi2_per_dof)
+        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * inflation)
+    seen = np.zeros(len(sightings.stamp_s), dtype=bool)
+    seen[used] = True
+    frames = frames_of(drive).frame_of_image
+    return AdjustedPoses(
+        stamp_s=sightings.stamp_s,
+        before=sightings.map_from_vehicle,
+        map_from_vehicle=bundle.rig.map_from_vehicle,
+        sigma=sigma,
+        seen=seen,
+        frame={image.path: int(frame) for image, frame in zip(drive.images, frames, strict=True)},
+        visit=sightings.visit,
+    )
+
+
+def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
+    """Of each visit each camera's clock offset: what its images were moved by, and the solve's beyond."""
+    evidence, drive = outcome.evidence, outcome.inputs.drive
+    applied_s = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
+    suspects = [one for one in evidence.suspects if one.fault is Fault.CLOCK]
+    out = []
+    for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
+        clocks = {}
+        for name in outcome.inputs.sightings.cameras:
+            if (visit, name) not in applied_s:
+                continue
+            beyond_s, sigma_s = estimated.get(name, (0.0, 0.0))
+            if name not in estimated:
+                # Of each camera, and of all of them together: a clock of its own may differ by both.
+                tested = [
+                    one.sigma**2
+                    for one in suspects
+                    if name in one.cameras and one.about in ("", f"in {place.name}")
+                ]
+                sigma_s = float(np.sqrt(sum(tested))) if tested else float("inf")
+            clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
+        out.append(clocks)
+    return tuple(out)
+
+
+@dataclass(frozen=True)
+class JointCorners:
+    """How the errors of an optimised map's corners hang together."""
+
+    optimised: Optimised
+
+    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
+        """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
+
+        Within a marking it is what the map states. From one marking to another only the errors of the
+        adjustment are shared, drift above all: a corner that was not seen shares those of one that was.
+        """
+        optimised, bundle = self.optimised, self.optimised.bundle
+        index = bundle.corner_index[optimised.groups[marking]]
+        own = index[np.arange(len(corner)), corner]
+        number = np.where(own >= 0, own, index.max(axis=1))
+        out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
+        _state(out, optimised.markings, marking, corner)
+        # Put together from two sources, it may be negative along some direction, by a millimetre squared.
+        values, vectors = np.linalg.eigh(out)
+        return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+@dataclass(frozen=True)
+class StatedCorners:
+    """The errors of the corners of markings from several maps, as far as each marking states them."""
+
+    markings: Sequence[Marking]
+
+    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
+        """As :meth:`JointCorners.covariance`, but that nothing is shared from one marking to another."""
+        out = np.zeros((2 * len(marking), 2 * len(marking)))
+        _state(out, self.markings, marking, corner)
+        return out
+
+
+def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> None:
+    """Set the blocks of ``out`` within each marking to its own covariance."""
+    rows = 2 * corner[:, None] + np.arange(2)
+    for k, own in enumerate(marking.tolist()):
+        stated = markings[own].covariance_m2
+        assert stated is not None
+        for other in np.flatnonzero(marking == own):
+            out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = stated[np.ix_(rows[k], rows[other])]
+
+
+def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
+    """Those of the observations that the solve accepted, of markings and of candidates left out."""
+    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, optimised.bundle
+    seen, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
+    marking = np.zeros(bundle.association.count, dtype=np.int64)
+    # The ids of a map whose markings have none yet: by their order, as its files number them.
+    marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
+    images = [drive.images[i] for i in seen.tolist()]
+    return Residuals(
+        image=tuple(_below(image.path, drive.root) for image in images),
+        camera=tuple(image.camera for image in images),
+        taken_s=np.array([image.taken_s for image in images]),
+        row_image=row_image.astype(np.int64),
+        marking=marking[bundle.group],
+        corner=bundle.corner,
+        is_point=np.asarray(sightings.valid[bundle.row, bundle.own_corner]),
+        observed_px=sightings.corners_pinhole_px[bundle.row, bundle.own_corner],
+        residual_px=bundle.solution.residual_px,
+        distance_sigma=np.sqrt(bundle.solution.mahalanobis2),
+    )
+
+
+def _below(path: Path, root: Path) -> str:
+    """A path from ``root`` on, whole where it lies elsewhere."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
 
 Progress = Callable[[str], None]
 
@@ -49,8 +171,7 @@ def run_methods(
     detections: Sequence[ImageDetections],
     cameras: Sequence[str],
     options: MappingOptions | None = None,
-    progress: Progress | None = None,
-    growth_steps: int = 0,
+    progress: Progress = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
     crew: Crew = ALONE,
@@ -58,46 +179,40 @@ def run_methods(
     """Map a drive with every method that its IPMs allow.
 
     Args:
-        drive: The drive; its truth is not looked at.
-        detections: What was found in its images.
-        cameras: Which cameras to map with, together.
-        options: Settings of the mapping.
-        progress: Called with the name of each step as it begins.
-        growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
-        base: An earlier map that ``Opt`` brings up to date; None where there is none.
-        grey: Reads the grey values (H, W) of an image, to look where ``base`` has paint; None does without.
-        crew: Who does what belongs to one visit of several.
+        drive: the drive; its truth is not looked at.
+        detections: of its images.
+        cameras: to map with, together.
+        options: settings of the mapping.
+        progress: gets the name of each step as it begins.
+        base: an earlier map that ``Opt`` brings up to date.
+        grey: reads the grey values (H, W) of an image, to look where ``base`` has paint.
+        crew: does what belongs to one visit of several.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
 
     Raises:
-        MappingError: There is nothing to map.
-        ConfigError: An option is out of range.
+        MappingError: there is nothing to map.
+        ConfigError: an option is out of range.
     """
     options = options or MappingOptions()
     check_options(options)
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
-    tell = progress or _silent
-    tell("linking sightings")
+    progress("linking sightings")
     given = Inputs(drive, detections, cameras, options, crew)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
-        tell(name)
+        progress(name)
         results[name] = run_naive(name, given, ipm)
     begin_s = time.perf_counter()
-    outcome, optimised = optimise(given, tell)
+    outcome, optimised = optimise(given, progress)
     optimal = _optimised_result(outcome, optimised, begin_s)
-    if growth_steps:
-        tell("growth of the map")
-        growth = grow_map(outcome.inputs.optimiser, optimised, growth_steps)
-        optimal = replace(optimal, growth=growth)
     if base is not None:
-        tell("the earlier map")
+        progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
     results["Opt"] = optimal
-    tell("ONI")
+    progress("ONI")
     found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
     results["ONI"] = replace(run_naive("ONI", outcome.inputs, ipm_found), calibrations=found)
@@ -134,48 +249,38 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 
 def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) -> MethodResult:
     inputs = outcome.inputs
-    options, drive, cameras = inputs.options, inputs.drive, inputs.cameras
-    solution = optimised.bundle.solution
+    options, drive, cameras, bundle = inputs.options, inputs.drive, inputs.cameras, optimised.bundle
+    solution, growth, noise = bundle.solution, inputs.optimiser.growth, drive.pose_noise
     if solution.status is not Status.CONVERGED:
         _log.warning(
             "the joint optimisation ended early (%s): %s", solution.status.value, solution.status.advice
         )
-    lost = without_corner(options.survey, optimised.bundle.problem.control)
+    lost = without_corner(options.survey, bundle.problem.control)
     if len(lost):
         _log.warning(
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
-            len(lost),
-            len(options.survey.control),
-            options.survey.reach_m,
-            ", ".join(lost),
-        )
-    ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
-    lanes = _lanes(inputs, ground)
-    symbols = map_symbols(
-        inputs.sightings.symbols,
-        optimised.bundle.rig,
-        drive.pose_noise.roll_pitch_rad,
-        optimised.markings,
-    )
+            len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
+        )  # fmt: skip
+    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig))
+    symbols = map_symbols(inputs.sightings.symbols, bundle.rig, noise.roll_pitch_rad, optimised.markings)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(
-            optimised.markings, lanes, drive.origin, symbols, drive.pose_noise.position_drift_over_m
-        ),
+        hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m),
         calibrations=optimised.calibrations,
         excluded=optimised.excluded,
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
+        growth=(*growth, optimised.markings) if growth else (),
         diagnostics={
-            "observations": float(len(optimised.bundle.row)),
-            "candidates": float(optimised.bundle.association.count),
+            "observations": float(len(bundle.row)),
+            "candidates": float(bundle.association.count),
             "evaluations": float(solution.evaluations),
             "gap": solution.gap,
             "chi2_per_dof": solution.chi2_per_dof,
             "time_s": time.perf_counter() - begin_s,
         },
-        certainty=_certainty(optimised.bundle),
+        certainty=_certainty(bundle),
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
@@ -224,7 +329,3 @@ def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:
         jitter_rad=inputs.drive.pose_noise.roll_pitch_rad,
     )
     return map_lanes(cloud, options)
-
-
-def _silent(step: str) -> None:
-    """Ignore progress."""

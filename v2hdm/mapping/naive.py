@@ -10,15 +10,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion
+from v2hdm.association.ground import ground_points
+from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
+from v2hdm.association.options import LEAST_SIGHTINGS
+from v2hdm.association.sightings import Sightings
+from v2hdm.geometry.ipm import facing_ipm, flat_motion
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
-from v2hdm.mapping.association.groups import Association, FusedGroups, keep_rows
-from v2hdm.mapping.association.merge import group_kinds, merge_groups
-from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
-from v2hdm.mapping.results import Exclusion
-from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, Marking
+from v2hdm.site.candidates import Exclusion
 
 
 def naive_markings(
@@ -28,15 +29,11 @@ def naive_markings(
     ipm: Mapping[str, FloatArray],
     options: MappingOptions,
 ) -> tuple[list[Marking], list[Exclusion]]:
-    """Map the markings of ``tracks`` by one IPM ``vehicle_from_pinhole_px`` per camera.
+    """Map ``tracks`` by one IPM ``vehicle_from_pinhole_px`` per camera; returns exclusions, too.
 
-    Only sightings whose four valid corners lie inside the camera's region of interest count.
-    Tracks are merged where their averages under these very IPMs lie within
-    ``options.association.naive_merge_m``, so two cameras whose IPMs disagree by more yield two
-    markings where there is one: that is the method's own failure.
-
-    Returns:
-        The markings, and what was seen too seldom to be one.
+    Only sightings with four valid corners inside the region of interest count. Tracks merge where their
+    averages lie within ``naive_merge_m``: two cameras whose IPMs disagree by more yield two markings where
+    there is one, which is the method's own failure.
     """
     corners_map = ipm_corners(sightings, cameras, ipm)
     usable = (tracks.group >= 0) & _inside_roi(sightings, cameras, corners_map[1])
@@ -64,9 +61,9 @@ def ipm_corners(
         [facing_ipm(ipm[name], cameras[name].roi_vehicle.mean(axis=0)) for name in sightings.cameras]
     )
     homographies = forward[sightings.camera]
-    corners_vehicle = apply_in_front(homographies, sightings.corners_pinhole_px)
+    corners_vehicle = ground_points(homographies, sightings.corners_pinhole_px)
     to_map = flat_motion(sightings.map_from_vehicle[sightings.frame]) @ homographies
-    return apply_in_front(to_map, sightings.corners_pinhole_px), corners_vehicle
+    return ground_points(to_map, sightings.corners_pinhole_px), corners_vehicle
 
 
 def _inside_roi(

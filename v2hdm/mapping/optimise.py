@@ -13,14 +13,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from v2hdm.adjust import Status, select_model
+from v2hdm.association.ground import Located, Views, locate
+from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.ipm import extrinsic_from_ipm
-from v2hdm.mapping.association.attach import attach
-from v2hdm.mapping.association.groups import Association, fuse_groups, in_view, same_groups
-from v2hdm.mapping.association.merge import merge_groups
-from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
+from v2hdm.geometry.tensors import extrinsic_from_ipm
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -29,15 +30,11 @@ from v2hdm.mapping.bundle import (
     full_model,
     solve_bundle,
 )
+from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.incremental import IncrementalMapper
-from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
-from v2hdm.mapping.sightings.location import Located, locate
-from v2hdm.mapping.sightings.rig import Rig, build_rig
-from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise, largest_noise
+from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, largest_noise
 
 _log = logging.getLogger(__name__)
 
@@ -49,6 +46,10 @@ STEEP_SINE = 0.15
 
 LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
+
+
+def silent(step: str) -> None:
+    """Ignore progress."""
 
 
 class Optimiser:
@@ -77,6 +78,7 @@ class Optimiser:
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
+        self.growth: tuple[tuple[Marking, ...], ...] = ()
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
 
@@ -90,17 +92,16 @@ class Optimiser:
         located = self._locate(self.initial_rig)
         return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
 
-    def run(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Optimised:
+    def run(self, tracks: Association, progress: Callable[[str], None] = silent) -> Optimised:
         """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
         return self.finish(self.settle(tracks, progress), progress)
 
-    def settle(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Bundle:
+    def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
-        tell = progress or _silent
-        tell("coarse solve")
+        progress("coarse solve")
         bundle = self._solve_steep(tracks)
         for number in range(1, self._options.rounds + 1):
-            tell(f"joint solve {number}")
+            progress(f"joint solve {number}")
             association = self._associate(bundle.rig)
             # The coarse solve takes the poses at their word, which no test of the inputs may rest on.
             if number > 1 and same_groups(association, bundle.association):
@@ -109,13 +110,12 @@ class Optimiser:
             self._reweigh(bundle)
         return bundle
 
-    def finish(self, bundle: Bundle, progress: Callable[[str], None] | None = None) -> Optimised:
+    def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
-        tell = progress or _silent
         if self._options.pose_model == AUTO:
-            tell("choice of the pose model")
+            progress("choice of the pose model")
             self._pose_model = self._choose_pose_model(bundle)
-        tell("final solve")
+        progress("final solve")
         usable, inlier = self._gate(bundle)
         final = self._solve(bundle.association, usable, bundle.rig)
         return conclude(
@@ -138,7 +138,7 @@ class Optimiser:
             for offset_s in solved.clock_offset_s.T
         ]
 
-    def grow(self, progress: Callable[[str], None] | None = None) -> Bundle:
+    def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
 
         ``progress`` is told how large the map is. In place of :meth:`settle`.
@@ -165,16 +165,11 @@ class Optimiser:
             solve,
             coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
-        grown = mapper.run(progress or _silent)
+        grown = mapper.run(progress)
+        self.growth = tuple(mapper.growth)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
         self._reweigh(bundle)
         return bundle
-
-    def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
-        """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""
-        association = optimised.bundle.association
-        chosen = np.isin(association.group, groups)
-        return self._solve(association, optimised.usable & chosen[:, None], self.initial_rig)
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which observations are used."""
@@ -238,11 +233,7 @@ class Optimiser:
         return bundle
 
     def _reweigh(self, bundle: Bundle) -> None:
-        """Take the observations for as good as their residuals under ``bundle`` say.
-
-        How well the poses are known is on the receiver's data sheet; how well corners are found in this
-        light, on this paint, under what is left of the lens's distortion, only the drive itself can tell.
-        """
+        """Scale the observations' variances as their residuals under ``bundle`` say."""
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
             self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
@@ -262,21 +253,14 @@ class Optimiser:
     def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:
         """Corners (S, 4) of accepted observations, and the verdict on each observation (K,)."""
         inlier = bundle.inliers
-        order = bundle.association.corner_order()
         usable = np.zeros_like(self._sightings.valid)
-        row, corner = bundle.row[inlier], bundle.corner[inlier]
-        usable[row, order[row, corner]] = True
+        usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         return usable, inlier
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """The extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
-    start = {
-        name: extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
-        for name, camera in cameras.items()
-    }
-    return build_rig({name: camera.info for name, camera in cameras.items()}, start, map_from_vehicle)
-
-
-def _silent(step: str) -> None:
-    """Ignore progress."""
+    intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
+    ipm = np.stack([camera.ipm[camera.initial_ipm] for camera in cameras.values()])
+    start = extrinsic_from_ipm(torch.tensor(intrinsic), torch.tensor(ipm)).numpy()
+    return Rig(intrinsic, start, map_from_vehicle)

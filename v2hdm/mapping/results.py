@@ -1,4 +1,7 @@
-"""What a mapping method hands back."""
+"""What a solve says of its own inputs: how well everything fits, and which input would have to be wrong.
+
+What a mapping method hands back.
+"""
 
 from __future__ import annotations
 
@@ -9,27 +12,88 @@ from typing import Protocol
 
 import numpy as np
 
+from v2hdm.adjust import Fault
 from v2hdm.io.maps.evidence import Residuals
-from v2hdm.mapping.evidence import SolveEvidence
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
+from v2hdm.site.candidates import Exclusion
+
+WINDOW_OBSERVATIONS = 200
+"""Observations of a window along the route: their median varies by a tenth by chance."""
+
+CELLS = (4, 6)
+"""Rows and columns that an image is divided into for the mean residual of each."""
 
 
 @dataclass(frozen=True)
-class Exclusion:
-    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
+class Contradiction:
+    """One input that would have to be wrong, as far as the residuals say.
 
-    kind: str
-    position_map: FloatArray
-    sightings: int
-    reason: str
+    ``fault`` of ``cameras``, along ``axis`` 0 to 2 of the vehicle (survey, lever) or the map (slope, datum),
+    ``about`` the class of a known size and its length, a surveyed point, or the visit of a clock. ``value``
+    is true minus stated, in s, m, rad or a share, with the ``sigma`` of this drive, inf where it is
+    unobservable; ``sigmas`` is the value in sigmas, by its chi-square.
+    """
+
+    fault: Fault
+    cameras: tuple[str, ...]
+    axis: int
+    about: str
+    value: float
+    sigma: float
+    sigmas: float
 
 
 @dataclass(frozen=True)
-class GrowthStep:
-    """The state after the first markings of a drive: their map and the extrinsics by camera."""
+class CameraFit:
+    """How well one camera's ``observations`` fit.
 
-    markings: tuple[Marking, ...]
-    cam_from_vehicle: Mapping[str, FloatArray]
+    ``variance_factor`` is how many times as large as stated by the detector their variances are, by the
+    median; ``rejected_share`` of them the rest contradicts; ``bias_px`` is the longest median residual of the
+    cells of its image (see :data:`CELLS`).
+    """
+
+    observations: int
+    variance_factor: float
+    rejected_share: float
+    bias_px: float
+
+
+@dataclass(frozen=True)
+class SolveEvidence:
+    """The evidence that the joint optimisation of one set of cameras leaves for the checks.
+
+    Attributes:
+        suspects: every input that was tested, as it stands in the result, the largest contradiction first.
+        corrected: inputs that were contradicted, and dropped or corrected before the result was solved.
+        pose_model: what was estimated of the poses, of :data:`v2hdm.adjust.MODELS`.
+        held_out: mean robust loss of held-out observations by pose model; a little below 2 without errors.
+        fits: by camera.
+        variance_factor: as in :class:`CameraFit`, of all cameras.
+        along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
+        window_s: (W,) when each window begins, s.
+        pose_pulls: root mean square normalised innovation by state of a pose; at most 1 for right sigmas.
+        worst_pull: the largest of them all, in sigmas.
+        worst_pull_s: when, s.
+        clock_s: by visit and camera the estimated clock offset and sigma, where the pose model has one.
+    """
+
+    suspects: tuple[Contradiction, ...]
+    corrected: tuple[Contradiction, ...]
+    pose_model: str
+    held_out: Mapping[str, float]
+    fits: Mapping[str, CameraFit]
+    variance_factor: float
+    along_route: FloatArray
+    window_s: FloatArray
+    pose_pulls: Mapping[str, float]
+    worst_pull: float
+    worst_pull_s: float
+    clock_s: Sequence[Mapping[str, tuple[float, float]]] = ({},)
+
+    @property
+    def held_out_loss(self) -> float | None:
+        """That of the chosen model, None where too little was seen to hold any of it out."""
+        return self.held_out.get(self.pose_model)
 
 
 @dataclass(frozen=True)
@@ -40,8 +104,7 @@ class AdjustedPoses:
         stamp_s: (F,) when images were taken, on the clock of the poses, rising within each visit.
         before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve.
         map_from_vehicle: (F, 4, 4) adjusted; as before where no marking was seen.
-        sigma: (F, 6) standard deviations along and about the vehicle's axes, m and rad; those stated by the
-            drive where no marking was seen.
+        sigma: (F, 6) along and about the vehicle's axes, m and rad; as stated where no marking was seen.
         seen: (F,) whether a marking was seen then.
         frame: which of them each image is of, by its path.
         visit: (F,) of which visit each is.
@@ -80,16 +143,19 @@ class Corners(Protocol):
 class MethodResult:
     """The outcome of one method on one set of cameras.
 
-    ``calibrations`` are per camera, empty where the method only has an IPM. ``reprojection_rmse_px``
-    (and ``initial_reprojection_rmse_px``, under the extrinsic the optimisation started from) are
-    over the same accepted corner observations; None for methods that do not reproject.
-    ``growth`` is how the result came about, marking by marking, where that was asked for;
-    ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
-    in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
-    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` of
-    each visit the offsets of the cameras' clocks, corrections before the solve included; ``corners`` how the
-    errors of the map's corners hang together, None where nothing tells; ``residuals`` are those of the corner
-    observations that it accepted; ``changes`` what became of an earlier map that was brought up to date.
+    Attributes:
+        calibrations: by camera, empty where the method only has an IPM.
+        reprojection_rmse_px: over the accepted corner observations; None for methods that do not reproject.
+        initial_reprojection_rmse_px: the same under the extrinsic that the optimisation started from.
+        growth: the maps after the first markings, in the incremental mode, the whole map last.
+        diagnostics: named figures for the log and the report.
+        certainty: by camera, a sentence on what the drive determined and what rests on the survey.
+        evidence: for the checks after the solve.
+        poses: as the solve has adjusted them.
+        clocks: by visit the offsets of the cameras' clocks, corrections before the solve included.
+        corners: how the errors of the map's corners hang together, None where unknown.
+        residuals: of the accepted corner observations.
+        changes: of an earlier map that was brought up to date.
     """
 
     name: str
@@ -99,7 +165,7 @@ class MethodResult:
     excluded: tuple[Exclusion, ...] = ()
     reprojection_rmse_px: float | None = None
     initial_reprojection_rmse_px: float | None = None
-    growth: tuple[GrowthStep, ...] = ()
+    growth: tuple[tuple[Marking, ...], ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     certainty: Mapping[str, str] = field(default_factory=dict)
     evidence: SolveEvidence | None = None

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from kornia.geometry.linalg import transform_points
 from kornia.geometry.transform import remap
 from torch import Tensor
 
@@ -257,7 +258,7 @@ def _recorded_px(lens: Lens, pinhole_px_from_canvas: FloatArray, points: FloatAr
     """Where an image shows points (T, N, 2) of a canvas, recorded px (T, N, 2), by kornia."""
     at = torch.from_numpy(points)
     homography = torch.from_numpy(pinhole_px_from_canvas)
-    pinhole_px = tensors.apply_homography(homography.expand(len(at), 3, 3), at)
+    pinhole_px = transform_points(homography.expand(len(at), 3, 3), at)
     return tensors.distort_points(lens.info, pinhole_px.reshape(-1, 2)).reshape(at.shape)
 
 

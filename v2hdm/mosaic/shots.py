@@ -18,7 +18,7 @@ from v2hdm.geometry.ipm import (
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
 
 

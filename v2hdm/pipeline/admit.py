@@ -53,7 +53,6 @@ _RANGES = {
         for name in ("parked_trucks", "barriers", "lamp_posts", "moving_trucks", "shadow_strips")
     },
     "simulate.yard.haze_m": POSITIVE,
-    "mapping.rounds": Within(1, 100),
 }  # fmt: skip
 
 

@@ -22,10 +22,10 @@ from v2hdm.io.maps import (
     write_features,
 )
 from v2hdm.io.trajectory import read_tum
-from v2hdm.mapping.changes.update import Base
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.figures import save_changes
+from v2hdm.site.changes import Base
 from v2hdm.store.files import load_json, take_array
 
 _SITE_M = 40.0

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from v2hdm.io.drive.truth import has_truth
-from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
@@ -20,13 +18,12 @@ from v2hdm.pipeline.viewer import Viewer
 from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
+from v2hdm.site.changes import Base
 from v2hdm.store.cache import StageCache
 
 _log = logging.getLogger(__name__)
 
 STAGE = "map"
-GROWTH_STEPS = 8
-"""Sizes of the growing map at which its error is drawn."""
 
 
 @dataclass(frozen=True)
@@ -79,16 +76,12 @@ def map_camera_sets(
     jobs = []
     for number, (name, cameras) in enumerate(sets.items()):
         last = number == len(sets) - 1
-        # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
-        steps = GROWTH_STEPS if last and has_truth(drive) else 0
         of_last = (base, survey.check) if last else None
-        work = partial(
-            _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last, crew
-        )
+        work = partial(_map_set, drive, detections, name, cameras, survey, base if last else None, last, crew)
         # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
         shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
         begin = partial(crew.begin if shared_out else ALONE.begin, work)
-        jobs.append((cache.key(begun, name, cameras, steps, of_last), begin))
+        jobs.append((cache.key(begun, name, cameras, of_last), begin))
     progress("map", 0, len(sets))
     found = {}
     for name, mapped in zip(sets, cache.get_or_make_each(STAGE, MappedSet, jobs), strict=True):
@@ -104,15 +97,12 @@ def _map_set(
     name: str,
     cameras: Sequence[str],
     survey: Survey,
-    growth_steps: int,
     base: Base | None,
     last: bool,
     crew: Crew,
 ) -> MappedSet:
     tell, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(
-        drive, detections, cameras, survey.mapping, tell, growth_steps, base, grey_reader(drive), crew
-    )
+    methods = run_methods(drive, detections, cameras, survey.mapping, tell, base, grey_reader(drive), crew)
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None
     # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.

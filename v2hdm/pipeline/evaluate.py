@@ -13,7 +13,7 @@ from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.remedy import Inputs
+from v2hdm.mapping.recovery import Inputs
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_figures, growth_figures, headline, map_figures
@@ -107,13 +107,15 @@ def _naive_under_true_extrinsic(
 
 
 def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
-    """Corner RMSE (m) over the first n markings, per method; only Opt solves anew at each n.
+    """Corner RMSE (m) over the first n markings per method, in the incremental mode; else empty.
 
-    The other methods keep a marking as it is once it has been passed, so their first n will do.
+    The naive methods keep a marking as it is once it has been passed, so their first n will do.
     """
     steps = methods["Opt"].growth
-    counts = [len(step.markings) for step in steps]
-    growth = {"Opt": growth_figures([HdMap(step.markings) for step in steps], truth)}
+    if not steps:
+        return {}
+    counts = [len(markings) for markings in steps]
+    growth = {"Opt": growth_figures([HdMap(markings) for markings in steps], truth)}
     for name, result in methods.items():
         if name != "Opt":
             growth[name] = growth_figures([HdMap(result.hd_map.markings[:n]) for n in counts], truth)

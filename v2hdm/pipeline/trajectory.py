@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.io.trajectory import interpolate, write_tum
+from v2hdm.geometry.trajectory import interpolate
+from v2hdm.io.trajectory import write_tum
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.records import Drive, FloatArray, Trajectory, Visit
 from v2hdm.store.files import replace_text

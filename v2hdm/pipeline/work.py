@@ -18,7 +18,6 @@ from v2hdm.detection.batch import Detect, detect_images
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.io.drive import join_drives
-from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mosaic.result import write_mosaic
 from v2hdm.pipeline.about import describe_run
@@ -40,6 +39,7 @@ from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.report.page.document import write_page
 from v2hdm.simulate import rendered_drive
+from v2hdm.site.changes import Base
 from v2hdm.store.cache import StageCache
 from v2hdm.store.pruning import prune_to_limit
 from v2hdm.verdict import Finding, Status, Verdict

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from v2hdm.experiment.figures.site import colour, method_of
 from v2hdm.experiment.measures import Matched, Measured
-from v2hdm.experiment.plan import OURS, PAPER
+from v2hdm.experiment.plan import PAPER
 from v2hdm.experiment.summary import by_port
 from v2hdm.mapping.options import INCREMENTAL
 from v2hdm.report import style
@@ -76,7 +76,7 @@ def _draw_boxes(axes: Axes, found: Matched) -> int:
 
 
 def save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
-    """Draw the error against the size of the growing map, batch and incremental; returns the caption."""
+    """Draw the error against the size of the map that grows marking by marking; returns the caption."""
     ports = list(dict.fromkeys(record["port"] for record in records))
     if not any(record["growth"] for record in records):
         return None
@@ -92,29 +92,28 @@ def save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
             axes.set_title(f"{port}: the error while the map grows")
         fig.legend(handles=_growth_legend(records), loc="outside lower center", ncols=5)
     return (
-        "Corner RMSE (cm) over the first markings of a drive, all cameras, a line per seed. Opt is solved "
-        "anew at each size, from what the drive has shown of the first markings; 'incremental' is the "
-        "same for the map that was grown marking by marking. CNI and ENI keep a marking as it was when it "
-        "was passed. See at which size Opt falls below CNI."
+        "Corner RMSE (cm) over the first markings of a drive, all cameras, a line per seed. Opt is "
+        "the map that was grown marking by marking (mode=incremental); CNI and ENI keep a marking as it was "
+        "when it was passed. See at which size Opt falls below CNI."
     )
 
 
 def _draw_growth(axes: Axes, growth: Mapping[str, Any]) -> None:
-    for recipe, by_method in growth.items():
-        for method, points in by_method.items():
-            if not points or (recipe != OURS and method != "Opt"):
-                continue
+    for method, points in growth.get(INCREMENTAL, {}).items():
+        if points:
             counts, errors = np.array(points, dtype=np.float64).T
-            look = _INCREMENTAL if recipe == INCREMENTAL else {"mfc": colour(method)}
-            axes.plot(counts, 100 * errors, ms=5, lw=1.3, **_line(method) | look)
+            axes.plot(
+                counts, 100 * errors, marker=style.MARKER[method], ms=5, lw=1.3, color=colour(method),
+                ls=style.LINE[method],
+            )  # fmt: skip
 
 
 def _growth_legend(records: Sequence[Mapping[str, Any]]) -> list[Line2D]:
-    methods = dict.fromkeys(name for record in records for name in record["growth"].get(OURS, {}))
-    handles = [Line2D([], [], label=name, **_line(name)) for name in methods]
-    if any(INCREMENTAL in record["growth"] for record in records):
-        handles.append(Line2D([], [], label="Opt, incremental", **_line("Opt") | _INCREMENTAL))
-    return handles
+    methods = dict.fromkeys(name for record in records for name in record["growth"].get(INCREMENTAL, {}))
+    return [
+        Line2D([], [], color=colour(name), marker=style.MARKER[name], ls=style.LINE[name], label=name)
+        for name in methods
+    ]
 
 
 def save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.io.drive.folder import folder_drive_name, is_folder_drive, read_description, read_folder_drive
-from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of, with_clock_offsets
+from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.io.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive

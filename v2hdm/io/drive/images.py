@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.trajectory import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.safe.pixels import read_header
-from v2hdm.io.trajectory import check_trajectory, interpolate, why_no_pose
+from v2hdm.io.trajectory import check_trajectory, why_no_pose
 from v2hdm.records import Camera, Drive, FloatArray, GeodeticOrigin, Image, PoseNoise, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -166,11 +167,6 @@ def _span(stamp_s: FloatArray) -> str:
     return f"{stamp_s[0]:.3f} to {stamp_s[-1]:.3f} s"
 
 
-def in_order(image: Image) -> tuple[int, float, str]:
-    """Key by which a drive's images are sorted."""
-    return image.visit, image.taken_s, image.camera
-
-
 def part_of(drive: Drive, options: ReadOptions) -> Drive:
     """The images between ``start_s`` and ``end_s`` after the first, at most ``limit`` of each camera."""
     if options.limit is None and options.end_s is None and options.start_s <= 0:
@@ -195,35 +191,3 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
                 f"the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
             )
     return replace(drive, images=tuple(images))
-
-
-def with_clock_offsets(
-    drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, visit: int = 0
-) -> Drive:
-    """The drive with the images of the session ``visit`` posed for when they were taken.
-
-    ``offset_s`` is, by camera, the delay of its images behind their stamps. Images are left out whose time
-    the trajectory does not cover, or where two poses are more than ``max_gap_s`` apart. Raises DriveError
-    when the drive holds no trajectory, or no image of some camera is left.
-    """
-    root, trajectory = drive.visits[visit].root, drive.visits[visit].trajectory
-    if trajectory is None:
-        raise DriveError(f"{root}: holds no trajectory to pose its images anew from")
-    images: list[Image] = [image for image in drive.images if image.visit != visit]
-    for name in dict.fromkeys(image.camera for image in drive.images if image.visit == visit):
-        own = [image for image in drive.images if (image.visit, image.camera) == (visit, name)]
-        if offset := offset_s.get(name):
-            poses, inside = interpolate(
-                trajectory, np.array([one.stamp_s for one in own]) + offset, max_gap_s
-            )
-            own = [
-                replace(own[n], map_from_vehicle=poses[n], clock_offset_s=offset)
-                for n in np.flatnonzero(inside).tolist()
-            ]
-        if not own:
-            raise DriveError(
-                f"{root}: {1e3 * offset_s[name]:.0f} ms after their stamps, no image of '{name}' "
-                "has a pose; record poses for as long as images"
-            )
-        images += own
-    return replace(drive, images=tuple(sorted(images, key=in_order)))

@@ -17,7 +17,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import camera_centre, log
-from v2hdm.io.drive.images import in_order
+from v2hdm.geometry.trajectory import in_order
 from v2hdm.records import (
     Camera,
     CameraInfo,

@@ -27,9 +27,10 @@ from v2hdm.geometry.geodetic import (
     position_of,
 )  # fmt: skip
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.importers import nmea, tables
 from v2hdm.io.importers.tables import Readings
-from v2hdm.io.trajectory import check_geodetic, interpolate, pose_matrices, read_tum, why_no_pose
+from v2hdm.io.trajectory import check_geodetic, pose_matrices, read_tum, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
 

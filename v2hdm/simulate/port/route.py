@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
-from v2hdm.io.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
 

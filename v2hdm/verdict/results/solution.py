@@ -1,7 +1,7 @@
 """After the solve: contradicted inputs, how well everything fits, and whether results agree.
 
-The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); an input that was contradicted and could be
-done without has been dropped (:mod:`v2hdm.mapping.remedy`) and is reported here. Every other sign of a wrong
+The inputs are tested one at a time (:mod:`v2hdm.adjust.score_tests`); an input that was contradicted and could be
+done without has been dropped (:mod:`v2hdm.mapping.recovery`) and is reported here. Every other sign of a wrong
 input is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has the
 figures of clean and spoilt drives.
 """
@@ -15,11 +15,10 @@ import numpy as np
 
 from v2hdm.adjust import Fault
 from v2hdm.ground import GroundEstimate
-from v2hdm.mapping.evidence import Contradiction, SolveEvidence
-from v2hdm.mapping.remedy import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
-from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.site_model.verdict import TOO_UNCERTAIN
+from v2hdm.mapping.recovery import CLOCK_OBSERVABLE_S, CONTRADICTED_SIGMAS, OBSERVABLE_SIGMA, is_contradicted
+from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
+from v2hdm.site.markings import TOO_UNCERTAIN
 from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
@@ -149,7 +148,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
 
 
 def _observable(tested: list[Contradiction]) -> list[Contradiction]:
-    return [one for one in tested if one.sigma <= TOLD_SIGMA[one.fault]]
+    return [one for one in tested if one.sigma <= OBSERVABLE_SIGMA[one.fault]]
 
 
 def _corrected(one: Contradiction) -> Finding:
@@ -188,7 +187,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
     clocks = _of_all(evidence, Fault.CLOCK, Fault.CLOCK)
     loosest_s = max((one.sigma for one in clocks), default=0.0)
-    if loosest_s > CLOCK_TOLD_S and "clock" not in raised:
+    if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = (
             f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, or change the "

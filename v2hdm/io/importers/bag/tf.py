@@ -10,7 +10,8 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
-from v2hdm.io.trajectory import in_order, interpolate, pose_matrices
+from v2hdm.geometry.trajectory import interpolate
+from v2hdm.io.trajectory import in_order, pose_matrices
 from v2hdm.records import FloatArray, Trajectory
 
 Edge = tuple[str, str]

@@ -1,0 +1,230 @@
+"""Where sightings and symbols lie on the ground under a rig, how certainly, and which images show what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, Sightings, Symbols, frames_of
+from v2hdm.geometry.ipm import (
+    apply_homography,
+    direction_covariance,
+    flat_motion,
+    ground_from_pinhole_px,
+    project_ground,
+)
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
+from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
+
+_HORIZON_M2 = 1e4
+"""Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2."""
+
+_SYMBOL_RANGE_M = 16.0
+"""Distance from the vehicle, m, beyond which a symbol's place is too vague to speak against a neighbour."""
+
+_BORDER_PX = 10.0
+"""Width of the image's border, px, within which a marking may be cut."""
+
+
+@dataclass(frozen=True)
+class Located:
+    """Ground positions of S sightings.
+
+    ``corners_map`` (S, 4, 2) m with the covariance ``covariance_m2`` (S, 4, 2, 2) that the pixel
+    noise alone gives them; ``ray_map`` (S, 4, 2) from below the camera to the corner; ``height_m``
+    (S,) of the camera. ``valid`` (S, 4) are points and ``informs`` (S, 4) all corners that say something,
+    as :class:`~v2hdm.association.sightings.Sightings` has them, without those that miss the ground.
+    """
+
+    corners_map: FloatArray
+    covariance_m2: FloatArray
+    ray_map: FloatArray
+    height_m: FloatArray
+    valid: BoolArray
+    informs: BoolArray
+
+    @property
+    def range_m(self) -> FloatArray:
+        """Horizontal distance (S, 4) of each corner from its camera."""
+        return np.asarray(np.linalg.norm(self.ray_map, axis=-1))
+
+    @property
+    def sine_depression(self) -> FloatArray:
+        """Sine (S, 4) of the angle by which each corner's ray points below the horizon."""
+        return np.asarray(self.height_m[:, None] / np.hypot(self.range_m, self.height_m[:, None]))
+
+    def direction_covariance_m2(self, sigma_rad: float) -> FloatArray:
+        """What an uncertain viewing direction adds to ``covariance_m2``: (S, 4, 2, 2)."""
+        return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)
+
+
+def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> FloatArray:
+    """Ground points (N, K, 2), m, of pixels (N, K, 2) by IPMs (N, 3, 3); nan at and above the horizon."""
+    points = back_project(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
+    return np.asarray(points.numpy())
+
+
+def ground_points_with_jacobian(
+    map_from_pinhole_px: FloatArray, pinhole_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """:func:`ground_points` and their derivatives (N, K, 2, 2), m/px, by the pixels; nan where they are."""
+    found = back_project_with_jacobian(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
+    points, jacobian = (one.numpy() for one in found)
+    return points, jacobian
+
+
+def _ipms(rig: Rig, camera: IntArray, frame: IntArray) -> FloatArray:
+    """The IPMs (N, 3, 3), map from pinhole pixels, of cameras (N,) at frames (N,)."""
+    return ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
+
+
+def locate(sightings: Sightings, rig: Rig) -> Located:
+    """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
+    camera, frame = sightings.camera, sightings.frame
+    ipms = _ipms(rig, camera, frame)
+    corners_map, jacobian = ground_points_with_jacobian(ipms, sightings.corners_pinhole_px)
+    covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
+    centre_vehicle = camera_centre(rig.cam_from_vehicle)[camera]
+    poses = rig.map_from_vehicle[frame]
+    centre_map = (poses[:, :3, :3] @ centre_vehicle[..., None])[..., 0] + poses[:, :3, 3]
+    finite = np.asarray(np.isfinite(corners_map).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2)))
+    smallest = np.linalg.eigvalsh(np.where(finite[..., None, None], covariance, np.eye(2)))[..., 0]
+    informs = sightings.informs & finite & (smallest < _HORIZON_M2)
+    return Located(
+        corners_map=corners_map,
+        covariance_m2=covariance,
+        ray_map=corners_map - centre_map[:, None, :2],
+        height_m=np.maximum(centre_map[:, 2], LEAST_HEIGHT_M),
+        valid=sightings.valid & informs,
+        informs=informs,
+    )
+
+
+def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
+    """In how many images a symbol lies along each of the quadrilaterals (G, 4, 2); nan ones have none.
+
+    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; other images
+    show the whole arrow there. A symbol lies along a quadrilateral whose middle line it mostly covers: an
+    arrow that crosses a stop line does not.
+    """
+    count = np.zeros(len(corners_map), dtype=np.int64)
+    known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
+    centre, points = corners_map.mean(axis=1), _middle_line(corners_map)
+    for ground in outlines_on_ground(symbols, rig):
+        if ground is None:
+            continue
+        middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
+        polygon = (ground - middle).astype(np.float32)
+        for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
+            inside = [
+                cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()
+            ]
+            count[group] += 2 * sum(inside) > len(inside)
+    return count
+
+
+def _middle_line(corners_map: FloatArray) -> FloatArray:
+    """Five points (G, 5, 2) spread evenly over the longer middle lines of quadrilaterals (G, 4, 2)."""
+    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
+    across = np.stack([sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1]], axis=1)
+    longer = np.argmax(np.linalg.norm(across, axis=2), axis=1)
+    way = across[np.arange(len(across)), longer]
+    return np.asarray(corners_map.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None])
+
+
+def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
+    """The outline (K, 2) of each symbol in the map, None of those too far away."""
+    if not len(symbols.camera):
+        return []
+    length = [len(outline) for outline in symbols.outlines_pinhole_px]
+    of_point = np.repeat(np.arange(len(length)), length)
+    points_px = np.concatenate(symbols.outlines_pinhole_px)
+    ground = ground_points(_ipms(rig, symbols.camera, symbols.frame)[of_point], points_px[:, None])[:, 0]
+    position = rig.map_from_vehicle[symbols.frame, :2, 3]
+    within = np.linalg.norm(ground - position[of_point], axis=1) <= _SYMBOL_RANGE_M
+    outlines = np.split(ground, np.cumsum(length)[:-1])
+    near = [bool(own.all()) for own in np.split(within, np.cumsum(length)[:-1])]
+    return [outline if one else None for outline, one in zip(outlines, near, strict=True)]
+
+
+@dataclass(frozen=True)
+class Views:
+    """The images of the mapped cameras: ``image`` (V,), ``camera`` (V,) and ``frame`` (V,)."""
+
+    image: IntArray
+    camera: IntArray
+    frame: IntArray
+
+
+def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
+    """All images that ``cameras`` took, whether anything was detected in them or not."""
+    index = {name: c for c, name in enumerate(cameras)}
+    rows = [i for i, image in enumerate(drive.images) if image.camera in index]
+    return Views(
+        image=np.array(rows, dtype=np.int64),
+        camera=np.array([index[drive.images[i].camera] for i in rows], dtype=np.int64),
+        frame=frames_of(drive).frame_of_image[rows],
+    )
+
+
+def easy_views(
+    views: Views,
+    rig: Rig,
+    cameras: Sequence[Camera],
+    corners_map: FloatArray,
+    within_m: float | None = None,
+) -> tuple[IntArray, IntArray]:
+    """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
+
+    ``cameras`` are the rig's, for image sizes and regions of interest, in whose place ``within_m`` of
+    distance from the camera counts if given; markings (G, 4, 2) with nan corners are in no view.
+    """
+    whole = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
+    groups, images = [], []
+    for c, camera in enumerate(cameras):
+        own = views.camera == c
+        if not own.any() or not len(whole):
+            continue
+        centre = camera_centre(rig.cam_from_vehicle[c])[:2]
+        reach_m = float(np.max(np.linalg.norm(camera.roi_vehicle, axis=1)))
+        if within_m is not None:
+            reach_m = within_m + float(np.linalg.norm(centre))
+        positions = rig.map_from_vehicle[views.frame[own]][:, :2, 3]
+        near = cKDTree(positions).query_ball_point(corners_map[whole].mean(axis=1), reach_m)
+        group = np.repeat(whole, [len(n) for n in near])
+        view = np.flatnonzero(own)[np.concatenate([np.asarray(n, dtype=np.int64) for n in near])]
+        vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
+        seen = _sees(camera, rig.cam_from_vehicle[c], vehicle_from_map, corners_map[group], within_m)
+        groups.append(group[seen])
+        images.append(views.image[view[seen]])
+    empty = [np.zeros(0, dtype=np.int64)]
+    return np.concatenate(groups or empty), np.concatenate(images or empty)
+
+
+def _sees(
+    camera: Camera,
+    cam_from_vehicle: FloatArray,
+    vehicle_from_map: FloatArray,
+    corners_map: FloatArray,
+    within_m: float | None,
+) -> NDArray[np.bool_]:
+    """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
+    corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners_map)
+    if within_m is None:
+        inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
+    else:
+        away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
+        inside = np.asarray(away_m <= within_m).all(axis=1)
+    pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
+    limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
+    with np.errstate(invalid="ignore"):
+        on_image = ((pixel > _BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
+    return np.asarray(inside & on_image)

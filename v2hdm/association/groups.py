@@ -1,0 +1,371 @@
+"""Which sightings belong together, where the groups lie, and groups that turn out to be one marking.
+
+Tracks break at occlusions and shadows, and each lap and each camera makes its own. Under an extrinsic that
+can be trusted they coincide in the map, up to their covariances. A dash that runs through the image from
+border to border is two lines, which look alike wherever the vehicle is: such sightings are attached last, to
+the one marking of the map that they fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.association.ground import Located
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+_LEAST_DEPTH_M = 1.0
+"""Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
+
+LEAST_TOLERANCE_M = 0.05
+"""How far corners of one shape may deviate, m, however small the marking is."""
+
+_CORNER_FLOOR_M = 0.001
+"""Floor of a corner's sigma where groups are fused, m."""
+
+_HUBER_SIGMAS = 2.0
+"""Residual in sigmas from which a sighting's weight in its group falls."""
+
+OPEN_END_M = 10.0
+"""Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
+
+
+@dataclass(frozen=True)
+class Association:
+    """Groups of sightings: tracks of one camera, or markings of the map.
+
+    ``group`` (S,) numbers groups from 0, -1 for sightings that belong to none; ``shift`` (S,) turns
+    a sighting's corners into its group's order: corner c of the group is corner (c + shift) mod 4
+    of the sighting. ``count`` is the number of groups.
+    """
+
+    group: IntArray
+    shift: IntArray
+    count: int
+
+    def corner_order(self) -> IntArray:
+        """Which of each sighting's corners is corner c of its group (S, 4)."""
+        return np.asarray((np.arange(4) + self.shift[:, None]) % 4)
+
+    def in_group_order(self, per_corner: NDArray[_Scalar]) -> NDArray[_Scalar]:
+        """Reorder the second axis of ``per_corner`` (S, 4, ...) into the order of the groups."""
+        return per_corner[np.arange(len(per_corner))[:, None], self.corner_order()]
+
+
+def keep_rows(association: Association, rows: BoolArray) -> Association:
+    """The association restricted to the sightings marked in ``rows`` (S,), groups renumbered."""
+    kept = rows & (association.group >= 0)
+    numbers, group = np.unique(association.group[kept], return_inverse=True)
+    full = np.full(len(association.group), -1, dtype=np.int64)
+    full[kept] = group
+    return Association(full, association.shift, len(numbers))
+
+
+def same_groups(a: Association, b: Association) -> bool:
+    """Whether ``a`` and ``b`` divide the sightings that both of them group in the same way."""
+    common = (a.group >= 0) & (b.group >= 0)
+    pairs = len(np.unique(np.stack([a.group[common], b.group[common]]), axis=1).T)
+    return pairs == len(np.unique(a.group[common])) == len(np.unique(b.group[common]))
+
+
+@dataclass(frozen=True)
+class FusedGroups:
+    """Where G groups lie: ``corners_map`` (G, 4, 2) m with ``covariance_m2`` (G, 4, 2, 2).
+
+    ``seen`` (G, 4) counts the sightings that show a corner as a point. A corner without any may still lie on
+    a known line, and says so by its covariance; if nothing is known of it, it is nan.
+    """
+
+    corners_map: FloatArray
+    covariance_m2: FloatArray
+    seen: IntArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which corners (G, 4) were seen as points."""
+        return np.asarray(self.seen > 0)
+
+
+def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
+    """Corners (S, 4) that a sighting knows only across their side, and others of its group as points.
+
+    Where other paint, a shadow or the image's border cuts a marking, its corner is somewhere on the line of
+    the side, no nearer than the cut. Images that are cut alike are wrong alike: as soon as another image
+    shows the corner, only the line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
+    """
+    grouped = (association.group >= 0)[:, None]
+    number = 4 * association.group[:, None] + np.arange(4)
+    points = association.in_group_order(point) & grouped
+    has_point = np.zeros(4 * association.count + 1, dtype=np.bool_)
+    has_point[number[points]] = True
+    out = np.zeros_like(point)
+    known = grouped & has_point[np.where(grouped, number, -1)]
+    np.put_along_axis(out, association.corner_order(), known, axis=1)
+    return np.asarray(out & informs & ~point)
+
+
+def line_only(covariance: FloatArray, sigma: float) -> FloatArray:
+    """Covariances (..., 2, 2) whose longer axis is made at least ``sigma`` long."""
+    value, vector = np.linalg.eigh(covariance)
+    value[..., 1] = np.maximum(value[..., 1], sigma**2)
+    return np.asarray((vector * value[..., None, :]) @ np.swapaxes(vector, -1, -2))
+
+
+def fuse_groups(association: Association, located: Located, jitter_rad: float) -> FusedGroups:
+    """Information-weighted mean of each group's corners, with Huber weights from its own median.
+
+    A sighting's covariance is that of its pixels plus what ``jitter_rad`` of viewing direction
+    makes of it at its range, so that one far sighting cannot ruin the mean of near ones.
+    """
+    corners = association.in_group_order(located.corners_map)
+    grouped = (association.group >= 0)[:, None]
+    informs = association.in_group_order(located.informs) & grouped
+    point = association.in_group_order(located.valid) & grouped
+    noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
+    on_line = known_elsewhere(association, located.valid, located.informs)
+    noise[on_line] = line_only(noise[on_line], OPEN_END_M)
+    covariance = association.in_group_order(noise) + _CORNER_FLOOR_M**2 * np.eye(2)
+    information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
+    corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)
+    points = np.where(informs[..., None], corners, 0.0)
+    size = association.count * 4 + 1
+    weight = informs.astype(float)
+    for _ in range(3):
+        total = np.zeros((size, 2, 2))
+        vector = np.zeros((size, 2))
+        weighted = information * weight[..., None, None]
+        np.add.at(total, corner, weighted)
+        np.add.at(vector, corner, (weighted @ points[..., None])[..., 0])
+        solvable = np.linalg.det(total) > 0
+        spread = np.linalg.inv(np.where(solvable[:, None, None], total, np.eye(2)))
+        mean = (spread @ vector[..., None])[..., 0]
+        miss = points - mean[corner]
+        distance = np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", miss, information, miss), 1e-12))
+        weight = informs * np.minimum(1.0, _HUBER_SIGMAS / distance)
+    seen = np.bincount(corner[point], minlength=size)[:-1]
+    mean[~solvable] = np.nan
+    return FusedGroups(
+        corners_map=mean[:-1].reshape(-1, 4, 2),
+        covariance_m2=spread[:-1].reshape(-1, 4, 2, 2),
+        seen=seen.reshape(-1, 4).astype(np.int64),
+    )
+
+
+def in_view(
+    association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float
+) -> BoolArray:
+    """Which corners (S, 4) the adjustment may use: points, and those on lines that the camera can see.
+
+    A dash that passes under the vehicle is cut by the image's border; its side is a line of the image, but
+    where its corner lies behind the camera the line cannot be had by projecting the corner.
+    """
+    fused = fuse_groups(association, located, jitter_rad)
+    cam_from_map = rig.cam_from_map(sightings.camera, sightings.frame)
+    group = np.maximum(association.group, 0)
+    corners = fused.corners_map[group] if association.count else np.full(located.corners_map.shape, np.nan)
+    _, depth_m = project_ground(rig.intrinsic[sightings.camera], cam_from_map, corners)
+    order = association.corner_order()
+    in_front = np.zeros_like(located.valid)
+    with np.errstate(invalid="ignore"):
+        np.put_along_axis(in_front, order, depth_m > _LEAST_DEPTH_M, axis=1)
+    return np.asarray(located.valid | (located.informs & in_front))
+
+
+def merge_groups(
+    association: Association,
+    sightings: Sightings,
+    fused: FusedGroups,
+    *,
+    floor_m: float,
+    gate_sigmas: float,
+    max_distance_m: float,
+    shape_tolerance: float,
+) -> Association:
+    """Merge groups of one class and shape that coincide in the map, nearest pairs first.
+
+    Two groups with a sighting in the same image are two markings and are never merged.
+
+    Args:
+        association: the groups to merge.
+        sightings: the table that they index.
+        fused: where the groups lie.
+        floor_m: sigma added to each position for what shifts whole groups: extrinsic, RTK drift.
+        gate_sigmas: largest distance of two groups in sigmas.
+        max_distance_m: largest distance of two groups in metres.
+        shape_tolerance: largest deviation of a corner as a fraction of the marking's diameter.
+    """
+    if not association.count:
+        return association
+    pairs, shifts, distance = _coinciding_pairs(
+        association, sightings, fused, floor_m, gate_sigmas, max_distance_m, shape_tolerance
+    )
+    root = np.arange(association.count)
+    # Corner c of the root is corner (c + turn) mod 4 of the group.
+    turn = np.zeros(association.count, dtype=np.int64)
+    images = _images_of_groups(association, sightings)
+    for p in np.argsort(distance, kind="stable"):
+        (a, b), s = pairs[p], shifts[p]
+        root_a, root_b = root[a], root[b]
+        if root_a == root_b or not images[root_a].isdisjoint(images[root_b]):
+            continue
+        members = root == root_b
+        turn[members] = (turn[members] + turn[a] + s - turn[b]) % 4
+        root[members] = root_a
+        images[root_a] |= images[root_b]
+    kept, number = np.unique(root, return_inverse=True)
+    grouped = association.group >= 0
+    safe = np.where(grouped, association.group, 0)
+    return Association(
+        group=np.where(grouped, number[safe], -1),
+        shift=(association.shift + np.where(grouped, turn[safe], 0)) % 4,
+        count=len(kept),
+    )
+
+
+def group_kinds(association: Association, sightings: Sightings) -> IntArray:
+    """The most frequent class (G,) among each group's sightings."""
+    votes = np.zeros((association.count, int(sightings.kind.max(initial=0)) + 1), dtype=np.int64)
+    grouped = association.group >= 0
+    np.add.at(votes, (association.group[grouped], sightings.kind[grouped]), 1)
+    return np.asarray(votes.argmax(axis=1))
+
+
+def _coinciding_pairs(
+    association: Association,
+    sightings: Sightings,
+    fused: FusedGroups,
+    floor_m: float,
+    gate_sigmas: float,
+    max_distance_m: float,
+    shape_tolerance: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs (P, 2) of groups that may be one marking, their shifts (P,) and distances (P,) in sigmas."""
+    usable = np.flatnonzero(fused.valid.sum(axis=1) >= 2)
+    centre = np.nanmean(fused.corners_map[usable], axis=1)
+    # Of a drive of a few images the extrinsic is hardly known, and rays may meet the ground nowhere.
+    somewhere = np.isfinite(centre).all(axis=1)
+    usable, centre = usable[somewhere], centre[somewhere]
+    kind = group_kinds(association, sightings)
+    size_m = diameters(fused.corners_map, fused.valid)
+    # Centres over different valid corners differ by up to half a diameter.
+    reach_m = max_distance_m + 0.5 * float(np.max(size_m[usable], initial=0.0))
+    pairs = usable[cKDTree(centre).query_pairs(reach_m, output_type="ndarray")] if len(usable) else _NO_PAIRS
+    a, b = pairs[:, 0], pairs[:, 1]
+    found = align(fused.corners_map[a], fused.valid[a], fused.corners_map[b], fused.valid[b])
+    covariance = _mean_covariance(fused, a) + _mean_covariance(fused, b) + 2 * floor_m**2 * np.eye(2)
+    solved = np.linalg.solve(covariance, found.offset[..., None])[..., 0]
+    distance = np.sqrt(np.sum(found.offset * solved, axis=-1))
+    tolerance_m = np.maximum(shape_tolerance * np.maximum(size_m[a], size_m[b]), LEAST_TOLERANCE_M)
+    accepted = (
+        (kind[a] == kind[b])
+        & (distance <= gate_sigmas)
+        & (np.linalg.norm(found.offset, axis=-1) <= max_distance_m)
+        & (found.deformation_m <= tolerance_m)
+    )
+    return pairs[accepted], found.shift[accepted], distance[accepted]
+
+
+_NO_PAIRS: IntArray = np.zeros((0, 2), dtype=np.int64)
+
+
+def _mean_covariance(fused: FusedGroups, groups: IntArray) -> FloatArray:
+    """Mean covariance (P, 2, 2) of the seen corners of ``groups``."""
+    valid = fused.valid[groups][..., None, None]
+    covariance = np.where(valid, fused.covariance_m2[groups], 0.0)
+    return np.asarray(covariance.sum(axis=1) / np.maximum(valid.sum(axis=1), 1))
+
+
+def _images_of_groups(association: Association, sightings: Sightings) -> list[set[int]]:
+    images: list[set[int]] = [set() for _ in range(association.count)]
+    for group, image in zip(association.group.tolist(), sightings.image.tolist(), strict=True):
+        if group >= 0:
+            images[group].add(image)
+    return images
+
+
+_REACH_M = 4.0
+"""How far, m, the middle of a sighting may be from the centre of its marking: dashes are up to 6 m long."""
+
+_MOST_SQUARED = 16.0
+"""Squared distance, in sigmas, up to which a sighting fits: four corners on lines have as many freedoms."""
+
+_CLEARER_BY = 9.0
+"""How much worse any other marking, or order of corners, must fit, in squared sigmas."""
+
+
+def attach(
+    association: Association,
+    sightings: Sightings,
+    located: Located,
+    rig: Rig,
+    fused: FusedGroups,
+    jitter_rad: float,
+) -> Association:
+    """Give each sighting without a group to the one that alone fits it; an image shows a group once.
+
+    ``located`` is under ``rig``; of the groups only those of four known corners in ``fused`` are looked at;
+    ``jitter_rad`` is how far the recorded attitude is off.
+    """
+    rows = np.flatnonzero((association.group < 0) & (located.informs.sum(axis=1) >= 2))
+    whole = np.flatnonzero(fused.valid.all(axis=1))
+    if not len(rows) or not len(whole):
+        return association
+    row, near = near_pairs(located, rows, fused.corners_map[whole].mean(axis=1), _REACH_M)
+    group = whole[near]
+    alike = group_kinds(association, sightings)[group] == sightings.kind[row]
+    row, group = row[alike], group[alike]
+    squared = squared_distances(sightings, located, rig, row, fused.corners_map[group], jitter_rad)
+    out_group, out_shift = association.group.copy(), association.shift.copy()
+    shown = set(zip(association.group.tolist(), sightings.image.tolist(), strict=True))
+    for one in np.unique(row):
+        own = np.flatnonzero(row == one)
+        order = np.argsort(squared[own], axis=None)
+        pair, shift = divmod(int(order[0]), 4)
+        best, second = squared[own].ravel()[order[:2]]
+        place = (int(group[own[pair]]), int(sightings.image[one]))
+        if best <= _MOST_SQUARED and second >= best + _CLEARER_BY and place not in shown:
+            out_group[one], out_shift[one] = place[0], shift
+            shown.add(place)
+    return Association(out_group, out_shift, association.count)
+
+
+def near_pairs(
+    located: Located, rows: IntArray, centres_map: FloatArray, reach_m: float
+) -> tuple[IntArray, IntArray]:
+    """Pairs (P,), (P,) of sightings, out of ``rows``, and places (G, 2) within reach of their middles."""
+    informs = located.informs[rows][..., None]
+    middle = np.where(informs, located.corners_map[rows], 0.0).sum(axis=1) / informs.sum(axis=1)
+    near = cKDTree(centres_map).query_ball_point(middle, reach_m)
+    row = np.repeat(rows, [len(places) for places in near])
+    return row, np.concatenate([np.asarray(places, dtype=np.int64) for places in near])
+
+
+def squared_distances(
+    sightings: Sightings,
+    located: Located,
+    rig: Rig,
+    row: IntArray,
+    corners_map: FloatArray,
+    jitter_rad: float,
+) -> FloatArray:
+    """Squared distances (P, 4), in sigmas, of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
+    camera = sightings.camera[row]
+    cam_from_map = rig.cam_from_map(camera, sightings.frame[row])
+    expected, depth_m = project_ground(rig.intrinsic[camera], cam_from_map, corners_map)
+    jitter_px = rig.intrinsic[camera, 0, 0] * jitter_rad
+    noise = sightings.covariance_px[row] + jitter_px[:, None, None, None] ** 2 * np.eye(2)
+    used = located.informs[row]
+    information = np.linalg.inv(np.where(used[..., None, None], noise, np.eye(2)))[:, SHIFTS]
+    off = np.where(used[..., None], sightings.corners_pinhole_px[row], 0.0)[:, SHIFTS] - expected[:, None]
+    each = np.einsum("psci,pscij,pscj->psc", off, information, off)
+    each = np.where(depth_m[:, None] > 0, each, np.inf)
+    return np.asarray(np.where(used[:, SHIFTS], each, 0.0).sum(axis=2))

@@ -1,0 +1,248 @@
+"""Detections as one table of arrays, and the rig that took them: every later step works on these."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2hdm.errors import MappingError
+from v2hdm.geometry.lens import has_distortion, undistort_points
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
+
+LEAST_HEIGHT_M = 0.1
+"""Least height of a camera, m, for what divides by it."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras and frames as the mapping currently believes them to be.
+
+    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4).
+    """
+
+    intrinsic: FloatArray
+    cam_from_vehicle: FloatArray
+    map_from_vehicle: FloatArray
+
+    def cam_from_map(self, camera: IntArray, frame: IntArray) -> FloatArray:
+        """The poses (N, 4, 4) of cameras (N,) at frames (N,)."""
+        return np.asarray(self.cam_from_vehicle[camera] @ np.linalg.inv(self.map_from_vehicle[frame]))
+
+    @property
+    def height_m(self) -> FloatArray:
+        """Heights (C,) of the camera centres above the ground of the vehicle."""
+        return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], LEAST_HEIGHT_M))
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes."""
+
+    camera: IntArray
+    frame: IntArray
+    outlines_pinhole_px: tuple[FloatArray, ...]
+    kinds: tuple[str, ...]
+
+
+NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), ())
+
+
+def collect_symbols(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    camera_index: Mapping[str, int],
+    frame_of_image: IntArray,
+) -> Symbols:
+    """The symbols that the images of some cameras show, lens distortion removed."""
+    camera, frame, outlines, kinds = [], [], [], []
+    for found in detections:
+        name = drive.images[found.image].camera
+        if name not in camera_index:
+            continue
+        for marking in found.markings:
+            if len(marking.outline_px) >= 3:
+                camera.append(camera_index[name])
+                frame.append(int(frame_of_image[found.image]))
+                kinds.append(marking.kind)
+                outlines.append(undistort_points(drive.cameras[name].info, marking.outline_px))
+    indices = np.array(camera, dtype=np.int64), np.array(frame, dtype=np.int64)
+    return Symbols(*indices, tuple(outlines), tuple(kinds))
+
+
+SIDE_SIGMA_PX = 3.0
+"""Largest sigma across, px, of a corner that is known to lie on a line; a vaguer one says next to nothing."""
+
+POINT_SIGMA_PX = 10.0
+"""Largest sigma, px, that a detector states for a corner that it takes for a point."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """S quadrilateral detections of a drive, in the order of its images.
+
+    ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
+    F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
+    images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
+    ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
+    says which of them are points, small in every direction. ``symbols`` are those of the same images.
+    ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
+    """
+
+    cameras: tuple[str, ...]
+    stamp_s: FloatArray
+    map_from_vehicle: FloatArray
+    image: IntArray
+    camera: IntArray
+    frame: IntArray
+    kind: IntArray
+    corners_pinhole_px: FloatArray
+    covariance_px: FloatArray
+    valid: BoolArray
+    kinds: tuple[str, ...]
+    visit: IntArray
+    symbols: Symbols = NO_SYMBOLS
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @property
+    def informs(self) -> BoolArray:
+        """Which corners (S, 4) the adjustment may use: points, and corners that lie on a known line.
+
+        The end of a dash that the image's border cuts is such a corner: its sigma is small across the dash
+        and large along it. A corner that is no point, but claims to be small in every direction, is neither.
+        """
+        finite = np.asarray(np.isfinite(self.covariance_px).all(axis=(2, 3)))
+        finite &= np.isfinite(self.corners_pinhole_px).all(axis=2)
+        variance = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance_px, np.eye(2)))
+        line = (variance[..., 0] <= SIDE_SIGMA_PX**2) & (variance[..., 1] > POINT_SIGMA_PX**2)
+        return np.asarray(finite & (self.valid | line))
+
+    def subset(self, rows: IntArray | BoolArray) -> Sightings:
+        """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
+        of_rows = ("image", "camera", "frame", "kind", "corners_pinhole_px", "covariance_px", "valid")
+        return replace(self, **{name: getattr(self, name)[rows] for name in of_rows})
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The distinct times of a drive's visits, and the recorded poses then.
+
+    ``frame_of_image`` (I,) indexes ``visit`` (F,), ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4).
+    """
+
+    frame_of_image: IntArray
+    visit: IntArray
+    stamp_s: FloatArray
+    map_from_vehicle: FloatArray
+
+
+def frames_of(drive: Drive) -> Frames:
+    """Number the distinct times of ``drive``; images of one visit that were taken together share a frame."""
+    taken = np.array([(image.visit, image.taken_s) for image in drive.images])
+    distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
+    poses = np.stack([drive.images[i].map_from_vehicle for i in first])
+    return Frames(
+        frame_of_image=inverse.ravel().astype(np.int64),
+        visit=distinct[:, 0].astype(np.int64),
+        stamp_s=distinct[:, 1],
+        map_from_vehicle=poses.astype(np.float64),
+    )
+
+
+def collect_sightings(
+    drive: Drive, detections: Sequence[ImageDetections], cameras: Sequence[str]
+) -> Sightings:
+    """Put the quadrilateral detections of ``cameras`` into one table, lens distortion removed.
+
+    Raises:
+        MappingError: the drive has no such camera, or its images hold no usable marking.
+    """
+    camera_index = _camera_index(drive, cameras)
+    frames = frames_of(drive)
+    rows = [
+        (found.image, marking)
+        for found in sorted(detections, key=lambda one: one.image)
+        if drive.images[found.image].camera in camera_index
+        for marking in found.markings
+        if not len(marking.outline_px)
+    ]
+    nothing = (
+        f"no marking was found in the images of {', '.join(cameras)} of drive {drive.name}; check "
+        "that the detector knows this kind of paint and that the images show it within range."
+    )
+    if not rows:
+        raise MappingError(nothing)
+    kinds = tuple(sorted({marking.kind for _, marking in rows}))
+    image = np.array([i for i, _ in rows], dtype=np.int64)
+    camera = np.array([camera_index[drive.images[i].camera] for i in image], dtype=np.int64)
+    corners = np.stack([marking.corners_px for _, marking in rows]).astype(np.float64)
+    covariance = np.stack([_corner_blocks(marking.covariance_px) for _, marking in rows])
+    for name, c in camera_index.items():
+        own = camera == c
+        corners[own], covariance[own] = _undistort(drive.cameras[name].info, corners[own], covariance[own])
+    valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
+    valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
+    sightings = Sightings(
+        cameras=tuple(cameras),
+        stamp_s=frames.stamp_s,
+        map_from_vehicle=frames.map_from_vehicle,
+        image=image,
+        camera=camera,
+        frame=frames.frame_of_image[image],
+        kind=np.array([kinds.index(m.kind) for _, m in rows], dtype=np.int64),
+        corners_pinhole_px=corners,
+        covariance_px=covariance,
+        valid=valid,
+        kinds=kinds,
+        visit=frames.visit,
+        symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
+    )
+    sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)
+    if not len(sightings):
+        raise MappingError(nothing)
+    return sightings
+
+
+def camera_of(drive: Drive, name: str) -> Camera:
+    """The camera ``name`` of ``drive``.
+
+    Raises:
+        MappingError: the drive has no such camera.
+    """
+    if name not in drive.cameras:
+        known = ", ".join(drive.cameras)
+        raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")
+    return drive.cameras[name]
+
+
+def _camera_index(drive: Drive, cameras: Sequence[str]) -> dict[str, int]:
+    for name in cameras:
+        camera_of(drive, name)
+    return {name: c for c, name in enumerate(cameras)}
+
+
+def _corner_blocks(covariance_px: FloatArray) -> FloatArray:
+    """The four 2 x 2 diagonal blocks of an 8 x 8 corner covariance."""
+    blocks = np.asarray(covariance_px, dtype=np.float64).reshape(4, 2, 4, 2)
+    return blocks[range(4), :, range(4), :]
+
+
+def _undistort(
+    info: CameraInfo, corners_px: FloatArray, covariance_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Corners (S, 4, 2) and covariances (S, 4, 2, 2) moved from recorded to pinhole pixels."""
+    if not has_distortion(info):
+        return corners_px, covariance_px
+    step_px = 0.5
+    flat = corners_px.reshape(-1, 2)
+    columns = [
+        undistort_points(info, flat + step) - undistort_points(info, flat - step)
+        for step in (np.array([step_px, 0.0]), np.array([0.0, step_px]))
+    ]
+    jacobian = np.stack(columns, axis=2).reshape(*corners_px.shape, 2) / (2 * step_px)
+    moved = jacobian @ covariance_px @ np.swapaxes(jacobian, -1, -2)
+    return undistort_points(info, flat).reshape(corners_px.shape), moved

@@ -1,0 +1,268 @@
+"""Sightings of one marking, linked from image to image of one camera.
+
+A wrong IPM puts every marking in the wrong place, metres off at range, but in nearly the same wrong
+place in two consecutive images. So sightings are first linked along the drive, with a gate that
+grows with the motion between the images, and only later compared across gaps, laps and cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from v2hdm.association.ground import Located
+from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
+from v2hdm.association.options import AssociationOptions
+from v2hdm.association.sightings import NO_SYMBOLS, Rig, Sightings
+from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
+from v2hdm.geometry.rigid import heading_rad
+from v2hdm.mapping.crew import ALONE, Crew
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+_REFUSED = 1e9
+"""Cost of a pair that the assignment must not make."""
+
+_POSITION_FLOOR_M = 0.02
+"""Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The errors that gates allow for.
+
+    ``direction_rad`` of an extrinsic, ``jitter_rad`` of roll and pitch from frame to frame, ``position_m``.
+    """
+
+    direction_rad: float
+    jitter_rad: float
+    position_m: float
+
+
+@dataclass
+class _Track:
+    """The latest state of one track: ``row`` of its last sighting, corners in the track's order."""
+
+    number: int
+    row: int
+    corners_map: FloatArray
+    valid: BoolArray
+
+    def extend(self, row: int, shift: int, located: Located) -> None:
+        """Take in the sighting at ``row``, whose corners are ``shift`` behind the track's."""
+        valid = located.valid[row][SHIFTS[shift]]
+        self.corners_map[valid] = located.corners_map[row][SHIFTS[shift]][valid]
+        self.valid |= valid
+        self.row = row
+
+
+def build_tracks(
+    sightings: Sightings,
+    located: Located,
+    rig: Rig,
+    uncertainty: Uncertainty,
+    options: AssociationOptions,
+    crew: Crew = ALONE,
+) -> Association:
+    """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
+
+    A sighting continues at most one track and a track takes at most one sighting of an image. A
+    sighting that continues none starts its own. Sightings with fewer than two valid corners on the
+    ground belong to no track. No track outlives its visit: each visit is linked by itself, by ``crew``.
+    """
+    visit = sightings.visit[sightings.frame]
+    rows = [np.flatnonzero(visit == own) for own in np.unique(visit)]
+    begun = [
+        crew.begin(partial(_link, *_of_visit(sightings, located, rig, own), uncertainty, options))
+        for own in rows
+    ]
+    linked = [wait() for wait in begun]
+    group = np.full(len(sightings), -1, dtype=np.int64)
+    shift = np.zeros(len(sightings), dtype=np.int64)
+    # Tracks are numbered camera by camera, and of each visit by visit.
+    counts = np.array([one.counts for one in linked], dtype=np.int64).reshape(-1, len(sightings.cameras))
+    before = np.cumsum(counts.T.flatten()).reshape(counts.T.shape).T - counts
+    for own, one, first in zip(rows, linked, before, strict=True):
+        group[own] = np.where(one.number >= 0, one.number + first[sightings.camera[own]], -1)
+        shift[own] = one.shift
+    return Association(group, shift, int(counts.sum()))
+
+
+class _Linked(NamedTuple):
+    """Tracks of one visit: ``number`` (S,) among those of the camera, -1 in none; ``counts`` by camera."""
+
+    number: IntArray
+    shift: IntArray
+    counts: list[int]
+
+
+def _of_visit(
+    sightings: Sightings, located: Located, rig: Rig, rows: IntArray
+) -> tuple[Sightings, Located, FloatArray]:
+    """The ``rows`` of one visit and its frames alone: sightings, where they lie, and its poses."""
+    own = sightings.subset(rows)
+    frames = slice(int(own.frame.min()), int(own.frame.max()) + 1)
+    own = replace(
+        own,
+        frame=own.frame - frames.start,
+        stamp_s=own.stamp_s[frames],
+        map_from_vehicle=own.map_from_vehicle[frames],
+        visit=own.visit[frames],
+        symbols=NO_SYMBOLS,
+    )
+    place = Located(**{name: values[rows] for name, values in vars(located).items()})
+    return own, place, rig.map_from_vehicle[frames]
+
+
+def _link(
+    sightings: Sightings,
+    located: Located,
+    map_from_vehicle: FloatArray,
+    uncertainty: Uncertainty,
+    options: AssociationOptions,
+) -> _Linked:
+    """Link the sightings of one visit, whose frames have the poses ``map_from_vehicle``."""
+    number = np.full(len(sightings), -1, dtype=np.int64)
+    shift = np.zeros(len(sightings), dtype=np.int64)
+    linker = _Linker(sightings, located, map_from_vehicle, uncertainty, options)
+    counts = []
+    for camera in range(len(sightings.cameras)):
+        count = 0
+        rows_of_camera = np.flatnonzero((sightings.camera == camera) & (located.valid.sum(axis=1) >= 2))
+        images = np.flatnonzero(np.diff(sightings.image[rows_of_camera], prepend=-1) != 0)
+        active: list[_Track] = []
+        for rows in np.split(rows_of_camera, images[1:]):
+            if not len(rows):
+                continue
+            active = [track for track in active if linker.is_alive(track, rows[0])]
+            continued = linker.match(active, rows)
+            for row in rows.tolist():
+                if row in continued:
+                    track, shift[row] = continued[row]
+                    track.extend(row, int(shift[row]), located)
+                else:
+                    track = _Track(count, row, located.corners_map[row].copy(), located.valid[row].copy())
+                    active.append(track)
+                    count += 1
+                number[row] = track.number
+        counts.append(count)
+    return _Linked(number, shift, counts)
+
+
+class _Linker:
+    """Matches the sightings of one image with the tracks that are alive."""
+
+    def __init__(
+        self,
+        sightings: Sightings,
+        located: Located,
+        map_from_vehicle: FloatArray,
+        uncertainty: Uncertainty,
+        options: AssociationOptions,
+    ) -> None:
+        self._sightings = sightings
+        self._located = located
+        self._uncertainty = uncertainty
+        self._options = options
+        steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
+        self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
+        self._noise_m2 = _noise_covariances(located, uncertainty)
+        self._ray_map, self._range_m = _mean_rays(located)
+        self._centre_map = mean_corners(located.corners_map, located.valid)
+        self._size_m = diameters(located.corners_map, located.valid)
+
+    def is_alive(self, track: _Track, row: int) -> bool:
+        """Whether ``track`` may still be continued by the sighting at ``row``."""
+        now, last = self._sightings.frame[[row, track.row]]
+        return bool(self._odometer_m[now] - self._odometer_m[last] <= self._options.max_gap_m)
+
+    def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
+        """For each row that continues a track: the track and the shift of the row's corners."""
+        if not tracks:
+            return {}
+        last = np.array([track.row for track in tracks])
+        corners = np.stack([track.corners_map for track in tracks])
+        valid = np.stack([track.valid for track in tracks])
+        size_m = diameters(corners, valid)
+        t, d = self._near(last, mean_corners(corners, valid), size_m, rows)
+        own = rows[d]
+        found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
+        cost = self._mahalanobis2(found.offset, last[t], own)
+        tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], LEAST_TOLERANCE_M)
+        shape = found.deformation_m / tolerance_m
+        accepted = (
+            (cost <= self._options.gate_sigmas**2)
+            & (np.linalg.norm(found.offset, axis=-1) <= self._options.max_gate_m)
+            & (shape <= 1.0)
+        )
+        t, d = t[accepted], d[accepted]
+        costs = np.full((len(tracks), len(rows)), _REFUSED)
+        costs[t, d] = (cost + shape**2)[accepted]
+        shift = np.zeros(costs.shape, dtype=np.int64)
+        shift[t, d] = found.shift[accepted]
+        picked = zip(*linear_sum_assignment(costs), strict=True)
+        return {int(rows[d]): (tracks[t], int(shift[t, d])) for t, d in picked if costs[t, d] < _REFUSED}
+
+    def _near(
+        self, last: IntArray, centre_map: FloatArray, size_m: FloatArray, rows: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Pairs of tracks and ``rows``, by index, of one class and no farther apart than their sizes."""
+        apart_m = np.linalg.norm(centre_map[:, None] - self._centre_map[rows], axis=-1)
+        reach_m = self._options.max_gate_m + size_m[:, None] + self._size_m[rows]
+        alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
+        pair = np.argwhere(alike & (apart_m <= reach_m))
+        return pair[:, 0], pair[:, 1]
+
+    def _mahalanobis2(self, offset: FloatArray, last: IntArray, rows: IntArray) -> FloatArray:
+        """Squared normalised displacements (P,) between tracks' ``last`` sightings and ``rows``."""
+        covariance = self._noise_m2[last] + self._noise_m2[rows] + self._drift_covariance(last, rows)
+        solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
+        return np.asarray(np.sum(offset * solved, axis=-1))
+
+    def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
+        """What a wrong extrinsic adds between the images of two sightings (P, 2, 2).
+
+        The error along the ray is r^2 / h * d and one across it r * d; between the images both
+        change by their derivative times the motion, and the turn of the vehicle swings the first.
+        """
+        frame = self._sightings.frame
+        moved_m = np.abs(self._odometer_m[frame[rows]] - self._odometer_m[frame[last]])
+        turned = np.abs(self._heading_rad[frame[rows]] - self._heading_rad[frame[last]])
+        height_m, range_m = self._located.height_m[rows], self._range_m[rows]
+        direction = self._uncertainty.direction_rad
+        along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
+        across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
+        return _ray_covariance(self._ray_map[rows], along_m, across_m)
+
+
+def _mean_rays(located: Located) -> tuple[FloatArray, FloatArray]:
+    """Mean ray (S, 2) and its length (S,) over each sighting's valid corners."""
+    ray = mean_corners(located.ray_map, located.valid)
+    return ray, np.linalg.norm(ray, axis=1)
+
+
+def _noise_covariances(located: Located, uncertainty: Uncertainty) -> FloatArray:
+    """Covariance (S, 2, 2) of a sighting's mean position: pixels, jitter and position noise."""
+    ray, range_m = _mean_rays(located)
+    height_m = located.height_m
+    jitter_m = uncertainty.jitter_rad * (range_m**2 + height_m**2) / height_m
+    weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
+    pixels = np.sum(
+        np.where(located.valid[..., None, None], located.covariance_m2, 0.0) * weight[..., None, None], axis=1
+    )
+    spread = _ray_covariance(ray, jitter_m, uncertainty.jitter_rad * range_m)
+    position_m2 = uncertainty.position_m**2 + _POSITION_FLOOR_M**2
+    return np.asarray(pixels + spread + position_m2 * np.eye(2))
+
+
+def _ray_covariance(ray: FloatArray, along_m: FloatArray, across_m: FloatArray) -> FloatArray:
+    """Covariances (..., 2, 2) with the given sigmas along and across ``ray`` (..., 2)."""
+    along = ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
+    outer = along[..., :, None] * along[..., None, :]
+    return np.asarray(
+        along_m[..., None, None] ** 2 * outer + across_m[..., None, None] ** 2 * (np.eye(2) - outer)
+    )

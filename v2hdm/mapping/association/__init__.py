@@ -1,1 +1,0 @@
-"""Which sightings are of one marking."""

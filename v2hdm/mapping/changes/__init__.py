@@ -1,1 +1,0 @@
-"""A new drive against an earlier map: what stayed, what moved, what is gone, what is new."""

@@ -1,1 +1,0 @@
-"""Lane paint of all images, fused into polylines."""

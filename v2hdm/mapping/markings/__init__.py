@@ -1,1 +1,0 @@
-"""From the site model to the outcome: markings, calibrations and how sure they are."""

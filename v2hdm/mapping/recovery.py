@@ -1,0 +1,318 @@
+"""Optimise, and where the drive contradicts an input that it can do without, drop that and optimise again.
+
+A survey, a known size or a clock is held against everything else before the result is solved. If contradicted
+it is dropped (clocks: corrected) and reported, never obeyed in silence; what the drive cannot do without,
+such as the focal length, stays and is reported.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from v2hdm.adjust import Fault, ScoreTest, pose_innovations, score_faults
+from v2hdm.association.ground import views_of
+from v2hdm.association.groups import Association
+from v2hdm.association.sightings import Sightings, collect_sightings
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.trajectory import with_clock_offsets
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.crew import ALONE, Crew
+from v2hdm.mapping.fit import (
+    along_route,
+    camera_fits,
+    contradictions,
+    overall_factor,
+    point_of,
+)
+from v2hdm.mapping.optimise import Optimiser
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions, SurveyOptions
+from v2hdm.mapping.results import Contradiction, SolveEvidence
+from v2hdm.records import Drive, ImageDetections
+
+_log = logging.getLogger(__name__)
+
+CONTRADICTED_SIGMAS = 5.0
+"""From so many sigmas an input is contradicted: clean drives stay below 3 (docs/verdict.md), and one in two
+million would exceed it by chance."""
+
+_LIMITS: Mapping[Fault, tuple[float, float]] = {
+    Fault.CLOCK: (0.005, 0.02),
+    Fault.FOCAL: (0.003, 0.01),
+    Fault.DISTORTION: (0.002, 0.02),
+    Fault.PRINCIPAL: (5.0, 10.0),
+    Fault.SLOPE: (0.002, 0.003),
+    Fault.SURVEY: (0.03, 1.0),
+    Fault.LEVER: (0.03, 1.0),
+    Fault.SIZE: (0.01, 0.05),
+    Fault.CONTROL: (0.02, 0.05),
+    Fault.DATUM: (0.02, 0.05),
+}
+"""In the fault's unit: the value below which an input is as good as a drive needs it, however sure the drive
+is, and the sigma up to which a drive observes it. A less observable fault is nearly what something else can
+be, and takes up what is left of other errors: of k1 on a straight street (.04), say."""
+
+OBSERVABLE_SIGMA = {fault: sigma for fault, (_, sigma) in _LIMITS.items()}
+"""Sigma, in the fault's unit, up to which a drive observes it."""
+
+LOOSE_CENTRE_SIGMA_M = 10.0
+"""Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
+
+AMBIGUOUS_SHARE = 0.8
+"""Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
+speed tells the distance of two centres, or the difference of two clocks, alone."""
+
+CLOCK_OBSERVABLE_S = 0.004
+"""Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
+
+CENTRE_OBSERVABLE_M = 0.1
+"""Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
+
+MOST_CORRECTIONS = 4
+"""Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a camera set is mapped from: as given, or after corrections."""
+
+    drive: Drive
+    detections: Sequence[ImageDetections]
+    cameras: Sequence[str]
+    options: MappingOptions
+    crew: Crew = ALONE
+
+    @cached_property
+    def sightings(self) -> Sightings:
+        """The detections of these cameras as one table."""
+        return collect_sightings(self.drive, self.detections, self.cameras)
+
+    @cached_property
+    def optimiser(self) -> Optimiser:
+        """Of these inputs, not yet run."""
+        drive, options = self.drive, self.options
+        views = views_of(drive, self.cameras)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, self.crew)
+
+    @cached_property
+    def tracks(self) -> Association:
+        """Sightings linked from image to image under the initial IPMs."""
+        return self.optimiser.initial_tracks()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was optimised from which inputs, and the evidence for the checks.
+
+    ``bundle`` holds the adjusted poses.
+    """
+
+    inputs: Inputs
+    bundle: Bundle
+    evidence: SolveEvidence
+
+
+def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, Optimised]:
+    """Optimise a drive, as often as inputs have to be dropped.
+
+    Raises:
+        MappingError: there is nothing to map.
+    """
+    corrected: list[Contradiction] = []
+    survey = inputs.options.survey
+    while True:
+        # 1. Associate and solve, all at once or marking by marking.
+        optimiser, drive = inputs.optimiser, inputs.drive
+        if inputs.options.mode == INCREMENTAL:
+            settled = optimiser.grow(progress)
+        else:
+            settled = optimiser.settle(inputs.tracks, progress)
+        # 2. Test the inputs against what everything else says.
+        progress("tests of the inputs")
+        found = _suspects(settled, drive)
+        worst = next((one for one in found if is_contradicted(one)), None)
+        # 3. Begin anew without the input that is contradicted most, if the drive can do without.
+        left = None
+        if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
+            left = _recovered(inputs, worst, settled)
+        if worst is None or left is None:
+            break
+        corrected.append(contradictions(settled, (worst,), visit_names(drive))[0])
+        _warn(inputs, corrected[-1])
+        inputs = left
+    # 4. Choose the pose model, solve without outliers and conclude.
+    optimised = optimiser.finish(settled, progress)
+    corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
+    suspected = contradictions(settled, found, visit_names(drive))
+    evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
+    return Outcome(inputs, optimised.bundle, evidence), optimised
+
+
+def _warn(inputs: Inputs, one: Contradiction) -> None:
+    about = f" {one.about}" if one.about else ""
+    _log.warning(
+        "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
+        ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas, one.value,
+        one.fault.unit,
+    )  # fmt: skip
+
+
+def visit_names(drive: Drive) -> tuple[str, ...]:
+    """The names of a joined drive's visits, none of a single one."""
+    return tuple(visit.name for visit in drive.joined)
+
+
+def _suspects(bundle: Bundle, drive: Drive) -> tuple[ScoreTest, ...]:
+    """The inputs that can be tested and were stated at all, the most contradicted first."""
+    found = score_faults(bundle.problem, bundle.solution)
+    return tuple(one for one in found if _is_stated(one, bundle, drive))
+
+
+def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
+    """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
+    if one.fault not in (Fault.SURVEY, Fault.LEVER):
+        return True
+    names = list(bundle.camera_index)
+    own = names if one.camera < 0 else [names[one.camera]]
+    return all(drive.cameras[name].centre_prior is not None for name in own)
+
+
+def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
+    """False of a surveyed point held to a candidate that did not enter the map, such as a worn marking."""
+    if one.fault is not Fault.CONTROL:
+        return True
+    point_map = next(point.position_map for point in survey.control if point.id == one.about)
+    corners_map = np.array([marking.corners_map for marking in optimised.markings])
+    if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
+        return True
+    _log.warning("the surveyed point %s is of no use: the marking there did not enter the map", one.about)
+    return False
+
+
+def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
+    """A survey that was dropped, off by what the solve without it says; others as they are."""
+    if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
+        return one
+    rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
+    off = camera_centre(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
+    return replace(one, value=float(off[:, one.axis].mean()))
+
+
+def _evidence(
+    settled: Bundle,
+    found: tuple[Contradiction, ...],
+    corrected: Sequence[Contradiction],
+    optimiser: Optimiser,
+    final: Bundle,
+    sightings: Sightings,
+) -> SolveEvidence:
+    factors, window_s = along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
+    innovations = pose_innovations(settled.solution)
+    largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
+    frames_s = sightings.stamp_s[np.unique(sightings.frame[settled.row])]
+    return SolveEvidence(
+        suspects=found,
+        corrected=tuple(corrected),
+        pose_model=optimiser.pose_model,
+        held_out=optimiser.held_out,
+        fits=camera_fits(settled),
+        variance_factor=overall_factor(settled),
+        along_route=factors,
+        window_s=window_s,
+        pose_pulls=innovations.rms(),
+        worst_pull=float(largest.max()),
+        worst_pull_s=float(frames_s[int(largest.argmax())]),
+        clock_s=_clocks(final),
+    )
+
+
+def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
+    """Whether the same fault of another camera would explain nearly as much."""
+    rivals = [
+        one.sigmas
+        for one in found
+        if one.fault is worst.fault
+        and one.axis == worst.axis
+        and one.item == worst.item
+        and min(one.camera, worst.camera) >= 0
+        and one.camera != worst.camera
+    ]
+    return max(rivals, default=0.0) > AMBIGUOUS_SHARE * worst.sigmas
+
+
+def is_contradicted(one: ScoreTest | Contradiction) -> bool:
+    """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
+    least, sigma = _LIMITS[one.fault]
+    return one.sigma <= sigma and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > least
+
+
+def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
+    offset_s = bundle.solution.clock_offset_s
+    if not bundle.model.solver.clock_offset:
+        return tuple({} for _ in offset_s.T)
+    sigma = np.sqrt(bundle.solution.covariance.clock_s2())
+    return tuple(
+        {name: (float(offset_s[c, v]), float(sigma[c, v])) for name, c in bundle.camera_index.items()}
+        for v in range(offset_s.shape[1])
+    )
+
+
+def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
+    """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
+    if worst.fault is Fault.CLOCK:
+        if worst.sigma > CLOCK_OBSERVABLE_S:
+            return None
+        return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
+    if worst.fault in (Fault.SURVEY, Fault.LEVER):
+        if worst.sigma > CENTRE_OBSERVABLE_M:
+            return None
+        names = tuple(settled.camera_index)
+        return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
+    options = inputs.options
+    if worst.fault is Fault.SIZE:
+        # One wrong size says that the paint is of another standard; the others' corners may only look like
+        # outliers, which a robust loss hides from the tests.
+        sizes = replace(options.known_sizes, by_class_m={})
+        return replace(inputs, options=replace(options, known_sizes=sizes))
+    if worst.fault in (Fault.CONTROL, Fault.DATUM):
+        point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
+        survey = options.survey.only([]) if point is None else options.survey.without(point)
+        return replace(inputs, options=replace(options, survey=survey))
+    return None
+
+
+def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
+    """The images of each visit and camera posed for ``later_s`` after the times that they have by now."""
+    drive = inputs.drive
+    if any(visit.trajectory is None for visit in drive.visits):
+        return None
+    so_far = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
+    moved = drive
+    for visit, later in enumerate(later_s):
+        own = {name: so_far[visit, name] + late for name, late in later.items() if (visit, name) in so_far}
+        moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), visit=visit)
+    number = {image.path: n for n, image in enumerate(moved.images)}
+    detections = [
+        replace(one, image=number[drive.images[one.image].path])
+        for one in inputs.detections
+        if drive.images[one.image].path in number
+    ]
+    return replace(inputs, drive=moved, detections=sorted(detections, key=lambda one: one.image))
+
+
+def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | None:
+    """The survey of some cameras' centres known no more along one axis; None where it already is not."""
+    cameras = dict(inputs.drive.cameras)
+    for name in names:
+        prior = cameras[name].centre_prior
+        if prior is None or prior.sigma_m[axis] >= LOOSE_CENTRE_SIGMA_M:
+            return None
+        sigma_m = prior.sigma_m.copy()
+        sigma_m[axis] = LOOSE_CENTRE_SIGMA_M
+        cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
+    return replace(inputs, drive=replace(inputs.drive, cameras=cameras))

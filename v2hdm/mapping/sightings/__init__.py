@@ -1,1 +1,0 @@
-"""What was seen, as one table, and where it lies on the ground under a rig."""

@@ -1,0 +1,107 @@
+"""Where things lie that may be markings, and how often they were seen: the data of the site model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.association.groups import FusedGroups, line_only
+from v2hdm.geometry.quadrilateral import block_diagonal
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+UNSEEN_M2 = 1e4
+"""Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
+
+_CORRELATION = 0.2
+"""Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
+small."""
+
+_KNOWN_SIGMA_M = 0.5
+"""Sigma, m, below which a corner counts as known: a fraction of any marking's length."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Corners ``corners_map`` (G, 4, 2), m, of G candidates and their joint covariances (G, 8, 8), m^2.
+
+    A corner that was not seen has the variance :data:`UNSEEN_M2` and lies anywhere near the others.
+    """
+
+    corners_map: FloatArray
+    covariance_m2: FloatArray
+
+    @classmethod
+    def seen(cls, corners_map: FloatArray, covariance_m2: FloatArray) -> Candidates:
+        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where one was not seen."""
+        unseen = np.asarray(np.isnan(corners_map).any(axis=2))
+        count = np.maximum((~unseen).sum(axis=1), 1)
+        centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
+        rows = np.repeat(unseen, 2, axis=1)
+        covariance = np.where(rows[:, :, None] | rows[:, None, :], UNSEEN_M2 * np.eye(8), covariance_m2)
+        return cls(np.where(unseen[..., None], centre[:, None], corners_map), covariance)
+
+    def __len__(self) -> int:
+        return len(self.corners_map)
+
+    def subset(self, rows: IntArray | BoolArray) -> Candidates:
+        """The candidates at ``rows``."""
+        return Candidates(self.corners_map[rows], self.covariance_m2[rows])
+
+    @property
+    def sigma_m(self) -> FloatArray:
+        """Standard deviation (G, 4) of each corner, both directions together."""
+        variance = np.diagonal(self.covariance_m2, axis1=1, axis2=2).reshape(-1, 4, 2)
+        return np.asarray(np.sqrt(variance.sum(axis=2)))
+
+    @property
+    def known(self) -> BoolArray:
+        """Which corners (G, 4) were seen as points."""
+        return np.asarray(self.sigma_m < _KNOWN_SIGMA_M)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How often G candidates were seen, each (G,).
+
+    ``images`` with accepted observations; ``observations`` of corners, and how many are ``agreeing`` with the
+    solution; ``easy_views``, images with the whole candidate in easy view, and those where it was ``found``;
+    ``as_symbol``, images in which a symbol lies on it.
+    """
+
+    images: IntArray
+    observations: IntArray
+    agreeing: IntArray
+    easy_views: IntArray
+    found: IntArray
+    as_symbol: IntArray
+
+    def subset(self, rows: IntArray | BoolArray) -> Counts:
+        """Those of the candidates at ``rows``."""
+        return Counts(*(values[rows] for values in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Exclusion:
+    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+
+
+def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates:
+    """The solved candidates (G,), with the errors that all images of a corner share.
+
+    A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
+    are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
+    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says.
+    """
+    single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
+    unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]
+    shared = np.where(unseen, 0.0, _CORRELATION * single)
+    # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
+    no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
+    shared[no_point] = line_only(shared[no_point], UNSEEN_M2**0.5)
+    return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))

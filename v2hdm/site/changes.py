@@ -1,0 +1,308 @@
+"""An earlier map brought up to date by a new drive: ids stay, what changed is listed with its evidence.
+
+Corners that both maps have are estimated anew from both. Given the errors that markings share
+(:mod:`v2hdm.site.map_errors`), each is a mean of two by its own errors alone; what both maps have in common
+tells the shared ones. So a drift of one map counts once, however many markings it moved, and what only one
+map has is shifted along with its surroundings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2hdm.association.ground import Views
+from v2hdm.association.sightings import Rig
+from v2hdm.errors import MappingError
+from v2hdm.geometry.quadrilateral import SHIFTS
+from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, IntArray, Marking
+from v2hdm.site.fates import Decision, Watched, decide
+from v2hdm.site.looks import Looks, Observer, find_rates, with_paint
+from v2hdm.site.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_symbols
+
+
+def fused(old: Marking, new: Marking, turn: int, pair: int, shift: Shift) -> Marking:
+    """A marking that both maps have: the old one's id and order of corners, both maps' sightings."""
+    of_old, of_new = shift.of_old.own_m2[shift.old[pair]], shift.of_new.own_m2[shift.new[pair]]
+    order = SHIFTS[turn]
+    rows = (2 * order[:, None] + np.arange(2)).ravel()
+    information = [np.linalg.inv(of_old), np.linalg.inv(of_new[np.ix_(rows, rows)])]
+    own = np.linalg.inv(information[0] + information[1])
+    shared, spread = shift.of_both(pair)
+    corners = [old.corners_map.ravel(), new.corners_map[order].ravel()]
+    parts = [
+        own @ one @ (stated - SHIFT @ part)
+        for one, stated, part in zip(information, corners, shared.reshape(2, 2), strict=True)
+    ]
+    gain = np.concatenate([own @ one @ SHIFT for one in information], axis=1)
+    covariance = own + gain @ spread @ gain.T
+    return replace(
+        old,
+        corners_map=(parts[0] + parts[1]).reshape(4, 2),
+        sightings=old.sightings + new.sightings,
+        covariance_m2=(covariance + covariance.T) / 2,
+        relative_sigma_m=_relative(own),
+    )
+
+
+def shifted_with(markings: Sequence[Marking], errors: Errors, of_old: bool, shift: Shift) -> list[Marking]:
+    """Markings that one map alone has, moved by the error that it shares with those which both have."""
+    at = shift.of_old_at if of_old else shift.of_new_at
+    mean, spread = at(errors.centres_map, errors.shared_m2)
+    covariance = errors.own_m2 + SHIFT @ spread @ SHIFT.T
+    return [
+        replace(
+            one,
+            corners_map=one.corners_map - mean[k],
+            covariance_m2=covariance[k],
+            relative_sigma_m=one.relative_sigma_m,
+        )
+        for k, one in enumerate(markings)
+    ]
+
+
+def fused_markings(
+    old: Sequence[Marking], new: Sequence[Marking], decision: Decision
+) -> tuple[dict[int, Marking], dict[int, Marking]]:
+    """The markings as they are now: by old one all that there were, by new one those without a partner."""
+    shift = decision.shift
+    by_old = dict(enumerate(shifted_with(old, shift.of_old, True, shift)))
+    by_new = dict(enumerate(shifted_with(new, shift.of_new, False, shift)))
+    number = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(shift.old, shift.new, strict=True))}
+    for pair in decision.pairs:
+        both = number.get((pair.old, pair.new))
+        moved = by_new.pop(pair.new)
+        if both is not None:
+            by_old[pair.old] = fused(old[pair.old], new[pair.new], pair.turn, both, shift)
+        else:
+            by_old[pair.old] = _repainted(old[pair.old], moved, pair.turn)
+    return by_old, by_new
+
+
+def _repainted(old: Marking, new: Marking, turn: int) -> Marking:
+    """A marking that was painted elsewhere: where the new map has it, under the old one's id."""
+    order = SHIFTS[turn]
+    rows = (2 * order[:, None] + np.arange(2)).ravel()
+    covariance = new.covariance_m2
+    return replace(
+        new,
+        corners_map=new.corners_map[order],
+        covariance_m2=None if covariance is None else covariance[np.ix_(rows, rows)],
+        heights_m=old.heights_m,
+        id=old.id,
+    )
+
+
+def _relative(own_m2: FloatArray) -> float:
+    """Standard deviation of a coordinate of the centre by the marking's own errors."""
+    return float(np.sqrt(np.einsum("iaja->", own_m2.reshape(4, 2, 4, 2)) / 32))
+
+
+DRIFT_OVER_M = 30.0
+"""Distance over which the error that a map's markings share fades, m, where the map does not say."""
+
+LIKELY = 0.5
+"""Probability from which a marking is told as moved, gone or new paint: the likelier of the two."""
+
+_LEAST_PAIRED = 0.3
+"""Share of the markings that a drive looked at which it finds again at least, if the site is the same."""
+
+_LOOKED = 3
+"""Easy views from which a drive has looked at a place for that share."""
+
+
+@dataclass(frozen=True)
+class Base:
+    """An earlier map, and from where its drives looked.
+
+    ``hd_map`` has ids. ``poses`` (F, 4, 4) are those of its images, (0, 4, 4) where they are not known;
+    ``left_out`` are the class, place (2,) and sightings of candidates that it was not sure of.
+    """
+
+    hd_map: HdMap
+    poses: FloatArray
+    left_out: tuple[tuple[str, FloatArray, int], ...] = ()
+
+
+@dataclass(frozen=True)
+class Names:
+    """What an updated map calls the M markings of the drive's own map.
+
+    ``id`` (M,) is 0 for one that it does not have, ``corner`` (M, 4) where each corner stands in its order.
+    """
+
+    id: IntArray
+    corner: IntArray
+
+
+def update_map(
+    base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
+) -> tuple[HdMap, Changes, Names]:
+    """Bring the ``base`` map up to date; returns it, what changed, and what ``made``'s markings are called.
+
+    Args:
+        base: the earlier map.
+        made: the new drive's own map, in the same frame.
+        observer: the new drive.
+        mapped: (S,) which sightings are of the markings of ``made``.
+        drift_over_m: distance over which the error of the drive's poses fades, m.
+
+    Raises:
+        MappingError: the drive finds too little of the map again to be of its site.
+    """
+    old, new = base.hd_map.markings, made.markings
+    of_old = Errors.of(old, base.hd_map.drift_over_m or DRIFT_OVER_M)
+    of_new = Errors.of(new, drift_over_m)
+    rates = find_rates(observer, new)
+    now, before = observer.looks(old, ~mapped), _looks_of(base, new, observer)
+    usual = float(np.mean(list(rates.values())))
+    decision = decide(
+        old,
+        new,
+        of_old,
+        of_new,
+        with_paint(now.watched(np.array([rates.get(one.kind, usual) for one in old])), observer, old, new),
+        before.watched(np.array([rates[one.kind] for one in new]))
+        if len(base.poses)
+        else Watched.never(len(new)),
+    )
+    _check_site(decision, now, len(old))
+    by_old, by_new = fused_markings(old, new, decision)
+    numbers = _Numbers(base.hd_map)
+    fresh = {k: replace(one, id=numbers.next()) for k, one in by_new.items()}
+    gone = {k for k, probability in decision.gone.items() if probability > LIKELY}
+    changes = [
+        *_moves(decision, old, by_old, now),
+        *_missing(decision, old, by_old, now),
+        *_additions(decision, fresh, before),
+    ]
+    lanes = updated_lanes(base.hd_map.lanes, made.lanes, decision.shift, numbers.next)
+    symbols = updated_symbols(base.hd_map.symbols, made.symbols, decision.shift, numbers.next)
+    updated = replace(
+        base.hd_map,
+        markings=(*(one for k, one in by_old.items() if k not in gone), *fresh.values()),
+        lanes=lanes,
+        symbols=symbols,
+        drift_over_m=max(of_old.over_m, of_new.over_m),
+        largest_id=numbers.largest,
+    )
+    same = sum(pair.moved <= LIKELY for pair in decision.pairs)
+    shift_m = decision.shift.off_map.mean(axis=0) if len(decision.shift.old) else np.zeros(2)
+    names = _names(len(new), decision, by_old, fresh)
+    return updated, Changes(tuple(changes), same, shift_m), names
+
+
+def _names(
+    count: int, decision: Decision, by_old: Mapping[int, Marking], fresh: Mapping[int, Marking]
+) -> Names:
+    names = Names(np.zeros(count, dtype=np.int64), np.tile(np.arange(4), (count, 1)))
+    for k, one in fresh.items():
+        names.id[k] = one.id or 0
+    for pair in decision.pairs:
+        names.id[pair.new] = by_old[pair.old].id or 0
+        names.corner[pair.new] = np.argsort(SHIFTS[pair.turn])
+    return names
+
+
+class _Numbers:
+    """Ids that no feature of a map has or ever had."""
+
+    def __init__(self, hd_map: HdMap) -> None:
+        ids = [one.id for one in hd_map.markings]
+        ids += [one.id for one in hd_map.lanes]
+        ids += [one.id for one in hd_map.symbols]
+        self.largest = max([hd_map.largest_id, *(number or 0 for number in ids)])
+
+    def next(self) -> int:
+        self.largest += 1
+        return self.largest
+
+
+def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Looks:
+    """How often the earlier drive looked at ``places``, as often as the new one's cameras at its poses."""
+    poses, count = base.poses, len(observer.cameras)
+    views = Views(
+        image=np.arange(count * len(poses)),
+        camera=np.repeat(np.arange(count), len(poses)),
+        frame=np.tile(np.arange(len(poses)), count),
+    )
+    rig = Rig(observer.rig.intrinsic, observer.rig.cam_from_vehicle, poses)
+    corners = np.array([one.corners_map for one in places]).reshape(-1, 4, 2)
+    seen = replace(observer, views=views, rig=rig).easy_views(corners)[0]
+    found = np.zeros(len(places), dtype=np.int64)
+    for kind, place, sightings in base.left_out:
+        for k, one in enumerate(places):
+            inside = np.linalg.norm(one.corners_map.mean(axis=0) - place) < _size_m(one) / 2
+            if one.kind == kind and inside:
+                found[k] = max(found[k], sightings)
+    return Looks(np.maximum(np.bincount(seen, minlength=len(places)), found), found)
+
+
+def _size_m(marking: Marking) -> float:
+    """Its longer diagonal, m."""
+    return float(np.linalg.norm(marking.corners_map[2:] - marking.corners_map[:2], axis=1).max())
+
+
+def _check_site(decision: Decision, now: Looks, count: int) -> None:
+    """Refuse a map of which the drive finds nearly nothing where it looked."""
+    paired = np.zeros(count, dtype=bool)
+    paired[[pair.old for pair in decision.pairs if pair.moved <= LIKELY]] = True
+    looked = (now.views >= _LOOKED) | paired
+    if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
+        raise MappingError(
+            f"map.base: this drive finds {paired.sum()} of {looked.sum()} markings again that it should have "
+            "seen; is the map of this site and frame? Map the drive by itself to see"
+        )
+
+
+def _moves(
+    decision: Decision, old: Sequence[Marking], by_old: Mapping[int, Marking], now: Looks
+) -> list[Change]:
+    shift, out = decision.shift, []
+    for pair in decision.pairs:
+        if pair.moved <= LIKELY:
+            continue
+        k, after = pair.old, by_old[pair.old]
+        mean, spread = shift.of_old_at(shift.of_old.centres_map[[k]], shift.of_old.shared_m2[[k]])
+        own = shift.of_old.own_m2[k] + shift.of_new.own_m2[pair.new]
+        sigma = np.sqrt(np.diag(own.reshape(4, 2, 4, 2).mean(axis=(0, 2)) + spread[0]))
+        placed = old[k].corners_map - mean[0]
+        moved = after.corners_map.mean(axis=0) - placed.mean(axis=0)
+        numbers = pair.moved, int(now.views[k]), int(now.found[k]), after.sightings
+        change = _change(old[k], Fate.MOVED, placed, after.corners_map, numbers)
+        out.append(replace(change, shift_m=moved, shift_sigma_m=sigma))
+    return out
+
+
+def _missing(
+    decision: Decision, old: Sequence[Marking], by_old: Mapping[int, Marking], now: Looks
+) -> list[Change]:
+    out = []
+    for k, gone in decision.gone.items():
+        fate, corners = Fate.VANISHED if gone > LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
+        numbers = max(gone, 1 - gone), int(now.views[k]), int(now.found[k]), old[k].sightings
+        out.append(_change(old[k], fate, corners, None if gone > LIKELY else corners, numbers))
+    return out
+
+
+def _additions(decision: Decision, fresh: Mapping[int, Marking], before: Looks) -> list[Change]:
+    out = []
+    for k, one in fresh.items():
+        new = decision.fresh[k]
+        fate = Fate.NEW if new > LIKELY else Fate.FIRST_SEEN
+        numbers = max(new, 1 - new), int(before.views[k]), int(before.found[k]), one.sightings
+        out.append(_change(one, fate, None, one.corners_map, numbers))
+    return out
+
+
+def _change(
+    marking: Marking,
+    fate: Fate,
+    before: FloatArray | None,
+    after: FloatArray | None,
+    numbers: tuple[float, int, int, int],
+) -> Change:
+    """A change without a shift; ``numbers`` are probability, views, found and sightings."""
+    return Change(marking.id or 0, marking.kind, fate, before, after, None, None, *numbers)

@@ -1,0 +1,295 @@
+"""Which marking of a new map is which of an old one: the likeliest of all that may have happened to them.
+
+Of a marking of the old map, the new drive may have seen it where it was, seen it elsewhere because it was
+painted anew there, or not seen it: because it is gone, because no image showed its place, or because it was
+missed. A marking of the new map that is none of the old one is new paint, or was missed before. Each has a
+likelihood; how often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
+prior), and one assignment makes all of it as likely as can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.special import logsumexp
+
+from v2hdm.geometry.quadrilateral import SHIFTS, align
+from v2hdm.records import FloatArray, IntArray, Marking
+from v2hdm.site.map_errors import SHIFT, Errors, Shift
+
+MOVED_SIGMA_M = 0.5
+"""Sigma of how far a marking is painted from where it was, m a coordinate: a new line of the same bay."""
+
+TURNED_SIGMA_RAD = 0.2
+"""Sigma of how far it is turned then, rad."""
+
+_REACH_M = 4 * MOVED_SIGMA_M
+"""Markings farther apart are never one, m."""
+
+_OTHER_SHAPE_M = 0.1
+"""Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
+
+_MISREAD_M = 0.3
+"""Sigma of an end or corner that one of two drives has taken from another edge, m, as in the site model."""
+
+_MISREAD_SHARE = 0.05
+"""Share of markings of which one of two drives has misread an end or a corner."""
+
+_PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
+"""Dirichlet prior: of fifty markings about so many stay, are painted elsewhere, are gone."""
+
+_PRIOR_NEW = (1.0, 50.0)
+"""Gamma prior: one new marking where there were fifty."""
+
+_PASSES = 4
+"""Rounds of shift, odds and assignment; the assignment settles within three."""
+
+STAYED, MOVED = range(2)
+
+
+@dataclass(frozen=True)
+class Watched:
+    """Log likelihoods (N,) of the images of N places where the drive's map has nothing.
+
+    ``there`` if the marking is there, ``bare`` if it is not.
+    """
+
+    there: FloatArray
+    bare: FloatArray
+
+    @classmethod
+    def never(cls, count: int) -> Watched:
+        """Of places that no image shows."""
+        return cls(np.zeros(count), np.zeros(count))
+
+
+@dataclass(frozen=True)
+class Pair:
+    """An old and a new marking that are one: the old one's corner c is the new one's (c + ``turn``) mod 4.
+
+    ``moved`` is the probability that it was painted elsewhere.
+    """
+
+    old: int
+    new: int
+    turn: int
+    moved: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What became of the markings.
+
+    ``pairs`` were seen again; ``gone`` are the probabilities by old marking that was not, ``fresh`` those by
+    new marking that has no partner, that it is new paint. ``shift`` is how the maps lie to each other.
+    """
+
+    pairs: tuple[Pair, ...]
+    gone: dict[int, float]
+    fresh: dict[int, float]
+    shift: Shift
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off.
+
+    ``off`` (P, 8), m, has the ``noise`` (P, 8, 8), m^2, of both; ``basis`` (P, 8, 8) has rows for two shifts,
+    the turn, in which it counts ``arm_m`` (P,) times, and five deformations.
+    """
+
+    old: IntArray
+    new: IntArray
+    turn: IntArray
+    off: FloatArray
+    noise: FloatArray
+    basis: FloatArray
+    arm_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.old)
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """Log probabilities of an old marking's fate, and log densities per m^2 of new and of older paint."""
+
+    stayed: float
+    moved: float
+    gone: float
+    kept: float
+    new_per_m2: float
+    older_per_m2: float
+
+
+def decide(
+    old: Sequence[Marking],
+    new: Sequence[Marking],
+    of_old: Errors,
+    of_new: Errors,
+    watched_now: Watched,
+    watched_before: Watched,
+) -> Decision:
+    """Decide what became of ``old`` markings of an earlier map, and what the ``new`` ones of a drive are.
+
+    ``of_old`` and ``of_new`` are their errors; ``watched_now`` is how often the new drive looked at the old
+    markings that it has not mapped, ``watched_before`` the earlier drive at the places of the new ones.
+    """
+    candidates = _candidates(old, new, of_old, of_new)
+    shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))
+    rates = _rates(_PRIOR_COUNT, _PRIOR_NEW)
+    chosen, moved = np.zeros(0, dtype=np.int64), np.zeros(0)
+    gone, fresh = np.zeros(len(old)), np.zeros(len(new))
+    for _ in range(_PASSES):
+        likelihood = _likelihoods(candidates, shift, chosen, rates)
+        unseen = np.logaddexp(rates.gone + watched_now.bare, rates.kept + watched_now.there)
+        gone = np.exp(rates.gone + watched_now.bare - unseen)
+        painted = rates.new_per_m2 + watched_before.bare
+        density = np.logaddexp(painted, rates.older_per_m2 + watched_before.there)
+        fresh = np.exp(painted - density)
+        both = logsumexp(likelihood, axis=1)
+        score = both - unseen[candidates.old] - _alone(candidates, density[candidates.new])
+        chosen = _assign(candidates, score)
+        moved = np.exp(likelihood[:, MOVED] - both)
+        stayed = chosen[moved[chosen] < 0.5]
+        shift = _shift(of_old, of_new, candidates, stayed)
+        alone_old = np.setdiff1d(np.arange(len(old)), candidates.old[chosen])
+        alone_new = np.setdiff1d(np.arange(len(new)), candidates.new[chosen])
+        counts = [(1 - moved[chosen]).sum(), moved[chosen].sum(), gone[alone_old].sum()]
+        rates = _rates(
+            _PRIOR_COUNT + counts,
+            (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen)),
+        )
+    numbers = zip(candidates.old[chosen], candidates.new[chosen], candidates.turn[chosen], strict=True)
+    return Decision(
+        pairs=tuple(
+            Pair(int(a), int(b), int(turn), float(probability))
+            for (a, b, turn), probability in zip(numbers, moved[chosen], strict=True)
+        ),
+        gone={int(k): float(gone[k]) for k in alone_old},
+        fresh={int(k): float(fresh[k]) for k in alone_new},
+        shift=shift,
+    )
+
+
+def _rates(counts: FloatArray, new: tuple[float, float]) -> _Rates:
+    """Rates by how often each fate was met, with ``new`` markings for so many old ones."""
+    stayed, moved, gone = np.log(counts / counts.sum())
+    # Of the paint within the reach of an old marking about one is older: that much ground counts for each.
+    older = -float(np.log(np.pi * _REACH_M**2))
+    return _Rates(stayed, moved, gone, float(np.log1p(-np.exp(gone))), older + np.log(new[0] / new[1]), older)
+
+
+def _candidates(
+    old: Sequence[Marking], new: Sequence[Marking], of_old: Errors, of_new: Errors
+) -> _Candidates:
+    """The pairs of one class within reach."""
+    near: list[list[int]] = [[] for _ in old]
+    if len(old) and len(new):
+        near = cKDTree(of_new.centres_map).query_ball_point(of_old.centres_map, _REACH_M).tolist()
+    pairs = [(a, b) for a, others in enumerate(near) for b in sorted(others) if old[a].kind == new[b].kind]
+    first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    before = np.array([old[a].corners_map for a in first]).reshape(-1, 4, 2)
+    after = np.array([new[b].corners_map for b in second]).reshape(-1, 4, 2)
+    whole = np.ones(before.shape[:2], dtype=bool)
+    turn = align(before, whole, after, whole).shift
+    turned = np.take_along_axis(after, SHIFTS[turn][..., None], axis=1)
+    order = (2 * SHIFTS[turn][..., None] + np.arange(2)).reshape(-1, 8)
+    rows = np.arange(len(second))[:, None, None]
+    noise = of_old.own_m2[first] + of_new.own_m2[second][rows, order[:, :, None], order[:, None, :]]
+    basis, arm_m = _bases(before)
+    return _Candidates(first, second, turn, (turned - before).reshape(-1, 8), noise, basis, arm_m)
+
+
+def _bases(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal rows (P, 8, 8): shifts along x and y, the turn about the centre, five deformations."""
+    arms = corners - corners.mean(axis=1, keepdims=True)
+    turning = np.stack([-arms[..., 1], arms[..., 0]], axis=-1).reshape(-1, 8)
+    arm_m = np.linalg.norm(turning, axis=1)
+    columns = np.concatenate(
+        [np.broadcast_to(SHIFT / 2, (len(corners), 8, 2)), (turning / arm_m[:, None])[..., None]], axis=2
+    )
+    rest = np.linalg.qr(columns, mode="complete")[0][:, :, 3:]
+    return np.swapaxes(np.concatenate([columns, rest], axis=2), 1, 2), arm_m
+
+
+def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntArray) -> Shift:
+    """How the maps lie to each other, by the candidates ``stayed``."""
+    information = np.linalg.inv(candidates.noise[stayed])
+    common = SHIFT.T @ information @ SHIFT
+    pulled = SHIFT.T @ information @ candidates.off[stayed][..., None]
+    spread = np.linalg.inv(common)
+    off = (spread @ pulled)[..., 0]
+    rows = candidates.old[stayed], candidates.new[stayed]
+    return Shift(of_old, of_new, *rows, off, np.asarray(spread, dtype=np.float64))
+
+
+def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates: _Rates) -> FloatArray:
+    """Log likelihood (P, 2) of each candidate pair having stayed or moved, its prior included."""
+    of_pair = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(shift.old, shift.new, strict=True))}
+    out = np.empty((len(candidates), 2))
+    for p in range(len(candidates)):
+        old, new = int(candidates.old[p]), int(candidates.new[p])
+        own = of_pair.get((old, new))
+        mean, spread = shift.at(old, new) if own is None else shift.without_itself(own)
+        off = candidates.basis[p] @ (candidates.off[p] - SHIFT @ mean)
+        noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
+        # In the basis a shift counts twice its length, a turn by its arm.
+        free = np.zeros(8)
+        free[:2], free[2] = (2 * MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * TURNED_SIGMA_RAD) ** 2
+        out[p, STAYED] = rates.stayed + _read(off, noise)
+        out[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
+    return out
+
+
+def _read(off: FloatArray, noise: FloatArray) -> float:
+    """Log likelihood of a deviation (8,), of which an end or corner may have been misread."""
+    plain = np.log1p(-_MISREAD_SHARE) + _normal(off, noise)
+    misread = noise + np.diag(np.repeat([0.0, _MISREAD_M**2], [3, 5]))
+    return float(np.logaddexp(plain, np.log(_MISREAD_SHARE) + _normal(off, misread)))
+
+
+def _normal(off: FloatArray, covariance: FloatArray) -> float:
+    root = np.linalg.cholesky(covariance)
+    whitened = np.linalg.solve(root, off)
+    count = len(off)
+    return float(-0.5 * (whitened @ whitened + count * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
+
+
+def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
+    """Log density (P,) of each pair's new marking, in its basis, if it is another one anywhere."""
+    off = (candidates.basis @ candidates.off[..., None])[..., 0]
+    noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
+    shape = [
+        _normal(one[3:], own[3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5))
+        for one, own in zip(off, noise, strict=True)
+    ]
+    return np.asarray(density - np.log(4) - np.log(np.pi * candidates.arm_m) + np.array(shape))
+
+
+def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
+    """The candidates that together have the largest score; each marking is in one of them at most."""
+    better = np.flatnonzero(score > 0)
+    if not len(better):
+        return better
+    olds, news = candidates.old[better], candidates.new[better]
+    count = int(olds.max()) + 1
+    size = count + int(news.max()) + 1
+    graph = coo_array((np.ones(len(better)), (olds, count + news)), shape=(size, size))
+    _, group = connected_components(graph, directed=False)
+    chosen: list[int] = []
+    for one in np.unique(group[olds]):
+        own = better[group[olds] == one]
+        a, rows = np.unique(candidates.old[own], return_inverse=True)
+        b, columns = np.unique(candidates.new[own], return_inverse=True)
+        gain = np.zeros((len(a), len(b)))
+        gain[rows, columns] = score[own]
+        taken = {(int(r), int(c)) for r, c in zip(*linear_sum_assignment(-gain), strict=True)}
+        chosen += [int(p) for p, r, c in zip(own, rows, columns, strict=True) if (int(r), int(c)) in taken]
+    return np.array(sorted(chosen), dtype=np.int64)

@@ -1,0 +1,361 @@
+"""Detected lane paint as a cloud of directed points on the ground, and the nodes on its ridges.
+
+Seeds spread over the cloud are moved across their line onto the local regression line of the points around
+them, a mean shift that is one-dimensional because every point carries its direction; points of a crossing or
+a parallel line take no part. The rest is thinned to single nodes, half a metre apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from v2hdm.association.ground import ground_points, ground_points_with_jacobian
+from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of
+from v2hdm.geometry.ipm import (
+    direction_covariance,
+    facing_ipm,
+    flat_motion,
+    ground_from_pinhole_px,
+)
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import (
+    LANE_BOUNDARY,
+    LANE_DASH,
+    BoolArray,
+    Drive,
+    FloatArray,
+    ImageDetections,
+    IntArray,
+    LaneDetection,
+)
+from v2hdm.site.options import LaneOptions
+
+_CENTRE_SIGMA_PX = 1.0
+"""Noise of a detected centre point across its line: about a cell of the network's output."""
+
+_OWN_SIGMA_M = 0.01
+"""Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
+
+_TANGENT_REACH = 2
+"""Points to either side whose difference gives a point's direction."""
+
+_GUIDE_RANGE = 1.8
+"""Whole lines are followed so many times farther than paint is mapped: they only say what is one line."""
+
+
+@dataclass(frozen=True)
+class Guides:
+    """Whole lines as single images saw them, gaps of dashes included: which paint is one line.
+
+    ``points_map`` (G, 2) m; ``line`` (G,) that a point is of, an index into ``image_of_line`` (L,).
+    """
+
+    points_map: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    image_of_line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class LaneCloud:
+    """P points on lane paint.
+
+    ``points_map`` (P, 2) m, unit ``tangent`` (P, 2) of either sense, ``weight`` (P,) = 1 / variance
+    across the line in 1 / m^2, ``image`` (P,) that a point was seen in, ``dash`` (P,) whether its
+    detection was a dash; beside them the ``guides``.
+    """
+
+    points_map: FloatArray
+    tangent: FloatArray
+    weight: FloatArray
+    image: IntArray
+    dash: BoolArray
+    guides: Guides = field(default_factory=Guides)
+
+
+@dataclass(frozen=True)
+class ImageGround:
+    """How each image of a drive maps to the ground; nan for images of cameras that are not used.
+
+    ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3).
+    """
+
+    map_from_pinhole_px: FloatArray
+    centre_map: FloatArray
+
+
+def ground_by_ipm(
+    drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray]
+) -> ImageGround:
+    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are."""
+    rows, names, poses = _rows(drive, list(ipm))
+    forward = {
+        name: facing_ipm(matrix, drive.cameras[name].roi_vehicle.mean(axis=0)) for name, matrix in ipm.items()
+    }
+    homographies = flat_motion(poses) @ np.stack([forward[name] for name in names])
+    extrinsic = np.stack([cam_from_vehicle[name] for name in names])
+    return _image_ground(len(drive.images), rows, homographies, extrinsic, poses)
+
+
+def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround:
+    """By optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
+    rows, names, _ = _rows(drive, cameras)
+    camera = np.array([list(cameras).index(name) for name in names])
+    poses = rig.map_from_vehicle[frames_of(drive).frame_of_image[rows]]
+    extrinsic = rig.cam_from_vehicle[camera]
+    homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
+    return _image_ground(len(drive.images), rows, homographies, extrinsic, poses)
+
+
+def collect_lane_points(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    ground: ImageGround,
+    *,
+    max_range_m: float,
+    jitter_rad: float,
+) -> LaneCloud:
+    """Back-project all lane detections of the images that ``ground`` covers, up to ``max_range_m``.
+
+    ``jitter_rad`` of viewing direction goes into the weights, so that near points count for more.
+    """
+    guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
+    lanes = _lanes(detections, ground, whole=False)
+    if not lanes:
+        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
+        return LaneCloud(*empty, guides)
+    piece, image, points_px = _points(drive, lanes)
+    homographies = ground.map_from_pinhole_px[image]
+    points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
+    points_map, jacobian = points_map[:, 0], jacobian[:, 0]
+    tangent = _tangents(points_map, piece)
+    centre = ground.centre_map[image]
+    ray = points_map - centre[:, :2]
+    covariance = _CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
+    covariance += direction_covariance(ray, np.maximum(centre[:, 2], LEAST_HEIGHT_M), jitter_rad)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    variance = np.einsum("pi,pij,pj->p", normal, covariance, normal)
+    with np.errstate(invalid="ignore"):
+        keep = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
+        keep &= np.isfinite(variance)
+    dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
+    weight = 1.0 / (variance[keep] + _OWN_SIGMA_M**2)
+    return LaneCloud(points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides)
+
+
+def _lanes(
+    detections: Sequence[ImageDetections], ground: ImageGround, whole: bool
+) -> list[tuple[int, LaneDetection]]:
+    """The images and lane detections, ``whole`` lines or pieces, of the images that ``ground`` covers."""
+    covered = np.isfinite(ground.centre_map[:, 0])
+    return [
+        (found.image, lane)
+        for found in detections
+        if covered[found.image]
+        for lane in found.lanes
+        if (lane.kind == LANE_BOUNDARY) == whole and (whole or len(lane.points_px) >= 2)
+    ]
+
+
+def _points(
+    drive: Drive, lanes: Sequence[tuple[int, LaneDetection]]
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Of all points of ``lanes`` their lane (P,), their image (P,) and their pinhole pixels (P, 2)."""
+    of_lane = np.repeat(np.arange(len(lanes)), [len(lane.points_px) for _, lane in lanes])
+    image = np.array([i for i, _ in lanes], dtype=np.int64)[of_lane]
+    camera = np.array([one.camera for one in drive.images])[image]
+    points_px = np.concatenate([lane.points_px for _, lane in lanes]).astype(np.float64)
+    for name in np.unique(camera):
+        own = camera == name
+        points_px[own] = undistort_points(drive.cameras[str(name)].info, points_px[own])
+    return of_lane, image, points_px
+
+
+def _guides(
+    drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, max_range_m: float
+) -> Guides:
+    """The whole lines of the images that ``ground`` covers, as far as ``max_range_m``."""
+    lanes = _lanes(detections, ground, whole=True)
+    if not lanes:
+        return Guides()
+    line, image, points_px = _points(drive, lanes)
+    points_map = ground_points(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
+    return Guides(points_map[near], line[near], np.array([i for i, _ in lanes], dtype=np.int64))
+
+
+def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, list[str], FloatArray]:
+    """Images of ``cameras``: their indices, camera names and recorded poses."""
+    rows = [i for i, image in enumerate(drive.images) if image.camera in cameras]
+    names = [drive.images[i].camera for i in rows]
+    return np.array(rows), names, np.stack([drive.images[i].map_from_vehicle for i in rows])
+
+
+def _image_ground(
+    count: int, rows: IntArray, homographies: FloatArray, extrinsic: FloatArray, poses: FloatArray
+) -> ImageGround:
+    centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
+    all_homographies = np.full((count, 3, 3), np.nan)
+    all_centres = np.full((count, 3), np.nan)
+    all_homographies[rows], all_centres[rows] = homographies, centre
+    return ImageGround(all_homographies, all_centres)
+
+
+def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
+    """Unit direction (P, 2) at each point of its piece, from the points up to two places away."""
+    length = np.bincount(piece)
+    first = (np.cumsum(length) - length)[piece]
+    last = first + length[piece] - 1
+    here = np.arange(len(points))
+    difference = (
+        points[np.minimum(here + _TANGENT_REACH, last)] - points[np.maximum(here - _TANGENT_REACH, first)]
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(difference / np.linalg.norm(difference, axis=1, keepdims=True))
+
+
+_SEED_CELL_M = 0.25
+"""Side of the cells that each give a seed, m."""
+
+_DIRECTION_BINS = 8
+"""Directions told apart within a cell, of half a circle."""
+
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))
+"""Cosine from which points are of one line: a crossing one is not."""
+
+_ITERATIONS = 4
+"""Mean shifts of each seed."""
+
+_THIN_SPACINGS = 0.7
+"""Spacings of nodes within which the best supported one suppresses others of its line."""
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """N points on the ridges.
+
+    ``points_map`` (N, 2), unit ``tangent`` (N, 2) of either sense, ``images`` (N,) that support a
+    node and ``dash`` (N,), the share of its points that were seen as a dash.
+    """
+
+    points_map: FloatArray
+    tangent: FloatArray
+    images: IntArray
+    dash: FloatArray
+
+
+def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
+    """Nodes on the ridges of ``cloud``, about ``options.node_spacing_m`` apart."""
+    seeds = _seeds(cloud)
+    points, tangent = cloud.points_map[seeds].copy(), cloud.tangent[seeds].copy()
+    pairs = _neighbours(points, cloud, options)
+    for _ in range(_ITERATIONS):
+        points, tangent = _shift(points, tangent, cloud, pairs, options)
+    images, dash = _support(points, tangent, cloud, pairs, options)
+    supported = np.flatnonzero(images >= options.min_images)
+    kept = supported[_thin(points[supported], tangent[supported], images[supported], options)]
+    return Nodes(points[kept], tangent[kept], images[kept], dash[kept])
+
+
+def _seeds(cloud: LaneCloud) -> IntArray:
+    """One point of the cloud per cell of position and direction."""
+    angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
+    cell = np.column_stack(
+        [np.floor(cloud.points_map / _SEED_CELL_M), np.floor(angle / np.pi * _DIRECTION_BINS)]
+    )
+    _, first = np.unique(cell.astype(np.int64), axis=0, return_index=True)
+    return np.asarray(first)
+
+
+def _neighbours(points: FloatArray, cloud: LaneCloud, options: LaneOptions) -> tuple[IntArray, IntArray]:
+    """Pairs (seed, point of the cloud) that may ever lie in a seed's neighbourhood."""
+    reach_m = float(np.hypot(options.half_length_m, 2 * options.half_width_m))
+    near = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
+    return near["i"].astype(np.int64), near["j"].astype(np.int64)
+
+
+def _coordinates(
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of each pair: position of the point along and across the seed's line, cosine of directions."""
+    seed, point = pairs
+    offset = cloud.points_map[point] - points[seed]
+    along = np.einsum("pi,pi->p", offset, tangent[seed])
+    across = offset[:, 1] * tangent[seed, 0] - offset[:, 0] * tangent[seed, 1]
+    cosine = np.abs(np.einsum("pi,pi->p", cloud.tangent[point], tangent[seed]))
+    return along, across, cosine
+
+
+def _shift(
+    points: FloatArray,
+    tangent: FloatArray,
+    cloud: LaneCloud,
+    pairs: tuple[IntArray, IntArray],
+    options: LaneOptions,
+) -> tuple[FloatArray, FloatArray]:
+    """Move each seed across its line onto the weighted regression line of its neighbourhood."""
+    along, across, cosine = _coordinates(points, tangent, cloud, pairs)
+    near = (np.abs(along) <= options.half_length_m) & (np.abs(across) <= options.half_width_m)
+    near &= cosine >= _SAME_DIRECTION
+    x, y = along[near], across[near]
+    # Gaussian across, so that of two lines within reach the nearer one wins.
+    kernel = np.exp(-0.5 * (2.0 * y / options.half_width_m) ** 2) * (1 - (x / options.half_length_m) ** 2)
+    weight = cloud.weight[pairs[1][near]] * kernel
+    count = len(points)
+
+    def total(value: FloatArray) -> FloatArray:
+        return np.bincount(pairs[0][near], weights=value, minlength=count).astype(np.float64)
+
+    w, wx, wy, wxx, wxy = (total(weight * v) for v in (np.ones_like(x), x, y, x * x, x * y))
+    safe = np.maximum(w, 1e-12)
+    # A little stiffness keeps the direction where all neighbours lie at one place.
+    spread = wxx - wx**2 / safe + 1e-3 * safe
+    slope = np.clip((wxy - wx * wy / safe) / np.maximum(spread, 1e-12), -0.5, 0.5)
+    offset = np.clip((wy - slope * wx) / safe, -options.half_width_m, options.half_width_m)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    turned = tangent + slope[:, None] * normal
+    return points + offset[:, None] * normal, turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def _support(
+    points: FloatArray,
+    tangent: FloatArray,
+    cloud: LaneCloud,
+    pairs: tuple[IntArray, IntArray],
+    options: LaneOptions,
+) -> tuple[IntArray, FloatArray]:
+    """Distinct images (N,) around each node, and the share (N,) of points seen as a dash."""
+    along, across, cosine = _coordinates(points, tangent, cloud, pairs)
+    near = (np.abs(along) <= options.node_spacing_m) & (np.abs(across) <= 0.5 * options.half_width_m)
+    near &= cosine >= _SAME_DIRECTION
+    seed, point = pairs[0][near], pairs[1][near]
+    key = np.unique(seed * (int(cloud.image.max(initial=0)) + 1) + cloud.image[point])
+    images = np.bincount(key // (int(cloud.image.max(initial=0)) + 1), minlength=len(points))
+    total = np.maximum(np.bincount(seed, minlength=len(points)), 1)
+    dash = np.bincount(seed, weights=cloud.dash[point].astype(float), minlength=len(points)) / total
+    return images.astype(np.int64), dash
+
+
+def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: LaneOptions) -> IntArray:
+    """Indices of the best supported nodes, no two closer than .7 of the spacing along or beside a line."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    reach_m = _THIN_SPACINGS * options.node_spacing_m
+    near = cKDTree(points).query_ball_point(points, reach_m)
+    alive = np.ones(len(points), dtype=bool)
+    kept = []
+    for node in np.argsort(-images, kind="stable").tolist():
+        if not alive[node]:
+            continue
+        kept.append(node)
+        others = np.array(near[node])
+        offset = points[others] - points[node]
+        across = offset[:, 1] * tangent[node, 0] - offset[:, 0] * tangent[node, 1]
+        same = np.abs(tangent[others] @ tangent[node]) >= _SAME_DIRECTION
+        alive[others[same & (np.abs(across) <= 0.5 * options.half_width_m)]] = False
+    return np.array(kept, dtype=np.int64)

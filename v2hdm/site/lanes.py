@@ -1,0 +1,377 @@
+"""Lanes: nodes on lane paint strung into polylines, and pieces of one line joined across its gaps.
+
+Pieces are joined by their directions; paint under trees or worn away leaves gaps too long for that. Where the
+detector saw, in several images, one whole line pass the end of one piece and the start of the next, they are
+one lane, and those lines say where it runs between them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.records import LANE_DASH, LANE_LINE, BoolArray, FloatArray, IntArray, Lane
+from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
+from v2hdm.site.options import LaneOptions
+
+_SAME_DIRECTION = np.cos(np.deg2rad(25.0))
+"""Cosine from which two nodes are of one line."""
+
+_MAX_LINK_SPACINGS = 2.5
+"""Longest link of two nodes, in spacings of nodes."""
+
+_MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
+"""Largest angle of a gap's chord and an end's tangent, and difference of the angles at both ends, rad."""
+
+_END_SIGMA_M = 0.05
+"""Lateral error of an end, m, which short gaps must allow for in angles."""
+
+_END_LENGTH_M = 2.0
+"""Length, m, over which an end's direction is taken."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """A polyline: ``points_map`` (N, 2), ``dash`` share and supporting ``images``, both means."""
+
+    points_map: FloatArray
+    dash: float
+    images: float
+
+    @property
+    def length_m(self) -> float:
+        """Length along the polyline."""
+        return float(np.sum(np.linalg.norm(np.diff(self.points_map, axis=0), axis=1)))
+
+    def turned(self, turn: bool) -> Path:
+        """The same from its other end if it is to ``turn``, else as it is."""
+        return replace(self, points_map=self.points_map[::-1]) if turn else self
+
+
+def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
+    """String nodes into paths that never fork: linked are mutually nearest ones ahead and behind."""
+    if not len(nodes.points_map):
+        return []
+    links = _mutual_links(nodes, _MAX_LINK_SPACINGS * options.node_spacing_m)
+    return [
+        Path(nodes.points_map[path], float(nodes.dash[path].mean()), float(np.median(nodes.images[path])))
+        for path in _walk(links)
+        if len(path) >= 2
+    ]
+
+
+def join_paths(paths: list[Path], options: LaneOptions) -> list[Path]:
+    """Join paths end to end where both ends lie on one arc, shortest gaps first.
+
+    Gaps up to ``max_dash_gap_m`` are bridged between dashed pieces, up to ``max_break_m`` otherwise.
+    """
+    joints = _joints(paths, options)
+    chain = _Chains(len(paths))
+    for a, end_a, b, end_b in joints:
+        chain.join(a, end_a, b, end_b)
+    return [_concatenate([paths[p].turned(flip) for p, flip in run], options) for run in chain.runs()]
+
+
+def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
+    """For each node (N, 2) the node linked ahead and behind it, -1 where there is none."""
+    pairs = cKDTree(nodes.points_map).query_pairs(reach_m, output_type="ndarray")
+    source = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    target = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    offset = nodes.points_map[target] - nodes.points_map[source]
+    distance = np.linalg.norm(offset, axis=1)
+    tangent = nodes.tangent[source]
+    along = np.einsum("pi,pi->p", offset, tangent)
+    straight = np.minimum(
+        np.abs(along), np.abs(np.einsum("pi,pi->p", offset, nodes.tangent[target]))
+    ) / np.maximum(distance, 1e-9)
+    parallel = np.abs(np.einsum("pi,pi->p", tangent, nodes.tangent[target]))
+    fits = (straight >= _SAME_DIRECTION) & (parallel >= _SAME_DIRECTION)
+    source, target, along, cost = source[fits], target[fits], along[fits], (distance / straight**4)[fits]
+    best = np.full((len(nodes.points_map), 2), -1, dtype=np.int64)
+    # Written from the costliest to the cheapest, so that the cheapest stays.
+    order = np.argsort(-cost, kind="stable")
+    best[source[order], (along[order] < 0).astype(int)] = target[order]
+    chosen = best.copy()
+    for side in (0, 1):
+        node = np.flatnonzero(best[:, side] >= 0)
+        other = best[node, side]
+        one_sided = node[~(best[other] == node[:, None]).any(axis=1)]
+        chosen[one_sided, side] = -1
+    return chosen
+
+
+def _walk(links: IntArray) -> list[IntArray]:
+    """Follow links (N, 2) from end to end, then around closed loops (whose start is repeated)."""
+    degree = (links >= 0).sum(axis=1)
+    left = np.ones(len(links), dtype=bool)
+    paths = []
+    for start in np.concatenate([np.flatnonzero(degree == 1), np.flatnonzero(degree == 2)]).tolist():
+        if not left[start]:
+            continue
+        path, previous, node = [], -1, start
+        while node >= 0 and left[node]:
+            left[node] = False
+            path.append(node)
+            ahead = [n for n in links[node].tolist() if n >= 0 and n != previous and left[n]]
+            previous, node = node, ahead[0] if ahead else -1
+        if degree[start] == 2 and start in links[path[-1]] and len(path) > 2:
+            path.append(start)
+        paths.append(np.array(path, dtype=np.int64))
+    return paths
+
+
+def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int, int]]:
+    """Pairs of path ends (path, end, path, end) that fit, by growing gap; end 0 first, 1 last."""
+    if len(paths) < 2:
+        return []
+    end = np.array([path.points_map[[0, -1]] for path in paths]).reshape(-1, 2)
+    outward = np.array([[_outward(path.points_map[::-1]), _outward(path.points_map)] for path in paths])
+    outward = outward.reshape(-1, 2)
+    dashed = np.repeat([path.dash > 0.5 for path in paths], 2)
+    pairs = cKDTree(end).query_pairs(max(options.max_dash_gap_m, options.max_break_m), output_type="ndarray")
+    a, b = pairs[:, 0], pairs[:, 1]
+    gap = end[b] - end[a]
+    gap_m = np.linalg.norm(gap, axis=1)
+    limit_m = np.where(dashed[a] & dashed[b], options.max_dash_gap_m, options.max_break_m)
+    leaving = _signed_angle(outward[a], gap)
+    arriving = _signed_angle(gap, -outward[b])
+    fits = (gap_m <= limit_m) & (a // 2 != b // 2) & _on_one_arc(leaving, arriving, gap_m)
+    order = np.flatnonzero(fits)[np.argsort(gap_m[fits], kind="stable")]
+    return [(int(a[p]) // 2, int(a[p]) % 2, int(b[p]) // 2, int(b[p]) % 2) for p in order]
+
+
+def _on_one_arc(leaving_rad: FloatArray, arriving_rad: FloatArray, gap_m: FloatArray) -> BoolArray:
+    """Whether a gap's chord meets both tangents at one angle, lateral errors of 5 cm allowed for."""
+    slack = np.arctan2(_END_SIGMA_M, np.maximum(gap_m, 1e-6))
+    return np.asarray(
+        (np.abs(leaving_rad) <= _MAX_BEND_RAD + slack)
+        & (np.abs(arriving_rad) <= _MAX_BEND_RAD + slack)
+        & (np.abs(leaving_rad - arriving_rad) <= _MAX_ARC_MISMATCH_RAD + 2 * slack)
+    )
+
+
+def _outward(points: FloatArray) -> FloatArray:
+    """Direction (2,) in which a polyline leaves its last point, over its last two metres."""
+    distance = np.linalg.norm(points - points[-1], axis=1)
+    inner = np.flatnonzero(distance <= _END_LENGTH_M)
+    start = int(inner[0]) if len(inner) > 1 else max(len(points) - 2, 0)
+    direction = points[-1] - points[start:-1].mean(axis=0)
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+
+
+def _signed_angle(source: FloatArray, target: FloatArray) -> FloatArray:
+    """Angle (P,) from directions ``source`` to ``target`` (P, 2), in (-pi, pi]."""
+    cross = source[:, 0] * target[:, 1] - source[:, 1] * target[:, 0]
+    return np.asarray(np.arctan2(cross, np.sum(source * target, axis=1)))
+
+
+class _Chains:
+    """Paths being joined end to end, each end at most once and never into a ring."""
+
+    def __init__(self, count: int) -> None:
+        self._next: dict[tuple[int, int], tuple[int, int]] = {}
+        self._root = list(range(count))
+
+    def join(self, a: int, end_a: int, b: int, end_b: int) -> None:
+        """Join two ends unless one is taken or the paths are connected already."""
+        if (a, end_a) in self._next or (b, end_b) in self._next or self._find(a) == self._find(b):
+            return
+        self._next[a, end_a], self._next[b, end_b] = (b, end_b), (a, end_a)
+        self._root[self._find(a)] = self._find(b)
+
+    def runs(self) -> list[list[tuple[int, bool]]]:
+        """Runs of (path, whether it is walked backwards), each path in exactly one run."""
+        seen: set[int] = set()
+        runs = []
+        for start in range(len(self._root)):
+            if start in seen or ((start, 0) in self._next and (start, 1) in self._next):
+                continue
+            run, path, enter = [], start, 1 if (start, 0) in self._next else 0
+            while True:
+                seen.add(path)
+                run.append((path, enter == 1))
+                following = self._next.get((path, 1 - enter))
+                if following is None:
+                    break
+                path, enter = following
+            runs.append(run)
+        return runs
+
+    def _find(self, path: int) -> int:
+        while self._root[path] != path:
+            path = self._root[path]
+        return path
+
+
+def _concatenate(paths: list[Path], options: LaneOptions) -> Path:
+    """One path of several in order, the gaps bridged by cubic curves with vertices as elsewhere."""
+    pieces = [paths[0].points_map]
+    for before, after in itertools.pairwise(paths):
+        pieces += [_bridge(before.points_map, after.points_map, options.node_spacing_m), after.points_map]
+    return _merged(np.concatenate(pieces), paths)
+
+
+def _merged(points_map: FloatArray, paths: Sequence[Path]) -> Path:
+    """A path along ``points_map``, with the means of what it was made of."""
+    length_m = [max(path.length_m, 1e-9) for path in paths]
+    dash = float(np.average([path.dash for path in paths], weights=length_m))
+    return Path(points_map, dash, float(np.average([path.images for path in paths], weights=length_m)))
+
+
+def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArray:
+    """Vertices (N, 2) of the Hermite cubic from the end of ``before`` to the start of ``after``."""
+    start, stop = before[-1], after[0]
+    gap_m = float(np.linalg.norm(stop - start))
+    t = np.linspace(0.0, 1.0, max(int(np.ceil(gap_m / spacing_m)), 1) + 1)[1:-1, None]
+    leave, arrive = gap_m * _outward(before), -gap_m * _outward(after[::-1])
+    return np.asarray(
+        (2 * t**3 - 3 * t**2 + 1) * start
+        + (t**3 - 2 * t**2 + t) * leave
+        + (3 * t**2 - 2 * t**3) * stop
+        + (t**3 - t**2) * arrive
+    )
+
+
+_MAX_BRIDGE_M = 25.0
+"""Longest gap that images' whole lines bridge, m."""
+
+_PASSES_M = 0.4
+"""A line that comes so near the end of a piece passes it."""
+
+_LEAST_COSINE = np.cos(np.deg2rad(30.0))
+"""Cosine of a gap's way and the directions of its ends at least."""
+
+_FIRST, _LAST = 0, 1
+_DIRECTION_LENGTH_M = 5.0
+"""A bridge leaves a piece in about the direction of so much of its end."""
+
+
+def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> list[Path]:
+    """The paths, those joined that ``options.min_images`` images saw as one line, shortest gaps first."""
+    if not len(guides.points_map):
+        return paths
+    tree = cKDTree(guides.points_map)
+    ended = [(path, _ends(path)) for path in paths]
+    while (joined := _shortest_bridge(ended, guides, tree, options)) is not None:
+        a, b, path = joined
+        ended = [of for k, of in enumerate(ended) if k not in (a, b)] + [(path, _ends(path))]
+    return [path for path, _ in ended]
+
+
+def _shortest_bridge(
+    ended: list[tuple[Path, FloatArray]], guides: Guides, tree: cKDTree, options: LaneOptions
+) -> tuple[int, int, Path] | None:
+    """Two of the paths, each with its ends, and what they are together: the shortest gap to be bridged."""
+    if len(ended) < 2:
+        return None
+    for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])).tolist():
+        before = ended[a][0].turned(end_a == _FIRST)
+        after = ended[b][0].turned(end_b == _LAST)
+        between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, options)
+        if between is not None:
+            joined = np.concatenate([before.points_map, between, after.points_map])
+            return a, b, _merged(joined, [before, after])
+    return None
+
+
+def _gaps(ends: FloatArray) -> NDArray[np.int64]:
+    """Path, end, path, end (G, 4) of all gaps whose way is roughly that of both paths, the shortest first."""
+    place, outward = ends.reshape(-1, 2, 2).swapaxes(0, 1)
+    gap = place[None] - place[:, None]
+    gap_m = np.linalg.norm(gap, axis=2)
+    # From i to j one leaves i outwards and arrives at j against what is outwards there.
+    leaving = np.einsum("ijk,ik->ij", gap, outward)
+    straight = np.minimum(leaving, leaving.T) >= _LEAST_COSINE * gap_m
+    path = np.arange(len(place)) // 2
+    able = straight & (gap_m > 0) & (gap_m <= _MAX_BRIDGE_M) & (path[:, None] < path)
+    i, j = np.nonzero(able)
+    order = np.argsort(gap_m[i, j], kind="stable")
+    return np.asarray(np.column_stack([path[i], i % 2, path[j], j % 2])[order])
+
+
+def _ends(path: Path) -> FloatArray:
+    """Position and outward direction (2, 2, 2) of the first and the last end of a path."""
+    points = path.points_map
+    return np.array([[points[0], _end_direction(points[::-1])], [points[-1], _end_direction(points)]])
+
+
+def _end_direction(points: FloatArray) -> FloatArray:
+    """Direction (2,) in which a polyline ends, over its last metres."""
+    away = np.linalg.norm(points - points[-1], axis=1)
+    direction = (
+        points[-1] - points[int(np.argmin(np.abs(away - min(_DIRECTION_LENGTH_M, float(away.max())))))]
+    )
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+
+
+def _course_between(
+    start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, options: LaneOptions
+) -> FloatArray | None:
+    """Vertices (N, 2) between two ends, where the lines seen run; None unless enough images saw one."""
+    first, last = (np.unique(guides.line[tree.query_ball_point(end, _PASSES_M)]) for end in (start, stop))
+    common = np.intersect1d(first, last)
+    if len(np.unique(guides.image_of_line[common])) < options.min_images:
+        return None
+    gap = stop - start
+    gap_m = float(np.linalg.norm(gap))
+    ahead = gap / gap_m
+    count = max(int(np.ceil(gap_m / options.node_spacing_m)), 1)
+    at = np.linspace(0.0, gap_m, count + 1)
+    courses = []
+    for line in common:
+        offset = guides.points_map[guides.line == line] - start
+        along, across = offset @ ahead, offset[:, 1] * ahead[0] - offset[:, 0] * ahead[1]
+        order = np.argsort(along)
+        courses.append(np.interp(at, along[order], across[order]))
+    course = np.median(courses, axis=0)
+    # The paint is where the ends are: what the lines seen are off there is taken off along the way.
+    course -= np.interp(at, [0.0, gap_m], [course[0], course[-1]])
+    points = start + at[:, None] * ahead + course[:, None] * np.array([-ahead[1], ahead[0]])
+    return np.asarray(points[1:-1])
+
+
+_LEAST_LENGTH_M = 6.0
+"""Length, m, at which a lane that just enough images saw is one; a shorter one must be seen more often."""
+
+
+def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
+    """Polylines along the lane paint of ``cloud``, vertices ``options.node_spacing_m`` apart.
+
+    Dashes of one line become one lane of kind ``lane_dash`` that runs on across their gaps.
+    """
+    if len(cloud.points_map) < 2:
+        return ()
+    paths = join_paths(string_nodes(find_nodes(cloud, options), options), options)
+    paths = bridge_paths(paths, cloud.guides, options)
+    return tuple(_lane(path, options) for path in paths if _is_seen_enough(path, options))
+
+
+def _is_seen_enough(path: Path, options: LaneOptions) -> bool:
+    """Whether a path is long enough, and a short one seen often enough."""
+    image_metres = path.length_m * path.images
+    return path.length_m >= options.min_length_m and image_metres >= _LEAST_LENGTH_M * options.min_images
+
+
+def _lane(path: Path, options: LaneOptions) -> Lane:
+    kind = LANE_DASH if path.dash > 0.5 else LANE_LINE
+    points = _resample(_smooth(path.points_map), options.node_spacing_m)
+    return Lane(kind, points, round(path.images))
+
+
+def _smooth(points: FloatArray) -> FloatArray:
+    """Binomial smoothing of the inner vertices: takes out the nodes' own lateral noise."""
+    out = points.copy()
+    out[1:-1] = 0.25 * points[:-2] + 0.5 * points[1:-1] + 0.25 * points[2:]
+    return out
+
+
+def _resample(points: FloatArray, spacing_m: float) -> FloatArray:
+    """Vertices at equal steps of about ``spacing_m`` along a polyline, both ends kept."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = np.linspace(0.0, along[-1], max(round(float(along[-1]) / spacing_m), 1) + 1)
+    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])

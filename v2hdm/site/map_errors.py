@@ -1,0 +1,307 @@
+r"""The errors that markings of a map share, how two maps therefore lie to each other, and lines carried over.
+
+A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of
+the receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the
+ground with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markings at the distance d. So the
+markings that two maps have in common tell how the maps are shifted against each other, everywhere near to
+them; and averaging many markings does not average away what they share.
+
+Lane lines and symbols of an earlier map stay where the new drive has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
+
+UNKNOWN_SIGMA_M = 0.02
+"""Sigma of a corner of a map that states none, m a coordinate: a marking drawn by hand over an image."""
+
+_LEAST_SIGMA_M = 1e-4
+"""Floor of the sigmas of a marking's own error, m: the rounding of a survey."""
+
+SHIFT = np.tile(np.eye(2), (4, 1))
+"""How the stacked corners (8,) move with a shift (2,)."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The errors of M markings, taken apart.
+
+    ``centres_map`` (M, 2), m; ``own_m2`` (M, 8, 8) covariances of each marking's own errors; ``shared_m2``
+    (M,) variances, a coordinate, of the shift that it shares with its surroundings, over about ``over_m``, m.
+    """
+
+    centres_map: FloatArray
+    own_m2: FloatArray
+    shared_m2: FloatArray
+    over_m: float
+
+    @classmethod
+    def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
+        """What ``markings`` state: their covariance is the whole error, their relative sigma its own part."""
+        centres = np.array([one.corners_map.mean(axis=0) for one in markings]).reshape(-1, 2)
+        stated = [
+            np.eye(8) * UNKNOWN_SIGMA_M**2 if one.covariance_m2 is None else one.covariance_m2
+            for one in markings
+        ]
+        whole = np.array(stated).reshape(-1, 8, 8)
+        centre_m2 = np.einsum("miaja->m", whole.reshape(-1, 4, 2, 4, 2)) / 32
+        own_m2 = np.array(
+            [np.nan if one.relative_sigma_m is None else one.relative_sigma_m**2 for one in markings]
+        )
+        shared_m2 = np.maximum(centre_m2 - own_m2, 0.0)
+        # One without neighbours has no relative sigma: it shares what the others do.
+        usual_m2 = float(np.nanmedian(shared_m2)) if np.isfinite(shared_m2).any() else 0.0
+        shared_m2 = np.where(np.isfinite(shared_m2), shared_m2, np.minimum(usual_m2, centre_m2))
+        own = whole - shared_m2[:, None, None] * (SHIFT @ SHIFT.T)
+        return cls(centres, _positive(own), shared_m2, over_m)
+
+    def __len__(self) -> int:
+        return len(self.centres_map)
+
+    def at(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (N, 2) as places of the process: themselves and the variance (N,) usual in the map."""
+        return points_map, np.full(len(points_map), float(np.median(self.shared_m2)) if len(self) else 0.0)
+
+    def kernel(self, rows: IntArray, points_map: FloatArray, variance_m2: FloatArray) -> FloatArray:
+        """Covariances (R, N), m^2 a coordinate, of the shifts of markings ``rows`` and of other places."""
+        apart_m = np.linalg.norm(self.centres_map[rows][:, None] - points_map[None], axis=2)
+        sigma = np.sqrt(self.shared_m2[rows][:, None] * variance_m2[None])
+        return np.asarray(sigma * np.exp(-apart_m / self.over_m))
+
+    def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """Covariances (R, N) of the shifts of markings ``rows`` and ``columns``."""
+        return self.kernel(rows, self.centres_map[columns], self.shared_m2[columns])
+
+
+def _positive(covariance: FloatArray) -> FloatArray:
+    """The nearest covariances whose sigmas are no smaller than the floor."""
+    values, vectors = np.linalg.eigh((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+    values = np.maximum(values, _LEAST_SIGMA_M**2)
+    return np.asarray((vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2))
+
+
+@dataclass(frozen=True)
+class Shift:
+    """How a new map lies to an old one, by P pairs of markings that both have.
+
+    ``old`` and ``new`` (P,) are the pairs' markings; ``off_map`` (P, 2) how far the new one is from the old,
+    of the covariance ``noise_m2`` (P, 2, 2) by their own errors.
+    """
+
+    of_old: Errors
+    of_new: Errors
+    old: IntArray
+    new: IntArray
+    off_map: FloatArray
+    noise_m2: FloatArray
+
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        """Of the joint covariance (2 P, 2 P) of all that is off."""
+        count = len(self.old)
+        shared = self.of_old.between(self.old, self.old) + self.of_new.between(self.new, self.new)
+        total = np.kron(shared, np.eye(2))
+        for k in range(count):
+            total[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += self.noise_m2[k]
+        return np.asarray(np.linalg.inv(total))
+
+    @cached_property
+    def _weighed(self) -> FloatArray:
+        """The inverse times what is off, (P, 2)."""
+        return np.asarray((self._inverse @ self.off_map.ravel()).reshape(-1, 2))
+
+    def without_itself(self, pair: int) -> tuple[FloatArray, FloatArray]:
+        """Mean (2,) and covariance (2, 2) of the maps' shift at a pair, by all other pairs.
+
+        Leave-one-out prediction of a Gaussian process (Rasmussen and Williams, Gaussian Processes for Machine
+        Learning, section 5.4.2).
+        """
+        own = slice(2 * pair, 2 * pair + 2)
+        spread = np.linalg.inv(self._inverse[own, own])
+        mean = self.off_map[pair] - spread @ self._weighed[pair]
+        return mean, _positive((spread - self.noise_m2[pair])[None])[0]
+
+    def at(self, old: int, new: int) -> tuple[FloatArray, FloatArray]:
+        """Mean (2,) and covariance (2, 2) of the maps' shift between an old and a new marking."""
+        one, other = np.array([old]), np.array([new])
+        prior_m2 = self.of_old.shared_m2[old] + self.of_new.shared_m2[new]
+        if not len(self.old):
+            return np.zeros(2), prior_m2 * np.eye(2)
+        known = self.of_old.between(self.old, one) + self.of_new.between(self.new, other)
+        return self._conditional(known[:, 0], np.array([prior_m2]))
+
+    def _conditional(self, known: FloatArray, prior_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
+        gain = np.kron(known[None], np.eye(2)) @ self._inverse
+        covariance = prior_m2[0] * np.eye(2) - gain @ np.kron(known[:, None], np.eye(2))
+        return gain @ self.off_map.ravel(), _positive(covariance[None])[0]
+
+    def of_old_at(self, points_map: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The old map's shared errors at places: means (N, 2) and covariances (N, 2, 2)."""
+        return self._of_one(-self.of_old.kernel(self.old, points_map, variance_m2), variance_m2)
+
+    def of_new_at(self, points_map: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The new map's shared errors at places: means (N, 2) and covariances (N, 2, 2)."""
+        return self._of_one(self.of_new.kernel(self.new, points_map, variance_m2), variance_m2)
+
+    def _of_one(self, known: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """By the covariances (P, N) of one map's shared errors at places with what is off."""
+        count, places = known.shape
+        prior = variance_m2[:, None, None] * np.eye(2)
+        if not count:
+            return np.zeros((places, 2)), prior
+        blocks = self._inverse.reshape(count, 2, count, 2)
+        taken = np.einsum("pn,piqj,qn->nij", known, blocks, known, optimize=True)
+        return known.T @ self._weighed, _positive(prior - taken)
+
+    def of_both(self, pair: int) -> tuple[FloatArray, FloatArray]:
+        """The shared errors of the old and the new map at a pair: mean (4,) and covariance (4, 4)."""
+        one, other = np.array([self.old[pair]]), np.array([self.new[pair]])
+        known = [-self.of_old.between(self.old, one)[:, 0], self.of_new.between(self.new, other)[:, 0]]
+        gain = np.concatenate([np.kron(part[None], np.eye(2)) for part in known])
+        prior = [self.of_old.shared_m2[one[0]], self.of_new.shared_m2[other[0]]]
+        covariance = np.kron(np.diag(prior), np.eye(2)) - gain @ self._inverse @ gain.T
+        return gain @ self._weighed.ravel(), (covariance + covariance.T) / 2
+
+
+_SAME_LINE_M = 0.3
+"""Distance of two maps' lines up to which they are one, m: two lines side by side lie twice as far apart."""
+
+_LEAST_SHARED = 0.5
+"""Share of a new line's vertices that lie on an earlier line, from which it is that line."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A new line that lies on an earlier one: from ``begin`` to ``end`` of its stations, m, along that."""
+
+    begin: float
+    end: float
+    lane: Lane
+
+
+def updated_lanes(
+    old: Sequence[Lane], new: Sequence[Lane], shift: Shift, number: Callable[[], int]
+) -> tuple[Lane, ...]:
+    """The lines of both maps: an earlier one keeps its id, and its course where the new drive has none of it.
+
+    ``shift`` is how the maps lie to each other; ``number`` gives a fresh id.
+    """
+    before = [replace(one, points_map=_moved(one.points_map, shift, of_old=True)) for one in old]
+    pieces: list[list[_Piece]] = [[] for _ in before]
+    added = []
+    for one in new:
+        lane = replace(one, points_map=_moved(one.points_map, shift, of_old=False))
+        owner = _owner(lane, before)
+        if owner is None:
+            added.append(replace(lane, id=number()))
+        else:
+            pieces[owner].append(_piece(lane, before[owner]))
+    kept = [_renewed(lane, parts) for lane, parts in zip(before, pieces, strict=True)]
+    return (*kept, *added)
+
+
+def updated_symbols(
+    old: Sequence[Symbol], new: Sequence[Symbol], shift: Shift, number: Callable[[], int]
+) -> tuple[Symbol, ...]:
+    """The symbols of both maps: of those that lie on each other the new outline under the earlier id."""
+    out = [replace(one, outline_map=_moved(one.outline_map, shift, of_old=True)) for one in old]
+    centres = np.array([one.outline_map.mean(axis=0) for one in out]).reshape(-1, 2)
+    taken: set[int] = set()
+    for one in new:
+        symbol = replace(one, outline_map=_moved(one.outline_map, shift, of_old=False))
+        off_m = np.linalg.norm(centres - symbol.outline_map.mean(axis=0), axis=1)
+        within = 0.5 * float(np.ptp(symbol.outline_map, axis=0).max())
+        near = [k for k in np.argsort(off_m).tolist() if k < len(old) and off_m[k] < within]
+        same = next((k for k in near if k not in taken and old[k].kind == one.kind), None)
+        if same is None:
+            out.append(replace(symbol, id=number()))
+        else:
+            taken.add(same)
+            out[same] = replace(
+                symbol, id=old[same].id, sightings=old[same].sightings + one.sightings, heights_m=None
+            )
+    return tuple(out)
+
+
+def _moved(points_map: FloatArray, shift: Shift, of_old: bool) -> FloatArray:
+    """Points without the error that they share with the markings around them."""
+    errors = shift.of_old if of_old else shift.of_new
+    at = shift.of_old_at if of_old else shift.of_new_at
+    return points_map - at(*errors.at(points_map))[0]
+
+
+def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
+    """The earlier line of the same class that most of a new line lies on."""
+    alike = [k for k, one in enumerate(lanes) if one.kind == lane.kind]
+    shares = [(_apart(lane.points_map, lanes[k].points_map) <= _SAME_LINE_M).mean() for k in alike]
+    best = int(np.argmax(shares)) if shares else 0
+    return alike[best] if shares and shares[best] >= _LEAST_SHARED else None
+
+
+def _apart(points: FloatArray, line: FloatArray) -> FloatArray:
+    """Distances (N,) of points (N, 2) from a polyline (M, 2)."""
+    place = _stations(points, line)
+    along = _along(line)
+    foot = np.column_stack([np.interp(place, along, line[:, k]) for k in (0, 1)])
+    return np.asarray(np.linalg.norm(points - foot, axis=1))
+
+
+def _along(line: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def _stations(points: FloatArray, line: FloatArray) -> FloatArray:
+    """How far along a polyline (M, 2) the feet of points (N, 2) lie, m: beside its nearest vertex."""
+    along, nearest = _along(line), cKDTree(line).query(points)[1]
+    best = np.full(len(points), np.inf)
+    station = np.asarray(along[nearest], dtype=np.float64)
+    for first in (nearest - 1, nearest):
+        begin = np.clip(first, 0, len(line) - 2)
+        side = line[begin + 1] - line[begin]
+        length2 = np.maximum((side**2).sum(axis=1), 1e-12)
+        share = np.clip(((points - line[begin]) * side).sum(axis=1) / length2, 0.0, 1.0)
+        off = np.linalg.norm(points - line[begin] - share[:, None] * side, axis=1)
+        nearer = off < best
+        station[nearer] = along[begin[nearer]] + share[nearer] * np.sqrt(length2[nearer])
+        best = np.minimum(best, off)
+    return station
+
+
+def _piece(lane: Lane, on: Lane) -> _Piece:
+    """The line, in the direction of the earlier one that it lies on."""
+    station = _stations(lane.points_map, on.points_map)
+    if station[-1] < station[0]:
+        lane, station = replace(lane, points_map=lane.points_map[::-1]), station[::-1]
+    return _Piece(float(station.min()), float(station.max()), lane)
+
+
+def _renewed(lane: Lane, pieces: Sequence[_Piece]) -> Lane:
+    """The earlier line with its course replaced where new lines lie on it."""
+    if not pieces:
+        return lane
+    along, heights = _along(lane.points_map), lane.heights_m
+    points: list[FloatArray] = []
+    up: list[FloatArray] = []
+    reached = -1.0
+    for piece in sorted(pieces, key=lambda one: one.begin):
+        old = (along > reached) & (along < piece.begin)
+        # Of two new pieces that overlap, the later one begins where the earlier one ends.
+        station = _stations(piece.lane.points_map, lane.points_map)
+        own = (station > reached) | (reached < 0)
+        points += [lane.points_map[old], piece.lane.points_map[own]]
+        if heights is not None:
+            up += [heights[old], np.interp(station[own], along, heights)]
+        reached = max(reached, piece.end)
+    left = along > reached
+    sightings = lane.sightings + max(piece.lane.sightings for piece in pieces)
+    course = np.concatenate([*points, lane.points_map[left]])
+    heights = None if heights is None else np.concatenate([*up, heights[left]])
+    return replace(lane, points_map=course, heights_m=heights, sightings=sightings)

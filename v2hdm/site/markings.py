@@ -1,0 +1,253 @@
+"""Which candidates become markings of the map, and why the others do not.
+
+How sure a marking is beside its neighbours, whatever drift or survey moves all of them alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from v2hdm.association.ground import Views, easy_views, images_with_symbol
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.errors import MappingError
+from v2hdm.geometry.planar import clip_convex, signed_area
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.site.candidates import Candidates, Counts, Exclusion
+from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
+
+OF_SYMBOL = "part of a symbol, such as an arrow"
+TOO_UNCERTAIN = "its position is too uncertain"
+LACKS_A_CORNER = "a corner was never seen twice"
+COVERED = "lies on a better supported marking"
+CLUTTER_BY = (
+    "not shaped like a marking of its class",
+    "seen in too few images",
+    "found in too few of its images",
+    "its sightings contradict each other",
+)
+"""What speaks most for clutter, in the order of :attr:`Posterior.evidence`."""
+
+_MAX_OVERLAP = 0.2
+"""Share of the smaller marking's area that may lie on another marking: paint does not overlap."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Support:
+    """The sightings of G candidates and the rig that they were seen by.
+
+    ``kind`` (G,) indexes ``sightings.kinds``. Observation k is of row ``row`` (K,) of the sightings and
+    candidate ``group`` (K,), and ``accepted`` (K,) or not. ``cameras`` are in the rig's order.
+    """
+
+    kind: IntArray
+    sightings: Sightings
+    rig: Rig
+    views: Views
+    cameras: tuple[Camera, ...]
+    row: IntArray
+    group: IntArray
+    accepted: BoolArray
+
+    def names(self) -> tuple[str, ...]:
+        """The class of each candidate."""
+        return tuple(self.sightings.kinds[kind] for kind in self.kind)
+
+    def counts(self, corners_map: FloatArray) -> Counts:
+        """How often candidates of corners (G, 4, 2) were seen."""
+        count = len(self.kind)
+        group, image = self.group[self.accepted], self.sightings.image[self.row[self.accepted]]
+        shown = np.unique(np.stack([group, image]), axis=1)
+        easy = np.stack(easy_views(self.views, self.rig, list(self.cameras), corners_map))
+        found = np.isin(_pair_keys(easy), _pair_keys(shown))
+        return Counts(
+            images=np.bincount(shown[0], minlength=count),
+            observations=np.bincount(self.group, minlength=count),
+            agreeing=np.bincount(group, minlength=count),
+            easy_views=np.bincount(easy[0], minlength=count),
+            found=np.bincount(easy[0, found], minlength=count),
+            as_symbol=images_with_symbol(self.sightings.symbols, self.rig, corners_map),
+        )
+
+
+@dataclass(frozen=True)
+class Classified:
+    """G candidates, and of each the reason why it is no marking of the map, None if it is one."""
+
+    kind: tuple[str, ...]
+    candidates: Candidates
+    images: IntArray
+    verdict: list[str | None]
+
+    @property
+    def accepted(self) -> IntArray:
+        """The candidates that are markings of the map."""
+        return np.flatnonzero([reason is None for reason in self.verdict])
+
+    def markings(self) -> tuple[Marking, ...]:
+        """The markings of the map, one for each accepted candidate.
+
+        Raises:
+            MappingError: there is none.
+        """
+        if not len(self.accepted):
+            raise MappingError(_no_marking_message(self.exclusions()))
+        return tuple(
+            Marking(
+                kind=self.kind[group],
+                corners_map=self.candidates.corners_map[group],
+                sightings=int(self.images[group]),
+                covariance_m2=self.candidates.covariance_m2[group],
+            )
+            for group in self.accepted
+        )
+
+    def exclusions(self) -> tuple[Exclusion, ...]:
+        """What was refused and why; candidates without a single solved corner were never candidates."""
+        return tuple(
+            Exclusion(
+                kind=self.kind[group],
+                position_map=self.candidates.corners_map[group].mean(axis=0),
+                sightings=int(self.images[group]),
+                reason=reason,
+            )
+            for group, reason in enumerate(self.verdict)
+            if reason is not None
+            and np.isfinite(self.candidates.corners_map[group]).all()
+            and self.images[group]
+        )
+
+
+def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> Classified:
+    """Decide which of the ``solved`` candidates are markings of the map, and where their corners are."""
+    counts = seen.counts(np.where(solved.known[..., None], solved.corners_map, np.nan))
+    first = posterior(solved, seen.kind, counts)
+    # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
+    counts = seen.counts(first.candidates.corners_map)
+    found = posterior(solved, seen.kind, counts)
+    least = np.log(options.min_probability / (1 - options.min_probability))
+    verdict: list[str | None] = [
+        None if odds >= least else _reason(found, group) for group, odds in enumerate(found.log_odds)
+    ]
+    sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
+    # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
+    uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
+    for group in np.flatnonzero(uncertain):
+        verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
+    for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
+        verdict[group] = COVERED
+    return Classified(seen.names(), found.candidates, counts.images, verdict)
+
+
+def _reason(found: Posterior, group: int) -> str:
+    """The hypothesis that has won against a marking, in words."""
+    if found.probability[group, PART_OF_SYMBOL] > found.probability[group, CLUTTER]:
+        return OF_SYMBOL
+    return CLUTTER_BY[int(np.argmin(found.evidence[group]))]
+
+
+def _covered(found: Posterior, standing: IntArray) -> IntArray:
+    """Those of the candidates ``standing`` that overlap another one of better odds."""
+    if len(standing) < 2:
+        return np.zeros(0, dtype=np.int64)
+    corners, odds = found.candidates.corners_map, found.log_odds
+    centres = corners[standing].mean(axis=1)
+    reach_m = 2 * float(np.max(np.linalg.norm(corners[standing] - centres[:, None], axis=2)))
+    pairs = standing[cKDTree(centres).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
+    covered: set[int] = set()
+    for a, b in sorted(pairs.tolist(), key=lambda pair: -max(odds[pair[0]], odds[pair[1]])):
+        if a not in covered and b not in covered and _overlap(corners[a], corners[b]) > _MAX_OVERLAP:
+            covered.add(b if odds[a] >= odds[b] else a)
+    return np.array(sorted(covered), dtype=np.int64)
+
+
+def _overlap(a: FloatArray, b: FloatArray) -> float:
+    """Common area of two convex quadrilaterals as a share of the smaller one's."""
+    common = abs(float(signed_area(clip_convex(a, b))))
+    return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)
+
+
+def _pair_keys(pairs: IntArray) -> IntArray:
+    """One number per column of ``pairs`` (2, P)."""
+    return np.asarray(pairs[0] * (1 << 32) + pairs[1])
+
+
+def _no_marking_message(excluded: tuple[Exclusion, ...]) -> str:
+    """What to say where no candidate was accepted."""
+    reasons = [exclusion.reason for exclusion in excluded]
+    commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
+    return (
+        f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); check the "
+        "camera's IPM, the detector and that the drive passes its markings closely."
+    )
+
+
+JointCovariance = Callable[[IntArray], FloatArray]
+"""Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""
+
+NEIGHBOUR_M = 10.0
+"""How far apart markings are compared, m: about a vehicle's length, over which it manoeuvres."""
+
+_FARTHEST_M = 15.0
+"""A marking without another one within so many metres has no relative standard deviation."""
+
+_CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
+
+
+def with_relative_sigma(
+    markings: Sequence[Marking], corner_index: IntArray, joint: JointCovariance
+) -> tuple[Marking, ...]:
+    """The markings (M,) with what each contributes to the error of the distance to one about 10 m away.
+
+    To the errors of the adjustment comes what the marking's own covariance has beyond it: an error of its
+    paint, which it shares with no other. ``corner_index`` (M, 4) numbers their corners in the solution, -1
+    for one that was not seen; ``joint`` is of corners of the solution.
+    """
+    seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
+    if not len(seen):
+        return tuple(markings)
+    chosen = [markings[m] for m in seen.tolist()]
+    diagonal = _diagonals(corner_index[seen])
+    first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
+    if not len(first):
+        return tuple(markings)
+    covariance = joint(np.concatenate([diagonal[first], diagonal[second]], axis=1))
+    apart = _CENTRES @ covariance @ _CENTRES.T
+    formal = _CENTRES[:, :4] @ covariance[:, :4, :4] @ _CENTRES[:, :4].T
+    stated = np.array([_centre_variance_m2(chosen[k]) for k in first])
+    own = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
+    # The difference of two centres has the errors of both.
+    sigma_m = np.sqrt(np.trace(apart, axis1=1, axis2=2) / 4 + own)
+    out = list(markings)
+    for marking, sigma in zip(seen[first].tolist(), sigma_m.tolist(), strict=True):
+        out[marking] = replace(markings[marking], relative_sigma_m=sigma)
+    return tuple(out)
+
+
+def _centre_variance_m2(marking: Marking) -> float:
+    """Variance of a coordinate of the mean of its corners."""
+    assert marking.covariance_m2 is not None
+    return float(np.einsum("iaja->", marking.covariance_m2.reshape(4, 2, 4, 2)) / 32)
+
+
+def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
+    """Pairs of points (N, 2): each that has others near, with the one whose distance is nearest to 10 m."""
+    first, second = [], []
+    tree = cKDTree(centres_map)
+    for own, near in enumerate(tree.query_ball_point(centres_map, _FARTHEST_M)):
+        others = np.array([other for other in near if other != own], dtype=np.int64)
+        if len(others):
+            distance_m = np.linalg.norm(centres_map[others] - centres_map[own], axis=1)
+            first.append(own)
+            second.append(int(others[np.argmin(np.abs(distance_m - NEIGHBOUR_M))]))
+    return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
+
+
+def _diagonals(corner_index: IntArray) -> IntArray:
+    """Of markings (M, 4) of which three corners are known, two (M, 2) that are opposite each other."""
+    even = np.asarray((corner_index[:, [0, 2]] >= 0).all(axis=1, keepdims=True))
+    return np.where(even, corner_index[:, [0, 2]], corner_index[:, [1, 3]])

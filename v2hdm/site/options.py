@@ -1,0 +1,38 @@
+"""Settings of what enters the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(kw_only=True)
+class AcceptanceOptions:
+    """What a place must show to enter the map.
+
+    ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not; and
+    a worst corner less certain than the best one of the map by at most ``max_sigma_m``.
+    """
+
+    min_probability: float = 0.9
+    max_sigma_m: float = 0.06
+
+
+@dataclass(kw_only=True)
+class LaneOptions:
+    """How lane paint becomes polylines.
+
+    ``max_range_m`` from the camera; ``node_spacing_m`` between the vertices of a polyline;
+    ``half_width_m`` across and ``half_length_m`` along bound the neighbourhood that is averaged;
+    ``max_dash_gap_m`` is the longest gap between two dashes of one line and ``max_break_m`` the
+    longest break in solid paint that is bridged. A piece needs ``min_length_m`` and, at each
+    vertex, ``min_images``.
+    """
+
+    max_range_m: float = 12.0
+    node_spacing_m: float = 0.5
+    half_width_m: float = 0.3
+    half_length_m: float = 0.8
+    max_dash_gap_m: float = 9.0
+    max_break_m: float = 3.0
+    min_length_m: float = 2.0
+    min_images: int = 3

@@ -1,0 +1,374 @@
+"""The posterior of a candidate: a marking of its class, of a shape of its own, part of a symbol, or clutter.
+
+A hypothesis says how the painted corners scatter about a laid shape (covariance N), and how the solved
+corners scatter about the painted ones: P of the adjustment, and O for edges that all images misplace alike.
+No hypothesis says anything about rigid motions. In the five other directions the deviation r of the solved
+corners from the laid shape has the marginal likelihood N(r; 0, P + O + N). A hypothesis of more freedom
+spreads over a larger volume, so that all compare fairly. How often each kind holds is learned from the drive,
+class by class (expectation maximisation with a Dirichlet prior).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import betaln, logsumexp
+from scipy.stats import norm
+
+from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.site.candidates import Candidates, Counts
+from v2hdm.site.shapes import (
+    SHAPE_SIGMA_M,
+    Laid,
+    PaintError,
+    Shape,
+    lay,
+    learn_paint_error,
+    learn_shapes,
+    parallelograms,
+)
+
+OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
+"""What a candidate may be: the first five are markings."""
+
+_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
+"""Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
+
+_SIZE_SIGMA_M = 1.0
+"""Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
+
+_LENGTH_SIGMA_M = 0.3
+"""Sigma, m, of the length of paint that is rolled by the metre: a tenth of a dash's."""
+
+_MISPLACED_M = 0.3
+"""Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
+
+_WORN_SHARE = 0.5
+"""The same as a share of the length, where a whole stretch is worn away: any part of a marking may be."""
+
+_RUN_ON_M = 1.0
+"""Sigma, m, of an end that runs on into other paint: letters and lines are about as long."""
+
+_RATE_STRENGTH = 4.0
+"""Images that the common rate of a class is worth: how alike its markings are in how often they are found."""
+
+_NEGLECTED_SHARE = 0.1
+"""Share of markings that are worn or hidden, and found at any rate."""
+
+_CLUTTER_FOUND = (0.5, 2.0)
+"""Beta distribution of how often clutter, or part of a symbol, is found in an easy view: a fifth of them."""
+
+_BARE_FOUND = (0.05, 10.0)
+"""Beta distribution of how often bare ground is taken for a given marking: in one view of two hundred."""
+
+_CLUTTER_REPEATS = 0.7
+"""Probability that clutter which some images have shown is shown by one more."""
+
+_AGREEING = (0.93, 0.6)
+"""Share of the observations of a marking, and of clutter, that agree with the joint solution."""
+
+_CORNERS_OF_IMAGE = 4.0
+"""Observations that err together: those of one image."""
+
+_UNDER_SYMBOL = (0.02, 0.5)
+"""Share of the images of a marking, and of part of a symbol, in which a symbol lies on it."""
+
+_PASSES = 2
+"""Rounds of expectation maximisation; a third changes no figure of six drives by a hundredth."""
+
+_FIRST, _SECOND = np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5])
+"""Of a parallelogram with the sides u and v corner k lies at its centre plus first[k] u + second[k] v."""
+
+_CORNERS_MOVED = np.concatenate([np.eye(4), np.eye(4)[:2] - np.eye(4)[2:]])
+"""How corners (6, 4) are taken wrongly: one alone, or two opposite ones by opposite ways.
+
+The shape that is fitted to an image is nearly a parallelogram, so that one wrong corner takes another along.
+"""
+
+_OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The posterior of G candidates.
+
+    ``probability`` (G, 7) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
+    of a marking. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
+    images show it, how many of its easy views, and how well they agree.
+    """
+
+    probability: FloatArray
+    log_odds: FloatArray
+    candidates: Candidates
+    evidence: FloatArray
+
+
+def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
+    """What G candidates of classes ``kind`` (G,) are, given where and how often they were seen."""
+    total = len(candidates)
+    probability, log_odds, evidence = np.zeros((total, 7)), np.zeros(total), np.zeros((total, 4))
+    corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
+    for one in np.unique(kind):
+        own = np.flatnonzero(kind == one)
+        found = _of_class(candidates.subset(own), counts.subset(own))
+        probability[own], log_odds[own], evidence[own] = found.probability, found.log_odds, found.evidence
+        corners[own], covariance[own] = found.candidates.corners_map, found.candidates.covariance_m2
+    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence)
+
+
+def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
+    """The posterior of the candidates of one class, which together say what its markings are like."""
+    share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
+    weight = _weight_before(candidates, counts)
+    for _ in range(_PASSES):
+        shapes = learn_shapes(candidates.subset(weight > 0.5))
+        hypotheses = _hypotheses(candidates, shapes, share, paint)
+        by_kind, sources = np.array([one.kind for one in hypotheses]), _counted(counts, weight)
+        shaped = np.stack([one.log_likelihood for one in hypotheses])
+        joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
+        joint += sources.sum(axis=0)[:, np.maximum(by_kind - OWN_SHAPE, 0)].T
+        each = np.exp(joint - logsumexp(joint, axis=0))
+        probability = np.stack([each[by_kind == one].sum(axis=0) for one in range(7)], axis=1)
+        weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
+        share = _PRIOR_COUNT + probability.sum(axis=0)
+        share /= share.sum()
+        paint = _paint_error(hypotheses, each, np.asarray(candidates.known.all(axis=1)))
+    marking = by_kind < PART_OF_SYMBOL
+    log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
+    by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
+    evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
+    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence)
+
+
+def _weight_before(candidates: Candidates, counts: Counts) -> FloatArray:
+    """Which candidates (N,) are taken for markings before anything is known of their class."""
+    return np.asarray(
+        candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations), dtype=np.float64
+    )
+
+
+def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
+    """Log likelihoods (3, N, 3) of images, easy views, the rest; of each for marking, symbol and clutter."""
+    images = np.maximum(counts.images, 1)
+    stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
+    shown = np.stack([_geometric(images, stay), *2 * [_geometric(images, _CLUTTER_REPEATS)]], axis=1)
+    rate = float((weight @ counts.found + 1) / (weight @ counts.easy_views + 2))
+    own = log_found(counts.found, counts.easy_views, rate)
+    clutter = _rates(counts.found, counts.easy_views, *_CLUTTER_FOUND)
+    found = np.stack([own, clutter, clutter], axis=1)
+    agree, differ = counts.agreeing, counts.observations - counts.agreeing
+    right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
+    under, alone = counts.as_symbol, counts.images
+    plain, covered = (under[:, None] * np.log(p) + alone[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL)
+    rest = np.hstack([right, right, wrong]) / _CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
+    return np.stack([shown, found, rest])
+
+
+def _geometric(images: IntArray, stay: float) -> FloatArray:
+    """Log likelihood of so many images, given the probability of one more."""
+    return np.asarray(np.log1p(-stay) + (images - 1) * np.log(stay))
+
+
+def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
+    """Log likelihood (N,) that markings are ``found`` (N,) times in so many ``easy_views`` (N,).
+
+    ``rate`` is that of their class. Some are worn or hidden, and are found at any rate.
+    """
+    usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
+    neglected = _rates(found, easy_views, 1.0, 1.0)
+    both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
+    return np.asarray(np.logaddexp(*both))
+
+
+def log_found_where_none_is(found: IntArray, easy_views: IntArray) -> FloatArray:
+    """Log likelihood (N,) that bare ground is taken for markings ``found`` times in ``easy_views`` (N,)."""
+    return _rates(found, easy_views, *_BARE_FOUND)
+
+
+def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) -> FloatArray:
+    """Log beta-binomial likelihood (N,) of the easy views."""
+    left = easy_views - found
+    return np.asarray(betaln(found + hits, left + misses) - betaln(hits, misses))
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """One hypothesis on N ``candidates``.
+
+    In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
+    laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced`` (..., 8,
+    8), only along ``one_way`` (N, 8) if given: paint wears inwards, and runs on outwards.
+    """
+
+    kind: int
+    log_prior: float
+    candidates: Candidates
+    directions: FloatArray
+    residual: FloatArray
+    scatter: FloatArray
+    misplaced: FloatArray
+    paint_m2: float
+    one_way: FloatArray | None
+
+    @cached_property
+    def formal(self) -> FloatArray:
+        """Covariance (N, 5, 5) of the residual by that of the solved corners alone."""
+        return _within(self.directions, self.candidates.covariance_m2)
+
+    @property
+    def log_likelihood(self) -> FloatArray:
+        """Marginal likelihood (N,) of the residual."""
+        innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
+        innovation = innovation + self.paint_m2 * np.eye(5)
+        solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
+        squared = np.sum(self.residual * solved, axis=1)
+        both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
+        if self.one_way is None:
+            return np.asarray(both_ways)
+        moved = (self.directions @ self.one_way[..., None])[..., 0]
+        mean = np.sum(moved * solved, axis=1)
+        held = np.sum(moved * np.linalg.solve(innovation, moved[..., None])[..., 0], axis=1)
+        return np.asarray(both_ways + norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2))
+
+    def corners(self, paint_m2: FloatArray) -> Candidates:
+        """The corners under the hypothesis (a Kalman update), where edges err by ``paint_m2`` (N,)."""
+        covariance = self.candidates.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
+        noise = _within(self.directions, self.scatter)
+        seen = self.directions @ covariance
+        innovation = seen @ np.swapaxes(self.directions, 1, 2) + noise
+        gain = np.swapaxes(np.linalg.solve(innovation, seen), 1, 2)
+        # Joseph's form: a sum of squares, so that what is nearly known keeps its small variance.
+        left = np.eye(8) - gain @ self.directions
+        after = left @ covariance @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
+        corners = self.candidates.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
+        return Candidates(corners, (after + np.swapaxes(after, 1, 2)) / 2)
+
+
+def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
+    return np.asarray(directions @ covariance @ np.swapaxes(directions, 1, 2))
+
+
+def _hypotheses(
+    candidates: Candidates, shapes: Sequence[Shape], share: FloatArray, paint: PaintError
+) -> list[_Hypothesis]:
+    """All that N candidates may be, given the shapes of their class."""
+    out: list[_Hypothesis] = []
+    nothing = np.zeros((8, 8))
+
+    def add(
+        kind: int,
+        part: float,
+        laid: Laid,
+        scatter: FloatArray,
+        misplaced: FloatArray = nothing,
+        one_way: FloatArray | None = None,
+    ) -> None:
+        off = (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
+        residual = (laid.directions @ off)[..., 0]
+        prior, paint_m2 = float(np.log(part * share[kind])), paint.sigma_m**2
+        out.append(
+            _Hypothesis(
+                kind, prior, candidates, laid.directions, residual, scatter, misplaced, paint_m2, one_way
+            )
+        )
+
+    total = sum(shape.share for shape in shapes)
+    for shape in shapes:
+        part = shape.share / total
+        laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
+        scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
+        add(OF_CLASS, part / 2, laid, scatter)
+        add(OF_CLASS, part / 2, otherwise, scatter)
+        ends = _inwards(laid.corners_map, shape.is_elongated)
+        lengths, angles = [(1.0, scatter)], [[nothing]] * len(ends)
+        if shape.is_elongated:
+            longer = scatter + _LENGTH_SIGMA_M**2 * _outer((ends[0][0] + ends[1][0]) / 2)
+            add(OTHER_LENGTH, part, laid, longer)
+            other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
+            lengths = [(1 - other, scatter), (other, longer)]
+            angles = [[nothing, _slanted(laid.corners_map, end)] for end, _ in ends]
+        for (end, extent_m), cuts in zip(ends, angles, strict=True):
+            ways = (_MISPLACED_M * end, _WORN_SHARE * extent_m * end, -_RUN_ON_M * end)
+            for way, cut, (likely, size) in itertools.product(ways, cuts, lengths):
+                weight = part * likely / len(ends) / len(ways) / len(cuts)
+                add(WRONG_END, weight, laid, size, _outer(way) + cut, way)
+        for moved in _CORNERS_MOVED:
+            block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
+            add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
+    own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else _as_seen(candidates)
+    any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
+    add(OWN_SHAPE, 1.0, own, any_size)
+    add(PART_OF_SYMBOL, 1.0, own, any_size)
+    add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8))
+    return out
+
+
+def _as_seen(candidates: Candidates) -> Laid:
+    """Every candidate's own parallelogram."""
+    centre = candidates.corners_map.mean(axis=1)
+    corners = parallelograms(candidates.corners_map) + centre[:, None]
+    unturned, unshifted = (
+        np.tile(np.eye(2), (len(candidates), 1, 1)),
+        np.zeros(len(candidates), dtype=np.int64),
+    )
+    return Laid(corners, unturned, centre, unshifted)
+
+
+def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """Motions (N, 8) of corners as a side moves inwards by 1 m, and how far (N, 1) it can, m."""
+    ways = []
+    for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
+        extent_m = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+        both = [-np.sign(sign) * (side * sign > 0)[:, None] * (along / extent_m)[:, None] for sign in (-1, 1)]
+        ways.append([(one.reshape(-1, 8), extent_m) for one in both])
+    if not elongated:
+        return [*ways[0], *ways[1]]
+    first = ways[0][0][1] > ways[1][0][1]
+    return [(np.where(first, a[0], b[0]), np.where(first, a[1], b[1])) for a, b in zip(*ways, strict=True)]
+
+
+def _slanted(corners: FloatArray, end: FloatArray) -> FloatArray:
+    """Covariance (N, 8, 8), m^2, of an ``end`` cut off at any angle: by half the breadth at 45 degrees."""
+    breadth_m = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
+    each = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
+    return np.asarray((breadth_m / 2)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))
+
+
+def _outer(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors[:, :, None] * vectors[:, None, :])
+
+
+def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: BoolArray) -> PaintError:
+    """What the deviations of ``whole`` candidates (N,) from the shapes of their class say about the paint."""
+    members = [
+        (one.residual[k], one.formal[k])
+        for one, probability in zip(hypotheses, each, strict=True)
+        if one.kind == OF_CLASS
+        for k in np.flatnonzero(whole & (probability > 0.5))
+    ]
+    return learn_paint_error([residual for residual, _ in members], [formal for _, formal in members])
+
+
+def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintError) -> Candidates:
+    """The corners as the hypotheses that are markings have them, by mean and covariance of their mixture."""
+    markings = [k for k, one in enumerate(hypotheses) if one.kind < PART_OF_SYMBOL]
+    weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))
+    each = [hypotheses[k].corners(_paint_m2(hypotheses[k], paint)) for k in markings]
+    mean = sum(w[:, None, None] * one.corners_map for w, one in zip(weight, each, strict=True))
+    covariance = sum(
+        w[:, None, None] * (one.covariance_m2 + _outer((one.corners_map - mean).reshape(-1, 8)))
+        for w, one in zip(weight, each, strict=True)
+    )
+    return Candidates(np.asarray(mean), np.asarray(covariance))
+
+
+def _paint_m2(hypothesis: _Hypothesis, paint: PaintError) -> FloatArray:
+    """Variance (N,) of the errors that all images share, given how a candidate deviates from its shape."""
+    if hypothesis.kind != OF_CLASS:
+        return np.full(len(hypothesis.residual), paint.sigma_m**2)
+    pairs = zip(hypothesis.residual, hypothesis.formal, strict=True)
+    return np.array([paint.variance_m2(residual, formal) for residual, formal in pairs])

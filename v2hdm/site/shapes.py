@@ -1,0 +1,280 @@
+"""The shapes that the markings of a class share, and how far painted edges are from where images put them.
+
+The diamonds of a yard are painted with one stencil, the dashes of a road with one roller. A hundred markings
+that were seen well say how large the next one is, which was seen four times, one corner under a puddle
+(empirical Bayes: Efron and Morris, Stein's estimation rule and its competitors, JASA 1973). All classes are
+parallelograms: half the diagonals say all of a shape.
+
+An edge that is worn or dirty is measured in the same wrong place by every image. That error does not average
+out, and no residual shows it, but each marking deviates from the shape of its class by its own error: most by
+a millimetre, some by centimetres. A normal variance per marking with an inverse-gamma prior describes both,
+so that deviations follow Student's t distribution (Lange, Little and Taylor, Robust statistical modeling
+using the t distribution, JASA 1989). The class teaches the prior; the posterior of a marking is added to the
+covariance of its corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import gammaln
+from scipy.stats import chi2
+
+from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.site.candidates import Candidates
+
+_LEAST_MEMBERS = 8
+"""Markings of one shape from which the shape is one of the class."""
+
+_LEAST_SHARE = 0.1
+"""Share of a class's markings from which their shape is one of the class."""
+
+_MEMBER_M = 0.05
+"""A marking of which no corner misses a shape by more, m, is of that shape."""
+
+_MEMBER_SHARE = 0.08
+"""The same as a share of the longer diagonal: large paint is laid out less exactly."""
+
+SHAPE_SIGMA_M = 0.01
+"""How far a painted corner lies from where the stencil would have it, m, at least."""
+
+_ELONGATED = 2.0
+"""Paint this many times as long as wide is rolled by the metre: its width is common, its length its own."""
+
+_GAUSS_NEWTON_STEPS = 3
+"""Steps that refine a laid shape."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A parallelogram (4, 2) about its centre, m, that a class has in common up to ``sigma_m`` a coordinate.
+
+    ``share`` of the class's markings have it.
+    """
+
+    corners: FloatArray
+    sigma_m: float
+    share: float
+
+    @property
+    def is_elongated(self) -> bool:
+        """Whether it is much longer than wide."""
+        sides = np.linalg.norm(self.corners[1:3] - self.corners[:2], axis=1)
+        return bool(sides.max() >= _ELONGATED * sides.min())
+
+
+@dataclass(frozen=True)
+class Laid:
+    """A shape laid on each of N candidates: ``corners_map`` (N, 4, 2).
+
+    ``shift`` (N,) and ``rotation`` (N, 2, 2) took it there, ``centre`` (N, 2) is its centre, ``directions``
+    (N, 5, 8) are orthonormal directions in which corners move other than rigidly.
+    """
+
+    corners_map: FloatArray
+    rotation: FloatArray
+    centre: FloatArray
+    shift: IntArray
+
+    @cached_property
+    def directions(self) -> FloatArray:
+        """Orthonormal directions (N, 5, 8)."""
+        return np.asarray(
+            np.swapaxes(np.linalg.qr(_rigid(self.corners_map), mode="complete")[0][:, :, 3:], 1, 2)
+        )
+
+    def in_frame_of_shape(self, corners_map: FloatArray) -> FloatArray:
+        """Corners (N, 4, 2) in the frame and order of the shape."""
+        turned = (corners_map - self.centre[:, None]) @ self.rotation
+        order = (np.arange(4) - self.shift[:, None]) % 4
+        return np.asarray(np.take_along_axis(turned, order[..., None], axis=1))
+
+
+def parallelograms(corners: FloatArray) -> FloatArray:
+    """The parallelograms (..., 4, 2) about their centres that corners (..., 4, 2) come nearest to."""
+    arms = (corners[..., :2, :] - corners[..., 2:, :]) / 2
+    return np.concatenate([arms, -arms], axis=-2)
+
+
+def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid, Laid]:
+    """Move and turn a parallelogram (4, 2) onto ``candidates``, corners weighted by their full covariances.
+
+    It looks the same from both ends, so that one shift by a corner is all there is to try: the better way
+    first.
+    """
+    information = np.asarray(np.linalg.inv(candidates.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
+    ways = [_lay(np.roll(shape, -shift, axis=0), candidates, information) for shift in (0, 1)]
+    best = np.argmin(np.stack([way[3] for way in ways]), axis=0)
+    rows = np.arange(len(candidates))
+    placed, rotation, centre = (np.stack([way[k] for way in ways]) for k in range(3))
+    first, second = (
+        Laid(placed[shift, rows], rotation[shift, rows], centre[shift, rows], shift)
+        for shift in (best, 1 - best)
+    )
+    return first, second
+
+
+def _lay(
+    shape: FloatArray, candidates: Candidates, information: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Placed corners (N, 4, 2), rotations, centres (N, 2) and what is left, squared, in sigmas (N,)."""
+    corners = candidates.corners_map
+    # What shifts all corners alike says nothing about their weights.
+    apart = candidates.covariance_m2.reshape(-1, 4, 2, 4, 2)
+    common = np.einsum("naibi->n", apart) / 32
+    weight = 1 / np.maximum(candidates.sigma_m**2 / 2 - common[:, None], 1e-6)
+    total = weight.sum(axis=1, keepdims=True)
+    target_centre, own_centre = np.einsum("nc,ncx->nx", weight, corners) / total, weight @ shape / total
+    # As complex numbers: the turn is the argument of the weighted sum of targets over shapes.
+    a, b = (
+        (one - middle[:, None]) @ [1, 1j] for one, middle in ((shape, own_centre), (corners, target_centre))
+    )
+    turn = np.angle(np.sum(weight * b * a.conj(), axis=1))
+    centre = target_centre - (_turned(turn) @ own_centre[..., None])[..., 0]
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]
+        off = (corners - placed).reshape(-1, 8, 1)
+        rigid = _rigid(placed)
+        normal = np.swapaxes(rigid, 1, 2) @ information @ rigid
+        step = np.linalg.solve(normal, np.swapaxes(rigid, 1, 2) @ information @ off)[..., 0]
+        turn, centre = turn + step[:, 2], centre + step[:, :2]
+    placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]
+    off = (corners - placed).reshape(-1, 8, 1)
+    squared = (np.swapaxes(off, 1, 2) @ information @ off)[:, 0, 0]
+    return placed, _turned(turn), centre, squared
+
+
+def _turned(angle: FloatArray) -> FloatArray:
+    """Rotations (N, 2, 2)."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([cosine, -sine], axis=-1), np.stack([sine, cosine], axis=-1)], axis=-2)
+
+
+def _rigid(corners: FloatArray) -> FloatArray:
+    """Derivatives (N, 8, 3) of corners (N, 4, 2) by a shift and a turn about their centre."""
+    arms = corners - corners.mean(axis=1, keepdims=True)
+    turning = np.stack([-arms[..., 1], arms[..., 0]], axis=-1).reshape(-1, 8, 1)
+    shifting = np.broadcast_to(np.tile(np.eye(2), (4, 1)), (len(corners), 8, 2))
+    return np.concatenate([shifting, turning], axis=2)
+
+
+def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
+    """The shapes that the markings of a class have, commonest first."""
+    whole = np.flatnonzero(candidates.known.all(axis=1))
+    least = max(_LEAST_MEMBERS, _LEAST_SHARE * len(whole))
+    shapes: list[Shape] = []
+    while len(whole) >= least:
+        left = candidates.subset(whole)
+        shape, members = _commonest(left)
+        if np.count_nonzero(members) < least:
+            break
+        sigma_m = _spread_m(shape, left.subset(members))
+        shapes.append(Shape(shape, sigma_m, np.count_nonzero(members) / len(candidates)))
+        whole = whole[~members]
+    return tuple(shapes)
+
+
+def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
+    """The shape (4, 2) that most of N candidates have, and which (N,) have it."""
+    lengths = _lengths(candidates.corners_map)
+    limit_m = np.maximum(_MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
+    apart = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
+    typical = int(np.argmax((apart <= limit_m[:, None]).sum(axis=1) - apart.mean(axis=1) / limit_m))
+    shape = parallelograms(candidates.corners_map[typical])
+    members = np.zeros(len(candidates), dtype=bool)
+    for _ in range(2):
+        laid = lay(shape, _MEMBER_M, candidates)[0]
+        missed = np.linalg.norm(candidates.corners_map - laid.corners_map, axis=2).max(axis=1)
+        members = np.asarray(missed <= limit_m[typical])
+        if not members.any():
+            break
+        shape = parallelograms(np.median(laid.in_frame_of_shape(candidates.corners_map)[members], axis=0))
+    return shape, members
+
+
+def _lengths(corners: FloatArray) -> FloatArray:
+    """Sides and diagonals (N, 4), each pair sorted, whichever corner comes first."""
+    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    pairs = np.sort(0.5 * (side[:, :2] + side[:, 2:]), axis=1)
+    diagonals = np.sort(np.linalg.norm(corners[:, 2:] - corners[:, :2], axis=2), axis=1)
+    return np.concatenate([pairs, diagonals], axis=1)
+
+
+def _spread_m(shape: FloatArray, candidates: Candidates) -> float:
+    """How far members' corners lie from their shape beyond their covariances, by the median."""
+    laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
+    directions = laid.directions
+    off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
+    own = directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2)
+    wanted = float(chi2.median(off.shape[1]))
+    low, high = SHAPE_SIGMA_M, float(np.abs(off).max()) + SHAPE_SIGMA_M
+    for _ in range(20):
+        sigma_m = np.sqrt(low * high)
+        innovation = own + sigma_m**2 * np.eye(off.shape[1])
+        squared = (np.swapaxes(off, 1, 2) @ np.linalg.solve(innovation, off))[:, 0, 0]
+        low, high = (sigma_m, high) if np.median(squared) > wanted else (low, sigma_m)
+    return float(low)
+
+
+_FREEDOM_BOUNDS = (1.0, 30.0)
+"""Degrees of freedom of the t distribution: from tails as heavy as Cauchy's to those of a normal one."""
+
+_SIGMA_BOUNDS_M = (1e-4, 0.05)
+"""Scale of a paint error, m: from the rounding of a survey to the width of a line."""
+
+_EDGE_SIGMA_M = 0.004
+"""How far all images may misplace a painted edge alike, m: a ragged edge of a sprayed line is about so wide.
+
+A class whose typical marking scatters by more was painted so: that scatter is no error of the map."""
+
+_START = (0.002, 3.0)
+"""Scale, m, and degrees of freedom from which the search starts."""
+
+
+@dataclass(frozen=True)
+class PaintError:
+    """Student's t distribution of a corner's coordinate: its scale ``sigma_m`` and degrees of ``freedom``."""
+
+    sigma_m: float
+    freedom: float
+
+    def variance_m2(self, deviation: FloatArray, formal: FloatArray) -> float:
+        """The variance, m^2, of a marking's errors of measurement, given how it deviates from its class.
+
+        ``deviation`` (m,) m is in orthonormal directions, ``formal`` (m, m) its covariance without paint
+        errors.
+        """
+        count = len(deviation)
+        beyond = max(float(deviation @ deviation) - float(np.trace(formal)), 0.0)
+        posterior_m2 = (self.freedom * self.sigma_m**2 + beyond) / (self.freedom + count)
+        painted_m2 = max(self.sigma_m**2 - _EDGE_SIGMA_M**2, 0.0)
+        return max(posterior_m2 - painted_m2, 0.0)
+
+
+def learn_paint_error(deviations: Sequence[FloatArray], formal: Sequence[FloatArray]) -> PaintError:
+    """The distribution under which deviations (m,) of markings are likeliest; of formal covariances (m, m).
+
+    Without any deviation it is the one from which the search starts.
+    """
+    if not deviations:
+        return PaintError(*_START)
+    count = np.array([len(one) for one in deviations])
+    squared = np.array([float(one @ one) for one in deviations])
+    own = np.array([float(np.trace(one)) for one in formal]) / count
+
+    def cost(parameters: FloatArray) -> float:
+        sigma_m, freedom = np.exp(parameters)
+        variance = sigma_m**2 + own
+        likelihood = gammaln((freedom + count) / 2) - gammaln(freedom / 2)
+        likelihood -= count / 2 * np.log(freedom * np.pi * variance)
+        likelihood -= (freedom + count) / 2 * np.log1p(squared / (freedom * variance))
+        return -float(likelihood.sum())
+
+    bounds = [np.log(_SIGMA_BOUNDS_M).tolist(), np.log(_FREEDOM_BOUNDS).tolist()]
+    found = minimize(cost, np.log(_START), method="L-BFGS-B", bounds=bounds)
+    sigma_m, freedom = np.exp(found.x)
+    return PaintError(float(sigma_m), float(freedom))
