@@ -9,7 +9,7 @@ import pytest
 from export.config import ExportConfig
 from train.config import TrainConfig
 from v2hdm.cli.config_help import help_text, keys_of
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
 
 
 @pytest.mark.parametrize("schema", [RunConfig, TrainConfig, ExportConfig])

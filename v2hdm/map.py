@@ -31,14 +31,14 @@ _settle = partial(open_door, "v2hdm.map", "map", _INTERRUPTED)
 
 def _map() -> int:
     from v2hdm.cli.config import work_on
-    from v2hdm.pipeline import RunConfig
+    from v2hdm.pipeline.config import RunConfig
 
     return work_on("map", RunConfig, _run, _settle, __doc__ or "")
 
 
 def _run(job: Job) -> int:
     from v2hdm.cli import config, console
-    from v2hdm.pipeline import RunConfig
+    from v2hdm.pipeline.config import RunConfig
     from v2hdm.verdict import Status
 
     run = config.to_dataclass(job.composed, RunConfig, _RUNS)

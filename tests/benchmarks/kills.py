@@ -27,7 +27,8 @@ import numpy as np
 
 import v2hdm.pipeline.work  # noqa: F401  # loaded once, before any run is forked
 from tests.pipeline.test_run import short_port
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.simulate import render_drive
 from v2hdm.store.cache.pruning import items_of
 

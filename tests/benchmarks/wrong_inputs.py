@@ -30,7 +30,8 @@ from v2hdm.cli import config as hydra_config
 from v2hdm.errors import V2hdmError
 from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.report.metrics import marking_metrics
 from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.workers import share_out

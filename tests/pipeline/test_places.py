@@ -13,9 +13,9 @@ from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.importers.mirror import mirrored
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, places
-from v2hdm.pipeline.config import run_name
-from v2hdm.pipeline.finished import note_finished
+from v2hdm.pipeline import places
+from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
+from v2hdm.pipeline.finished import RunResult, note_finished
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
 from v2hdm.pipeline.places import in_place
 from v2hdm.store.cache.keys import code_key, key_of

@@ -18,8 +18,11 @@ from v2hdm.detection import batch
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, work
+from v2hdm.pipeline import detections, work
 from v2hdm.pipeline import inspect as inspection
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.finished import RunResult
+from v2hdm.pipeline.run import run
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.store.cache.pruning import items_of
@@ -93,7 +96,8 @@ def test_with_nothing_changed_the_result_is_taken_as_it_lies(
 
 def test_a_finished_result_is_known_without_torch(site: Path) -> None:
     code = (
-        "import sys; from v2hdm.pipeline import DriveConfig, RunConfig, run\n"
+        "import sys\n"
+        "from v2hdm.pipeline.config import DriveConfig, RunConfig\nfrom v2hdm.pipeline.run import run\n"
         f"run(RunConfig(name='short', drive=DriveConfig(path={str(site / 'drive')!r}), workers=1,"
         f" output={str(site / 'first')!r}, cache={str(site / 'cache')!r}))\n"
         "print('torch' in sys.modules)"
@@ -143,7 +147,9 @@ def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(
 
 KILLED = """
 import os, signal, sys
-from v2hdm.pipeline import DriveConfig, RunConfig, detections, run
+from v2hdm.pipeline import detections
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 original, kept = detections.Room.keep, []
 def keep(room, stage, *rest):
     found = original(room, stage, *rest)

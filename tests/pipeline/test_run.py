@@ -23,9 +23,9 @@ from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.io.maps.residuals import read_residuals
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.camera_sets import camera_sets
-from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
+from v2hdm.pipeline.run import run
 from v2hdm.records import Trajectory
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig

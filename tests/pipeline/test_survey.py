@@ -24,7 +24,8 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.tum import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions, SurveyOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.report.metrics import driven_past
 from v2hdm.simulate import render_drive

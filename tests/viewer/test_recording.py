@@ -20,9 +20,10 @@ from v2hdm.errors import ConfigError
 from v2hdm.io.calibration.document import read_calibration
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps import read_geojson
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.run import run
 from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig

@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from v2hdm import pipeline
-from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.config import RunConfig, run_name
+from v2hdm.pipeline.run import run
+from v2hdm.pipeline.telling import Progress as TellProgress
 from v2hdm.pipeline.telling import logging_to
 from v2hdm.progress import progress_lines
 from v2hdm.report.table import changes_table, results_table
@@ -21,13 +22,13 @@ from v2hdm.viewer import RerunViewer, check_viewer
 _STYLES = {Status.PASS: "bold green", Status.WARN: "bold yellow", Status.FAIL: "bold red"}
 
 
-def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
+def run_on_terminal(config: RunConfig, config_yaml: str) -> Verdict:
     """Run the pipeline, show what it does and found, and return the verdict on it."""
     console = Console()
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
     with logging_to(handler), _bars(console) as progress:
-        result = pipeline.run(config, config_yaml, progress, viewer)
+        result = run(config, config_yaml, progress, viewer)
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)
@@ -45,7 +46,7 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
 
 
 @contextmanager
-def _bars(console: Console) -> Iterator[pipeline.Progress]:
+def _bars(console: Console) -> Iterator[TellProgress]:
     """A progress bar per task, made the first time that a task reports; lines where there is no terminal."""
     if not console.is_terminal:
         yield progress_lines(console.print)

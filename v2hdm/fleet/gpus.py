@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
 
 EYES_A_GPU = 8
 """Actors that detect on one GPU: each takes memory there, and most of an image's time is the CPU's."""

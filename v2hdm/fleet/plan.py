@@ -13,8 +13,7 @@ from v2hdm.cli.config import compose_run_file, to_dataclass, to_yaml
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.fleet.rows import Row
 from v2hdm.io.texts import shown, take_name
-from v2hdm.pipeline import RunConfig
-from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.store.objects.bucket import place_of
 
 

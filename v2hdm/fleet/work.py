@@ -14,7 +14,7 @@ from v2hdm.fleet.board import Telling
 from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
 from v2hdm.fleet.rows import Row
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.places import in_place
 from v2hdm.store.cache.store import Store

@@ -12,7 +12,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic
@@ -211,6 +210,8 @@ def _check(drives: Sequence[Drive]) -> None:
 
 def _check_overlap(drive: Drive) -> None:
     """Refuse a visit that comes near to no other: nothing would be common to them."""
+    from scipy.spatial import cKDTree  # which a drive alone does without
+
     places = [
         np.array([image.map_from_vehicle[:2, 3] for image in drive.images if image.visit == number])
         for number in range(len(drive.joined))

@@ -8,8 +8,6 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from v2hdm.store.cache.codec import encode
-
 _PACKAGE = Path(__file__).parents[2]
 _CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
 """Files of the package that decide what comes out: sources, catalogue, weights, templates."""
@@ -29,6 +27,8 @@ LIBRARIES = (
 
 def key_of(*parts: object) -> str:
     """SHA-256 in hexadecimal of parts that :func:`v2hdm.store.cache.codec.encode` takes."""
+    from v2hdm.store.cache.codec import encode  # msgspec, which reading a drive does without
+
     return hashlib.sha256(encode(parts)).hexdigest()
 
 

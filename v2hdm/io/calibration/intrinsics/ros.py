@@ -10,7 +10,6 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.camera_info import take_camera_info
 from v2hdm.io.calibration.intrinsics.document import Document
 from v2hdm.io.fields import take_size_px
-from v2hdm.io.importers.bag.streams import info_of
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import take_array, take_text
 
@@ -29,6 +28,8 @@ def names_of_message(document: Document) -> list[str]:
 
 def read_message(document: Document, name: str) -> CameraInfo:
     """The intrinsics of a ``CameraInfo`` message."""
+    from v2hdm.io.importers.bag.streams import info_of  # whose package imports this one
+
     where, content = str(document.path), document.entries
     lower = {key.lower(): value for key, value in content.items() if isinstance(key, str)}
     for key in ("k", "d"):
