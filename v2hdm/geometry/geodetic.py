@@ -1,4 +1,4 @@
-"""Between a local east-north-up frame, geodetic coordinates and projected ones, by PROJ (pyproj).
+"""Between a local east-north-up frame, geodetic coordinates and, by PROJ (pyproj), projected ones.
 
 Datums are kept, never shifted: ETRS89 coordinates stay ETRS89. Datums whose ellipsoid is WGS84's to within a
 millimetre on the ground count as satellite datums (WGS84, ETRS89, NAD83, GDA2020, JGD2011); others are
@@ -17,8 +17,9 @@ from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.extras import need
 from v2hdm.records import FloatArray, GeodeticOrigin
 
-_CARTESIAN = "+proj=cart +ellps=WGS84"
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563
+_SEMI_MINOR_M = _SEMI_MAJOR_M * (1 - _FLATTENING)
+_ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
 _SAME_ELLIPSOID_M = 1e-3
 """GRS80's semi-minor axis is 0.1 mm longer than WGS84's, m."""
 
@@ -32,8 +33,19 @@ _CONFORMAL_RAD = 1e-5
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
     """Map points (N, 3) in m to (N, 3): latitude and longitude in degrees, ellipsoidal height in m."""
     points_ecef = points_map @ enu_axes(_position(origin))[0].T + _ecef_from_geodetic(_position(origin))[0]
-    lon, lat, height_m = _cartesian().transform(*points_ecef.T, direction="INVERSE")
-    return np.column_stack([lat, lon, height_m])
+    x, y, z = points_ecef.T
+    off_axis = np.hypot(x, y)
+    # Bowring 1976, with the reduced latitude improved once: exact to rounding within 10 km of the ground.
+    reduced = np.arctan2(z * _SEMI_MAJOR_M, off_axis * _SEMI_MINOR_M)
+    for _ in range(2):
+        lat = np.arctan2(
+            z + _ECCENTRICITY2 / (1 - _ECCENTRICITY2) * _SEMI_MINOR_M * np.sin(reduced) ** 3,
+            off_axis - _ECCENTRICITY2 * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
+        )
+        reduced = np.arctan2((1 - _FLATTENING) * np.sin(lat), np.cos(lat))
+    curved = _SEMI_MAJOR_M * np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
+    height_m = off_axis * np.cos(lat) + z * np.sin(lat) - curved
+    return np.column_stack([np.degrees(lat), np.degrees(np.arctan2(y, x)), height_m])
 
 
 def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArray:
@@ -125,11 +137,10 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
     except pyproj.exceptions.CRSError:
         raise error(f"{where}: unknown crs '{crs}'; give an EPSG code such as EPSG:25832") from None
     ellipsoid = system.ellipsoid
-    minor_m = _SEMI_MAJOR_M * (1 - _FLATTENING)
     if (
         ellipsoid is None
         or abs(ellipsoid.semi_major_metre - _SEMI_MAJOR_M) > _SAME_ELLIPSOID_M
-        or abs(ellipsoid.semi_minor_metre - minor_m) > _SAME_ELLIPSOID_M
+        or abs(ellipsoid.semi_minor_metre - _SEMI_MINOR_M) > _SAME_ELLIPSOID_M
     ):
         raise error(
             f"{where}: {crs} ({system.name}) is of no satellite datum; convert the coordinates to one with "
@@ -152,12 +163,8 @@ def _position(origin: GeodeticOrigin) -> FloatArray:
 
 
 def _ecef_from_geodetic(geodetic: FloatArray) -> FloatArray:
-    return np.column_stack(_cartesian().transform(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2]))
-
-
-@lru_cache(maxsize=1)
-def _cartesian() -> Any:
-    pyproj = need("pyproj", "map", "a place on the earth", MapFileError)
-    # PROJ takes angles of a bare pipeline in radians: the first step makes them of degrees.
-    pipeline = f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step {_CARTESIAN}"
-    return pyproj.Transformer.from_pipeline(pipeline)
+    lat, lon, height_m = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1]), geodetic[:, 2]
+    normal_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
+    off_axis = (normal_m + height_m) * np.cos(lat)
+    along_axis = (normal_m * (1 - _ECCENTRICITY2) + height_m) * np.sin(lat)
+    return np.column_stack([off_axis * np.cos(lon), off_axis * np.sin(lon), along_axis])
