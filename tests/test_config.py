@@ -11,7 +11,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from v2hdm.cli import config
+from v2hdm.cli import compose as config
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.config import RunConfig
 

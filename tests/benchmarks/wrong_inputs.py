@@ -26,7 +26,7 @@ from omegaconf import OmegaConf
 from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.poses import poses_faults
-from v2hdm.cli import config as hydra_config
+from v2hdm.cli import compose as hydra_config
 from v2hdm.errors import V2hdmError
 from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.mapping.options import MappingOptions

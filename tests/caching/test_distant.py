@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from v2hdm.cli import cache as door
+from v2hdm.cli.main import run
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store, name_of
 from v2hdm.store.objects.bucket import Bucket
@@ -67,11 +67,11 @@ def test_the_door_lists_verifies_and_prunes_a_store(
     Store(tmp_path, memory).put("map", KEY, bytes(1000))
     memory.write("stages/detect/notes", b"mine")
     memory.write("notes", b"mine")
-    assert door.main(["list", "--cache", str(memory)]) == 0
+    assert run(["cache", "list", "--cache", str(memory)]) == 0
     told = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in told[1:]] == [["detect", "3"], ["map", "1"], ["all", "4"]]
-    assert door.main(["verify", "--cache", str(memory)]) == 0
+    assert run(["cache", "verify", "--cache", str(memory)]) == 0
     assert "read 4 entries, 3 of them damaged" in capsys.readouterr().out
-    assert door.main(["prune", "--cache", str(memory), "--gb", "0"]) == 0
+    assert run(["cache", "prune", "--cache", str(memory), "--gb", "0"]) == 0
     assert "removed 1 entries" in capsys.readouterr().out
     assert set(memory.listed()) == {"stages/detect/notes", "notes"}

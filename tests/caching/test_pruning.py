@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from v2hdm.cli import cache as door
+from v2hdm.cli.main import run
 from v2hdm.store.cache.folders import LIST, note_use
 from v2hdm.store.cache.leases import lease
 from v2hdm.store.cache.pruning import DRIVES, items_of, prune
@@ -136,16 +136,16 @@ def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path: Path) 
 
 
 def test_the_door_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert door.main(["list", "--cache", str(cache)]) == 0
+    assert run(["cache", "list", "--cache", str(cache)]) == 0
     assert "detect" in capsys.readouterr().out
     path = Store(cache).path("detect", KEYS[1])
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert door.main(["verify", "--cache", str(cache)]) == 0
+    assert run(["cache", "verify", "--cache", str(cache)]) == 0
     printed = capsys.readouterr().out
     assert str(path) in printed
     assert "read 4 entries, 1 of them damaged" in printed
     assert not path.exists()
-    assert door.main(["prune", "--cache", str(cache), "--gb", "0"]) == 0
+    assert run(["cache", "prune", "--cache", str(cache), "--gb", "0"]) == 0
     assert "removed 3 entries" in capsys.readouterr().out
     assert not left(cache)
 
@@ -159,7 +159,7 @@ def test_the_door_tells_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(cache.parent)
-    assert door.main(arguments) == 2
+    assert run(["cache", *arguments]) == 2
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1

@@ -16,7 +16,7 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.detect import main
+from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.draw import draw_detections
@@ -42,7 +42,7 @@ class Bench:
 
     def run(self, source: object, *arguments: object, calibrated: bool = True) -> int:
         camera = ["--camera", str(self.calibration)] if calibrated else []
-        return main([str(source), "--model", str(self.model), *camera, *map(str, arguments)])
+        return run(["detect", str(source), "--model", str(self.model), *camera, *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ def smaller(arguments: list[str]) -> list[str]:
     """The arguments of ``python`` with what makes the command small."""
     door, given = arguments[1], arguments[2:]
     if (
-        door in ("v2hdm.cli.check", "v2hdm.cli.extrinsic", "v2hdm.cli.localize")
+        door in ("v2hdm.cli.check", "v2hdm.cli.calibrate_ground", "v2hdm.cli.localize")
         and "--list-topics" not in given
     ):
         return [*arguments, "--workers", "1"]

@@ -10,7 +10,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from tests.experiment.scene import experiment
-from v2hdm.cli import config
+from v2hdm.cli import compose as config
 from v2hdm.errors import ConfigError
 from v2hdm.experiment.plan import ExperimentConfig, Site, jobs
 

@@ -16,7 +16,7 @@ import pytest
 from tests.docs.blocks import blocks, document
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from tests.mapping.test_changes import repainted
-from v2hdm import map as door
+from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive, write_drive
 from v2hdm.io.maps.geojson import read_geojson, write_geojson
@@ -66,8 +66,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
         patch.chdir(folder)
         for command in ("python -m v2hdm.map drive.path=drives/monday name=monday", BOTH, LATER):
-            patch.setattr(sys, "argv", [*shlex.split(command)[2:], "workers=1"])
-            assert door.main() == 0
+            assert run(["map", *shlex.split(command)[3:], "workers=1"]) == 0
     return folder / "outputs"
 
 

@@ -42,7 +42,7 @@ def calibrate_camera(parsed: argparse.Namespace) -> bool:
     """Calibrate, print what came out with the verdict on it, and write it.
 
     Args:
-        parsed: the arguments of :mod:`v2hdm.cli.calibrate`.
+        parsed: the arguments of :mod:`v2hdm.cli.calibrate_points`.
 
     Returns:
         Whether the verdict is FAIL.

@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from v2hdm.cli.config import compose_run_file, to_dataclass, to_yaml
+from v2hdm.cli.compose import compose_run_file, to_dataclass, to_yaml
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.fleet.rows import Row
 from v2hdm.io.texts import shown, take_name

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from v2hdm.cli.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
+from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
 
 ERROR = "ERROR"
 """Status of a drive of which there is no result."""
@@ -75,5 +75,5 @@ def as_json(rows: Sequence[Row]) -> bytes:
 
 def exit_code(rows: Sequence[Row]) -> int:
     """2 where a drive gave no result, else 3 where a verdict is FAIL, else 0."""
-    told = {row.status for row in rows}
-    return EXIT_USER_ERROR if ERROR in told else EXIT_FAILED_VERDICT if "FAIL" in told else 0
+    found = {row.status for row in rows}
+    return EXIT_USER_ERROR if ERROR in found else EXIT_FAILED_VERDICT if "FAIL" in found else 0

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from v2hdm.cli.door import told
+from v2hdm.errors import describe
 from v2hdm.fleet.board import Telling
 from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
@@ -36,7 +36,7 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
         mapped = partial(_mapped, job, eyes, telling)
         result, kept = in_place(job.config, mapped, job.config.resume, telling)
     except Exception as error:  # a drive that fails is a row, and the others go on
-        line = told(error)
+        line = describe(error)
         if line is not None:
             return Row.of_error(job.name, job.source, line), ""
         line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"

@@ -1,6 +1,6 @@
 """Whether a result can be trusted: named checks, each with a value, a limit, a cause and a remedy.
 
-``inputs`` holds the checks before a run (:func:`check_drive`, and ``python -m v2hdm.cli.check``), which need no
+``inputs`` holds the checks before a run (:func:`check_drive`, and ``v2hdm check``), which need no
 torch; ``results`` those after it. Both end in one :class:`Verdict`.
 """
 

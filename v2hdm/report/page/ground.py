@@ -1,4 +1,4 @@
-"""The mosaic of the ground, where ``python -m v2hdm.cli.mosaic`` has put one into the folder (docs/mosaic.md)."""
+"""The mosaic of the ground, where ``v2hdm mosaic`` has put one into the folder (docs/mosaic.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``--help`` of the doors that Hydra configures: every key with its default, explained by its dataclass.
+"""``--help`` of the commands that Hydra configures: every key with its default, explained by its dataclass.
 
 The docstrings are the only source: an entry of ``Attributes``, else the sentences that name the key.
 """
@@ -17,7 +17,7 @@ from typing import Any, get_args, get_type_hints
 
 _WIDTH = 100
 _USAGE = """\
-Usage: python -m {door} [key=value ...] [--config-dir FOLDER] [--multirun]
+Usage: {command} [key=value ...] [--config-dir FOLDER] [--multirun]
 
   +run=NAME           a run: what conf/run/NAME.yaml or FOLDER/run/NAME.yaml sets
   key=value           sets a key; null is nothing, lists are [1.0, 2.0], texts with blanks want quotes
@@ -40,16 +40,16 @@ class Key:
     meaning: str
 
 
-def help_text(about: str, schema: type[Any], conf: Path) -> str:
+def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
     """The page that ``--help`` prints.
 
     Args:
-        about: the door's docstring, which names it.
+        command: as users type it.
+        says: a sentence about it.
         schema: the dataclass of its configuration.
         conf: the folder of the shipped configuration.
     """
-    named = re.search(r"python -m ([\w.]+)", about)
-    parts = [about.split("\n\n")[0], "", _USAGE.format(door=named.group(1) if named else "...")]
+    parts = [_USAGE.format(command=command), says, ""]
     names = {one.name for one in fields(schema)}
     if "drive" in names:
         parts += [
