@@ -268,9 +268,8 @@ def texts() -> Iterator[Case]:
             # Of intrinsics any tool's file will do.
             either = f"{says}|no intrinsics of a known format" if file.startswith("front") else says
             yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), either)
-        yield Case(
-            f"calibration: {name}", "v2hdm calibrate compare", ("a.yaml", "a.yaml"), write("a.yaml", text), says
-        )  # fmt: skip
+        both = ("a.yaml", "a.yaml")
+        yield Case(f"calibration: {name}", "v2hdm calibrate compare", both, write("a.yaml", text), says)
     for name, (text, says) in JSON_TEXTS.items():
         yield Case(
             f"map: {name}",

@@ -65,8 +65,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "check_drive", lambda *_: [])
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
         patch.chdir(folder)
-        for command in ("python -m v2hdm.map drive.path=drives/monday name=monday", BOTH, LATER):
-            assert run(["map", *shlex.split(command)[3:], "workers=1"]) == 0
+        for command in ("v2hdm map drive.path=drives/monday name=monday", BOTH, LATER):
+            assert run(["map", *shlex.split(command)[2:], "workers=1"]) == 0
     return folder / "outputs"
 
 

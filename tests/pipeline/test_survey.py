@@ -100,7 +100,7 @@ def documented(site: Site) -> tuple[Path, str]:
     (command,) = DOCUMENTED.lines
     settings = ["drive.cameras=[front]", "all_maps=true", "workers=1", "output=outputs", "name=short"]
     done = subprocess.run(
-        [sys.executable, *shlex.split(command)[1:], *settings],
+        [sys.executable, "-m", *shlex.split(command), *settings],
         cwd=site.folder,
         capture_output=True,
         text=True,

@@ -19,7 +19,7 @@ def centre_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> Float
 
 
 def mounting_lines(name: str, cam_from_vehicle: FloatArray, covariance: FloatArray) -> list[str]:
-    """What the terminal shows of a mounting: angles as :mod:`v2hdm.cli.calibrate_ground` counts them, and the centre."""
+    """Lines for the terminal: the angles of a mounting, as docs/extrinsic.md counts them, and its centre."""
     angles = np.degrees(mounting_angles(cam_from_vehicle))
     angle_sigma = np.degrees(angle_sigmas(cam_from_vehicle, covariance))
     centre, centre_sigma = camera_centre(cam_from_vehicle), centre_sigmas(cam_from_vehicle, covariance)

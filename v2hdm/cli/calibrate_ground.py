@@ -1,7 +1,7 @@
 """``v2hdm calibrate ground DRIVE``: one line per camera on stdout and the verdict on the drive.
 
-Calibrations and pictures of the matched ground go into the output folder. docs/extrinsic.md describes them. No
-torch is needed.
+Calibrations and pictures of the matched ground go into the output folder (docs/extrinsic.md). No torch is
+needed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``v2hdm check DRIVE``: one line per finding, a verdict, and pictures of the route and of every camera's ground.
+"""``v2hdm check DRIVE``: one line per finding, a verdict, and pictures of the route and of sample images.
 
 docs/check.md says what each finding means. No torch is needed.
 """

@@ -1,4 +1,4 @@
-"""``v2hdm detect SOURCE``, on the vehicle: one JSON object per image, latency percentiles at the end on stderr.
+"""``v2hdm detect SOURCE``: one JSON object per image, percentiles of the latency at the end on stderr.
 
 It needs the base install only (numpy, opencv, onnxruntime, PyYAML). docs/detect.md describes it.
 """

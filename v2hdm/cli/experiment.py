@@ -1,4 +1,4 @@
-"""``v2hdm experiment``: its arguments are Hydra overrides, which ``--help`` lists. docs/experiment.md describes it."""
+"""``v2hdm experiment``: its arguments are Hydra overrides (docs/experiment.md)."""
 
 from __future__ import annotations
 

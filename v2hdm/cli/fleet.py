@@ -1,4 +1,4 @@
-"""``v2hdm fleet drives/*.yaml``: detection and mapping spread over this machine's cores, or a cluster's, by Ray.
+"""``v2hdm fleet drives/*.yaml``: many drives on the cores of this machine or of a cluster, by Ray.
 
 A drive whose result is finished and was made of the same is not done again; one that fails is a row of the
 table that says why, and the others go on. With --site all drives are mapped together (docs/fleet.md).

@@ -1,4 +1,4 @@
-"""``v2hdm localize MAP DRIVE``: of the recorded poses only the first is used, the rest tells how far off it is.
+"""``v2hdm localize MAP DRIVE``: only the first recorded pose is used; the others show how far off it is.
 
 docs/localize.md describes it.
 """

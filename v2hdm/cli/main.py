@@ -139,7 +139,7 @@ def script() -> int:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run a command line in this process; 0, 2 where a user must mend something, 3 where a verdict is FAIL."""
+    """Run a command line in this process; 0, 2 where a user must mend something, 3 for a verdict FAIL."""
     words = list(arguments)
     name = next((one for one in (" ".join(words[:2]), *words[:1]) if one in COMMANDS), "")
     given = words[len(name.split()) :]

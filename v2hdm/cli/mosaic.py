@@ -1,4 +1,4 @@
-"""``v2hdm mosaic RESULT``: the ground from above as a GeoTIFF and pictures, before and after the optimisation.
+"""``v2hdm mosaic RESULT``: the ground from above, as a GeoTIFF and as pictures before and after.
 
 docs/mosaic.md describes it.
 """

@@ -93,7 +93,7 @@ class RoadDetector:
         options: DetectorOptions | None = None,
         linear_response: bool = False,
     ) -> RoadDetector:
-        """A detector for the camera of a calibration YAML that ``python -m v2hdm.map`` wrote.
+        """A detector for the camera of a calibration YAML that ``v2hdm map`` wrote.
 
         Args:
             calibration: the YAML file.

@@ -48,7 +48,7 @@ def mosaic_of_result(parsed: argparse.Namespace) -> list[str]:
     logging.basicConfig(format="%(message)s")
     check_device(parsed.device)
     if not parsed.result.is_dir():
-        raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm.map")
+        raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
     drive = drive_of_result(parsed.result, parsed.drive)
     resolution_m = RESOLUTION_M if parsed.resolution is None else parsed.resolution
     with added_to(parsed.result, "RESULT") as folder:

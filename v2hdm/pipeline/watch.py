@@ -58,7 +58,7 @@ def watch(parsed: argparse.Namespace) -> None:
     A live camera is watched until Ctrl-C; for any other source that is raised on, and no file is written.
 
     Args:
-        parsed: the arguments of :mod:`v2hdm.detect`.
+        parsed: the arguments of :mod:`v2hdm.cli.detect`.
 
     Raises:
         V2hdmError: what a user got wrong.

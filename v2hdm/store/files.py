@@ -99,7 +99,7 @@ def refuse_url(path: Path) -> None:
     """
     if _URL.match(str(path)):
         raise ConfigError(
-            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm.map and "
+            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm map and "
             "v2hdm.fleet; give a path on this machine"
         )
 

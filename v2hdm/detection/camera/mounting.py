@@ -86,7 +86,7 @@ def _check(calibration: Calibration) -> None:
         or np.linalg.det(rotation) < 0
         or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1])
     ):
-        problem = "cam_from_vehicle is no rotation and translation; write it again with `python -m v2hdm.map`"
+        problem = "cam_from_vehicle is no rotation and translation; write it again with `v2hdm map`"
     elif camera_centre(cam_from_vehicle)[2] <= 0:
         problem = "cam_from_vehicle puts the camera on or under the ground; mend it"
     if problem:

@@ -144,7 +144,7 @@ def trusted_calibrations(path: Path) -> dict[str, Calibration]:
     files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
     if not files:
         raise MapFileError(
-            f"{path}: no calibration_*.yaml in it; give what v2hdm.map or v2hdm.cli.calibrate_ground wrote"
+            f"{path}: no calibration_*.yaml in it; give what v2hdm map or v2hdm calibrate ground wrote"
         )
     out = {}
     for file in files:

@@ -42,7 +42,7 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
         DriveError: the drive cannot be read, or is not that of this result.
     """
     if not (folder / METRICS).is_file():
-        raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm.map")
+        raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm map")
     told = load_json(folder / METRICS, MapFileError).get("drive")
     told = told if isinstance(told, dict) else {}
     try:

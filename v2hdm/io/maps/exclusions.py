@@ -55,7 +55,7 @@ def read_exclusions(path: Path) -> list[ExcludedMarking]:
     """
     features = load_json(path, MapFileError).get("features")
     if not isinstance(features, list):
-        raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
+        raise MapFileError(f"{path}: no 'features'; give what v2hdm map wrote")
     excluded = []
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"

@@ -29,7 +29,7 @@ def write_page(folder: Path, drive: Drive | None) -> Path:
     """Write ``report.html`` into a result folder, atomically, and return its path.
 
     Args:
-        folder: what :mod:`v2hdm.map` wrote.
+        folder: what ``v2hdm map`` wrote.
         drive: that was mapped, for pictures, the recorded route and truth; None where it is not at hand.
 
     Raises:
