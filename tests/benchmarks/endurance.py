@@ -29,14 +29,13 @@ from v2hdm.io.drive import read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.camera_sets import map_camera_sets
 from v2hdm.pipeline.config import DriveConfig
+from v2hdm.pipeline.context import Unwatched, silent
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.inspect import inspect
 from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.result import write_results
 from v2hdm.pipeline.survey import take_survey
-from v2hdm.pipeline.telling import silent
-from v2hdm.pipeline.viewer import Unwatched
-from v2hdm.pipeline.write import write_results
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.verdict import Verdict

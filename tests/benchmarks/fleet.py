@@ -44,9 +44,9 @@ from v2hdm.fleet.parts import RayTeam
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.context import silent
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.keys import read_visits
-from v2hdm.pipeline.telling import silent
 from v2hdm.store.cache.keys import key_of
 from v2hdm.store.cache.room import Room
 

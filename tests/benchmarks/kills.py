@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-import v2hdm.pipeline.work  # noqa: F401  # loaded once, before any run is forked
+import v2hdm.pipeline.map_drive  # noqa: F401  # loaded once, before any run is forked
 from tests.pipeline.test_run import short_port
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run

@@ -25,7 +25,7 @@ from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.io.calibration.document import Provenance
 from v2hdm.io.calibration.formats import write_calibration_as
 from v2hdm.io.maps import write_calibration
-from v2hdm.pipeline import watch
+from v2hdm.pipeline import detect_images as watch
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 
 DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]

@@ -20,7 +20,7 @@ from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive, write_drive
 from v2hdm.io.maps.geojson import read_geojson, write_geojson
-from v2hdm.pipeline import work
+from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
 

@@ -18,8 +18,9 @@ from v2hdm.detection import batch
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import detections, work
+from v2hdm.pipeline import detections
 from v2hdm.pipeline import inspect as inspection
+from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.run import run

@@ -49,6 +49,6 @@ def run(arguments: Sequence[str]) -> None:
         "--draw", type=Path, metavar="DIR", help="folder for the images with detections drawn"
     )
     parsed = parser.parse_args(arguments)
-    from v2hdm.pipeline.watch import watch
+    from v2hdm.pipeline.detect_images import watch
 
     watch(parsed)

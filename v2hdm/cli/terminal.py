@@ -11,9 +11,9 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from v2hdm.pipeline.config import RunConfig, run_name
+from v2hdm.pipeline.context import Progress as TellProgress
+from v2hdm.pipeline.context import logging_to
 from v2hdm.pipeline.run import run
-from v2hdm.pipeline.telling import Progress as TellProgress
-from v2hdm.pipeline.telling import logging_to
 from v2hdm.progress import progress_lines
 from v2hdm.report.table import changes_table, results_table
 from v2hdm.verdict import Status, Verdict

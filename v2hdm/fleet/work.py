@@ -48,7 +48,7 @@ def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, 
     # They load torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
     from v2hdm.mapping.crew import ALONE, Crew
-    from v2hdm.pipeline.work import map_drives
+    from v2hdm.pipeline.map_drive import map_drives
 
     crew: Crew = ALONE
     if len(config.drive.paths) > 1:

@@ -14,10 +14,9 @@ from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
+from v2hdm.pipeline.context import Progress, Viewer
+from v2hdm.pipeline.result import BEST
 from v2hdm.pipeline.survey import Survey, compare_survey
-from v2hdm.pipeline.telling import Progress
-from v2hdm.pipeline.viewer import Viewer
-from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
 from v2hdm.store.cache.room import Room

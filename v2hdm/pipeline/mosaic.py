@@ -10,7 +10,7 @@ from pathlib import Path
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive.of_result import drive_of
 from v2hdm.mosaic.result import RESOLUTION_M, write_mosaic
-from v2hdm.pipeline.admit import check_device
+from v2hdm.pipeline.config import check_device
 from v2hdm.records import Drive
 from v2hdm.store.outputs import added_to
 

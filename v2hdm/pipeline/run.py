@@ -7,10 +7,9 @@ result of just that lies in its place, nothing else is loaded or done.
 from __future__ import annotations
 
 from v2hdm.pipeline.config import RunConfig
+from v2hdm.pipeline.context import Progress, Viewer, silent
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.places import in_place
-from v2hdm.pipeline.telling import Progress, silent
-from v2hdm.pipeline.viewer import Viewer
 from v2hdm.store.cache.store import Store
 
 
@@ -32,7 +31,7 @@ def run(
     def work(config: RunConfig, store: Store) -> RunResult:
         # Loads torch and much else, which takes seconds.
         from v2hdm.detection.network import check_device
-        from v2hdm.pipeline.work import map_drives
+        from v2hdm.pipeline.map_drive import map_drives
 
         check_device(config.detector.device)
 

@@ -1,35 +1,104 @@
-"""A run's results as files."""
+"""What a run was made of: the drive, the date, the versions of what computed it.
+
+The adjusted trajectory as files: poses in the format of TUM, and how well they are known.
+
+A run's results as files.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from v2hdm import __version__
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.calibration.document import Provenance, write_calibration
 from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+from v2hdm.io.drive import ReadOptions
+from v2hdm.io.drive.of_result import told_of
+from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.io.drive.tum import write_tum
 from v2hdm.io.maps.exclusions import ExcludedMarking, write_exclusions
 from v2hdm.io.maps.formats import write_map
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.heights import with_heights
 from v2hdm.io.maps.residuals import FILE as RESIDUALS
 from v2hdm.io.maps.residuals import write_residuals
-from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
-from v2hdm.pipeline.trajectory import write_trajectories
-from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections
+from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory, Visit
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
+from v2hdm.store.cache.keys import library_versions
+from v2hdm.store.files import replace_text
 from v2hdm.verdict import Verdict
+
+
+def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
+    """What ``metrics.json`` begins with: name, version, date (UTC), the drive at ``paths`` as it was read."""
+    return {
+        "name": name,
+        "version": __version__,
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "drive": _drive(drive, paths, options),
+        "versions": {"v2hdm": __version__, **library_versions()},
+    }
+
+
+def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
+    stamp_s = [image.stamp_s for image in drive.images]
+    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    return {
+        **told_of(drive, paths, options),
+        "duration_s": round(float(np.ptp(stamp_s)), 3),
+        "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
+        "position_sigma_m": drive.pose_noise.position_m,
+        "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
+    }
+
+
+_HEADER = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
+
+
+def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None:
+    """Write ``trajectory.tum`` and ``trajectory_sigma.csv``, a line for each time of an image.
+
+    Of joined drives each has its own, such as ``trajectory_monday.tum``.
+
+    The poses are in the frame of the recorded ones, whose road is not flat: each is the recorded pose of that
+    time, moved as the solve has moved the flat one. ``seen`` says whether a marking was seen then; where none
+    was, the pose is the recorded one and its sigmas those that the drive states.
+    """
+    for number, visit in enumerate(drive.visits):
+        own = poses.visit == number
+        stem = f"trajectory_{visit.name}" if drive.joined else "trajectory"
+        stamp_s, before = poses.stamp_s[own], poses.before[own]
+        moved = np.linalg.inv(before) @ poses.map_from_vehicle[own]
+        write_tum(Trajectory(stamp_s, _recorded(visit, stamp_s, before) @ moved), folder / f"{stem}.tum")
+        rows = [
+            f"{stamp:.9f},{int(seen)}," + ",".join(f"{value:.6g}" for value in sigma)
+            for stamp, seen, sigma in zip(stamp_s, poses.seen[own], poses.sigma[own], strict=True)
+        ]
+        replace_text(folder / f"{stem}_sigma.csv", "\n".join([_HEADER, *rows]) + "\n")
+
+
+def _recorded(visit: Visit, stamp_s: FloatArray, before: FloatArray) -> FloatArray:
+    """The poses (F, 4, 4) as recorded, those laid flat where the visit has no others."""
+    if visit.recorded is None:
+        return before
+    recorded, _ = interpolate(visit.recorded, stamp_s, float("inf"))
+    return recorded
+
 
 _log = logging.getLogger(__name__)
 

@@ -21,20 +21,17 @@ from v2hdm.io.drive import join_drives
 from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mosaic.result import write_mosaic
-from v2hdm.pipeline.about import describe_run
-from v2hdm.pipeline.admit import admit
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.camera_sets import map_camera_sets
-from v2hdm.pipeline.config import NO_DRIVE, RunConfig
+from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit
+from v2hdm.pipeline.context import Progress, Unwatched, Viewer, log_file, logging_to, timed
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.finished import RunResult, note_finished
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.keys import Contents, read_visits, result_key
+from v2hdm.pipeline.result import BEST, describe_run, write_results
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
-from v2hdm.pipeline.telling import Progress, log_file, logging_to, timed
-from v2hdm.pipeline.viewer import Unwatched, Viewer
-from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
