@@ -20,7 +20,7 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import detections
 from v2hdm.pipeline import inspect as inspection
-from v2hdm.pipeline import map_drive as work
+from v2hdm.pipeline import run as running
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.run import run
@@ -87,7 +87,7 @@ def test_another_mapping_setting_needs_no_image_again(site: Path, monkeypatch: p
 def test_with_nothing_changed_the_result_is_taken_as_it_lies(
     site: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(work, "map_drives", refused)
+    monkeypatch.setattr(running, "map_and_save", refused)
     again = run(config(site, "first", workers=2))
     metrics = json.loads((site / "first" / "short" / "metrics.json").read_text())
     assert again.metrics["results"].keys() == metrics["results"].keys()
@@ -124,8 +124,8 @@ def test_what_is_missing_or_damaged_is_made_anew(
     made: list[RunResult] = []
     before = (site / "first" / "short" / "map.geojson").read_bytes()
     harm(site / "first" / "short")
-    original = work.map_drives
-    monkeypatch.setattr(work, "map_drives", lambda *given: made.append(original(*given)) or made[-1])
+    original = running.map_and_save
+    monkeypatch.setattr(running, "map_and_save", lambda *given: made.append(original(*given)) or made[-1])
     run(config(site, "first"))
     assert made
     assert (site / "first" / "short" / "map.geojson").read_bytes() == before
@@ -148,17 +148,17 @@ def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(
 
 KILLED = """
 import os, signal, sys
-from v2hdm.pipeline import detections
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
-original, kept = detections.Room.keep, []
+from v2hdm.store.cache.room import Room
+original, kept = Room.keep, []
 def keep(room, stage, *rest):
     found = original(room, stage, *rest)
     kept.append(stage)
     if kept.count("detect") == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return found
-detections.Room.keep = keep
+Room.keep = keep
 drive = DriveConfig(path=sys.argv[1])
 run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], workers=1))
 """

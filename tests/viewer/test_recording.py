@@ -21,14 +21,13 @@ from v2hdm.io.calibration.document import read_calibration
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps import read_geojson
 from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.context import Context, Unwatched
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
 from v2hdm.pipeline.run import run
 from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]
@@ -181,10 +180,11 @@ def test_images_are_shown_as_they_are_looked_at(drive_folder: Path, tmp_path: Pa
     drive = read_drive(drive_folder, DriveConfig(limit=3))
     shown: list[list[int]] = []
 
-    def show(found: Sequence[ImageDetections]) -> None:
-        shown.append([one.image for one in found])
+    class Watching(Unwatched):
+        def detected(self, detections: Sequence[ImageDetections]) -> None:
+            shown.append([one.image for one in detections])
 
     for _ in range(2):
-        room = Room(Store(tmp_path))
-        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), room, 1, lambda *_: None, show=show)
+        context = replace(Context.of(tmp_path, workers=1), viewer=Watching())
+        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), context)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

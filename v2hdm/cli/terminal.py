@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from v2hdm.pipeline.config import RunConfig, run_name
-from v2hdm.pipeline.context import Progress as TellProgress
 from v2hdm.pipeline.context import logging_to
 from v2hdm.pipeline.run import run
-from v2hdm.progress import progress_lines
+from v2hdm.progress import progress_bars
 from v2hdm.report.table import changes_table, results_table
 from v2hdm.verdict import Status, Verdict
 from v2hdm.viewer import RerunViewer, check_viewer
@@ -27,7 +23,7 @@ def run_on_terminal(config: RunConfig, config_yaml: str) -> Verdict:
     console = Console()
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
-    with logging_to(handler), _bars(console) as progress:
+    with logging_to(handler), progress_bars(console) as progress:
         result = run(config, config_yaml, progress, viewer)
     console.print()
     for line in result.headlines:
@@ -43,26 +39,3 @@ def run_on_terminal(config: RunConfig, config_yaml: str) -> Verdict:
         )
     console.print(f"results in {result.place}: open report.html", highlight=False, soft_wrap=True)
     return result.verdict
-
-
-@contextmanager
-def _bars(console: Console) -> Iterator[TellProgress]:
-    """A progress bar per task, made the first time that a task reports; lines where there is no terminal."""
-    if not console.is_terminal:
-        yield progress_lines(console.print)
-        return
-    columns = (
-        TextColumn("{task.description:<28}"),
-        BarColumn(40),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bars:
-        tasks = {}
-
-        def advance(task: str, done: int, total: int) -> None:
-            if task not in tasks:
-                tasks[task] = bars.add_task(task, total=total)
-            bars.update(tasks[task], completed=done, total=total)
-
-        yield advance

@@ -7,7 +7,7 @@ that a finished drive is never opened again.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -25,9 +25,11 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.camera_sets import camera_sets
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.inspect import Inspection, inspect_each
 from v2hdm.pipeline.keys import Contents, model_key
+from v2hdm.progress import Progress
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
@@ -36,9 +38,6 @@ from v2hdm.store.cache.keys import code_key, file_digest, key_of
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.store.files import whole_file
-
-Tell = Callable[[str, int, int], None]
-"""Told a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
 GROWTH_STEPS = 8
@@ -68,7 +67,7 @@ def recipe_file(recipe: str) -> str:
     return f"{recipe}.json.gz"
 
 
-def drive_record(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
+def drive_record(job: Job, workers: int, tell: Progress) -> dict[str, Any]:
     """What is known of a drive and of its maps, from disk or found now and kept there.
 
     Args:
@@ -114,7 +113,7 @@ def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]])
     }
 
 
-def _find(job: Job, workers: int, tell: Tell) -> None:
+def _find(job: Job, workers: int, tell: Progress) -> None:
     """Open the drive, and map it by those recipes whose maps are missing."""
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(tell, "render"))
@@ -124,12 +123,10 @@ def _find(job: Job, workers: int, tell: Tell) -> None:
     truth = read_truth(drive)
     store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
     cache, contents = Store(job.cache), Contents.of([drive])
-    room, max_gap_s = Room(cache), job.site.drive.max_gap_s
+    context = Context(Room(cache), tell, workers=workers)
     with cache.in_use():
-        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, tell)
-        detections = detect_in_pieces(
-            inspection.drive, contents, job.detector, room, workers, partial(tell, "detect")
-        )
+        (inspection,) = inspect_each([drive], contents, job.site.drive.max_gap_s, context)
+        detections = detect_in_pieces(inspection.drive, contents, job.detector, context)
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
         if stored(path, key) is None:
@@ -177,7 +174,7 @@ def _mapped(
     inspection: Inspection,
     detections: Sequence[ImageDetections],
     truth: Truth,
-    tell: Tell,
+    tell: Progress,
 ) -> dict[str, Any]:
     """Maps, growth and extrinsics of a drive under a recipe; under ours residuals, too."""
     drive = inspection.drive

@@ -15,8 +15,10 @@ from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
 from v2hdm.fleet.rows import Row
 from v2hdm.pipeline.config import RunConfig
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.places import in_place
+from v2hdm.pipeline.run import map_and_save
 from v2hdm.store.cache.store import Store
 
 
@@ -45,13 +47,9 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
 
 
 def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, store: Store) -> RunResult:
-    # They load torch, which a finished result does not need.
+    # It loads torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
-    from v2hdm.mapping.crew import ALONE, Crew
-    from v2hdm.pipeline.map_drive import map_drives
 
-    crew: Crew = ALONE
-    if len(config.drive.paths) > 1:
-        crew = RayCrew(len(eyes), str(Path.cwd()))
-    detect = partial(detect_by, eyes)
-    return map_drives(config, store, job.config_yaml, telling, detect=detect, crew=crew)
+    crew = RayCrew(len(eyes), str(Path.cwd())) if len(config.drive.paths) > 1 else None
+    context = Context(progress=telling, detect=partial(detect_by, eyes), executor=crew)
+    return map_and_save(config, store, job.config_yaml, context)

@@ -1,4 +1,4 @@
-"""The settings of a run: where the drive is, how to work, where the results go; what cannot work is refused."""
+"""The settings of a run, and what of them is refused before any long work."""
 
 from __future__ import annotations
 
@@ -182,15 +182,24 @@ def admit(config: RunConfig) -> str:
         raise ConfigError(
             "mosaic=true puts the images of one drive on the ground; map the drives one by one for it"
         )
-    if config.map.base is not None and config.mapping.mode == INCREMENTAL:
+    check_choice(config.mapping, len(config.drive.paths), config.map.base is not None)
+    return name
+
+
+def check_choice(options: MappingOptions, drives: int, has_base: bool) -> None:
+    """Refuse settings of the mapping that do not go with so many drives, with an earlier map, or here.
+
+    Raises:
+        ConfigError: says which, and what to set.
+    """
+    if has_base and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
-    if len(config.drive.paths) > 1 and config.mapping.mode == INCREMENTAL:
+    if drives > 1 and options.mode == INCREMENTAL:
         raise ConfigError(
             "mode=incremental maps one drive as the vehicle would; map several with mode=batch, or one by "
             "one with map.base"
         )
-    check_device(config.mapping.device)
-    return name
+    check_device(options.device)
 
 
 def check_device(device: str) -> None:

@@ -1,72 +1,30 @@
-"""How a run tells what it does: progress, the log, the time that each step took.
-
-What the pipeline tells whoever watches a run.
-"""
+"""The surroundings of a run: cache, progress, viewer, workers, times, the log."""
 
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
+from v2hdm.store.cache.room import Room
+from v2hdm.store.cache.store import Store
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # loads torch, which a finished run does without
+    from collections.abc import Callable
+
+    from v2hdm.detection.batch import Detect
+    from v2hdm.mapping.crew import Crew
     from v2hdm.mapping.results import MethodResult
 
-
 _log = logging.getLogger(__name__)
-
-
-class Progress(Protocol):
-    """Told how far a named piece of long work is."""
-
-    def __call__(self, task: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``task`` are finished."""
-
-
-def silent(task: str, done: int, total: int) -> None:
-    """A :class:`Progress` that shows nothing."""
-
-
-@contextmanager
-def timed(seconds: dict[str, float], step: str) -> Iterator[None]:
-    """Note how long the block takes, s, as a ``step``, and log it."""
-    start = time.perf_counter()
-    yield
-    seconds[step] = round(time.perf_counter() - start, 2)
-    _log.info("%s: %.1f s", step, seconds[step])
-
-
-@contextmanager
-def logging_to(handler: logging.Handler) -> Iterator[None]:
-    """Send this library's log to ``handler`` as well, for as long as the block runs."""
-    logger = logging.getLogger("v2hdm")
-    logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        handler.close()
-
-
-class _LogFile(logging.FileHandler):
-    """A log that is part of a result: where it cannot be written, the result cannot."""
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Raise what went wrong; logging itself would print a traceback and go on."""
-        raise
-
-
-def log_file(path: Path) -> logging.Handler:
-    """A log in a file of the result."""
-    handler = _LogFile(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    return handler
 
 
 class Viewer(Protocol):
@@ -99,3 +57,79 @@ class Unwatched:
 
     def close(self) -> None:
         """Nothing."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """Surroundings of a run.
+
+    Attributes:
+        cache: keeps what stages have found; as it is here, nothing.
+        progress: shows how far the long steps are.
+        viewer: is shown images, detections and maps as they come.
+        detect: detects in images; None does so in processes of this machine.
+        executor: works on what can be parted of a run; None for this process.
+        workers: processes; 0 takes one per core.
+        folder: takes what the viewer keeps of the run.
+        seconds: how long each step took, s.
+    """
+
+    cache: Room = field(default_factory=lambda: Room(None))
+    progress: Progress = silent
+    viewer: Viewer = field(default_factory=Unwatched)
+    detect: Detect | None = None
+    executor: Crew | None = None
+    workers: int = 0
+    folder: Path = Path()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, cache: str | Path | None, progress: Progress = silent, workers: int = 0) -> Context:
+        """The surroundings of a call from Python; without a ``cache`` folder nothing is kept."""
+        room = Room(None if cache is None else Store(Path(cache)))
+        return cls(room, progress, workers=workers)
+
+    @property
+    def processes(self) -> int:
+        """The number of processes to work in."""
+        return self.workers or os.cpu_count() or 1
+
+    def steps(self, task: str) -> Callable[[int, int], None]:
+        """The progress of one task: called with how many steps are done, and of how many."""
+        return partial(self.progress, task)
+
+    @contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Note how long the block takes, s, as a ``step``, and log it."""
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = round(time.perf_counter() - start, 2)
+        _log.info("%s: %.1f s", step, self.seconds[step])
+
+
+@contextmanager
+def logging_to(handler: logging.Handler) -> Iterator[None]:
+    """Send this library's log to ``handler`` as well, for as long as the block runs."""
+    logger = logging.getLogger("v2hdm")
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
+
+
+class _LogFile(logging.FileHandler):
+    """A log that is part of a result: where it cannot be written, the result cannot."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Raise what went wrong; logging itself would print a traceback and go on."""
+        raise
+
+
+def log_file(path: Path) -> logging.Handler:
+    """A log in a file of the result."""
+    handler = _LogFile(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    return handler

@@ -1,225 +1,232 @@
-"""The stages of a run: read, check, detect, map, judge, write; what an earlier run has found is taken."""
+"""From a drive to a map, calibrations and a verdict: the stages of docs/design.md, one line each."""
 
 from __future__ import annotations
 
 import logging
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import torch  # noqa: F401  # its absence is told before that of what is built on it
+import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
-from v2hdm import __version__
-from v2hdm.detection.batch import Detect, detect_images
+from v2hdm.detection.batch import detect_images
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
-from v2hdm.io.drive import join_drives
+from v2hdm.errors import AdjustError, MappingError, V2hdmError
+from v2hdm.io.drive import ReadOptions, join_drives, read_drive
 from v2hdm.mapping.changes.update import Base
-from v2hdm.mapping.crew import ALONE, Crew
-from v2hdm.mosaic.result import write_mosaic
+from v2hdm.mapping.crew import ALONE
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
-from v2hdm.pipeline.camera_sets import map_camera_sets
-from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit
-from v2hdm.pipeline.context import Progress, Unwatched, Viewer, log_file, logging_to, timed
+from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
+from v2hdm.pipeline.config import check_choice
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
-from v2hdm.pipeline.finished import RunResult, note_finished
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
-from v2hdm.pipeline.keys import Contents, read_visits, result_key
-from v2hdm.pipeline.result import BEST, describe_run, write_results
+from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
+from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.report.check_points import write_check_points
-from v2hdm.report.outputs import result_folder, write_json
-from v2hdm.report.page.write import write_page
-from v2hdm.simulate import rendered_drive
-from v2hdm.store.cache.pruning import make_room
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.known_sizes import check_known_sizes
 from v2hdm.verdict.results.result import check_result
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
+
+Source = Drive | Path | str
 
 
 @dataclass(frozen=True)
-class _Task:
-    """A run while it is worked on; ``seconds`` says how long each step took."""
+class Read:
+    """Drives as they were read, as one, and the digests of their images."""
 
-    config: RunConfig
-    room: Room
-    folder: Path
-    about: Mapping[str, Any]
-    seconds: dict[str, float]
-    progress: Progress
-    viewer: Viewer
-    detect: Detect
-    crew: Crew
-
-    def result(self, metrics: Mapping[str, Any], headlines: Sequence[str], verdict: Verdict) -> RunResult:
-        """What the run hands back."""
-        return RunResult(Path(self.config.output) / self.about["name"], metrics, headlines, verdict)
+    drives: tuple[Drive, ...]
+    whole: Drive
+    contents: Contents
 
 
-def map_drives(
-    config: RunConfig,
-    store: Store,
-    config_yaml: str,
-    progress: Progress,
-    viewer: Viewer | None = None,
-    detect: Detect = detect_images,
-    crew: Crew = ALONE,
-) -> RunResult:
-    """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps.
+def map_drive(
+    drive: Source | Iterable[Source],
+    *,
+    options: MappingOptions | None = None,
+    detector: Detector | DetectorOptions | None = None,
+    reading: ReadOptions | None = None,
+    base: Path | str | None = None,
+    name: str | None = None,
+    cache: Path | str | None = None,
+    progress: Progress = silent,
+    workers: int = 0,
+    context: Context | None = None,
+) -> Result:
+    """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
 
-    ``detect`` takes the place of detection in processes of this machine, ``crew`` that of this process where
-    work can be parted.
+    Args:
+        drive: the drive or its folder, or several.
+        options: settings of association, adjustment and lanes.
+        detector: the detector, or its settings.
+        reading: how folders are read.
+        base: the map.geojson of an earlier result, which the drive brings up to date.
+        name: of the result; None takes that of the drive.
+        cache: folder that keeps what each stage has found for the next call; None keeps nothing.
+        progress: shows how far the long steps are, ``progress(task, done, total)``.
+        workers: processes; 0 takes one per core.
+        context: takes the place of the last three.
+
+    Returns:
+        The map in the frame ``map`` (east, north, up; m), calibrations, trajectory and verdict. The verdict
+        is data: a FAIL raises nothing.
+
+    Raises:
+        DriveError: the drive cannot be read.
+        MapFileError: ``base`` cannot be used.
+        DetectorError: the detector cannot be used.
+        MappingError: there is nothing to map, although no check of the drive has failed.
+
+    >>> result = map_drive(port, workers=1)
+    >>> result.verdict.status.value
+    'PASS'
+    >>> {marking.kind for marking in result.map.markings} <= {"diamond", "lane_dash", "stop_line"}
+    True
+    >>> result.calibrations["front"].cam_from_vehicle.shape
+    (4, 4)
     """
-    name = admit(config)
-    base = None if config.map.base is None else read_base(Path(config.map.base))
-    with store.in_use():
-        with (
-            result_folder(Path(config.output) / name) as folder,
-            logging_to(log_file(folder / "run.log")),
-        ):
-            log.info("v2hdm %s, run %s", __version__, name)
-            (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-            room = Room(store, config.resume)
-            hands = viewer or Unwatched(), detect, crew
-            result, key = _write(config, name, base, room, folder, progress, *hands)
-            for line in result.verdict.lines:
-                log.info("%s", line)
-        note_finished(result, key, store)
-        make_room(store.cache, config.cache_gb)
-    return result
-
-
-def _write(
-    config: RunConfig,
-    name: str,
-    base: Base | None,
-    room: Room,
-    folder: Path,
-    progress: Progress,
-    viewer: Viewer,
-    detect: Detect,
-    crew: Crew,
-) -> tuple[RunResult, str]:
-    """Write a run's result into ``folder``; returns the key of what it was made of, too."""
-    unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
-    if unknown is not None:
-        log.warning("%s", unknown)
-    seconds: dict[str, float] = {}
-    paths = _drive_folders(config, seconds, progress)
-    with timed(seconds, "read"):
-        drives, contents = read_visits(config, paths, crew)
-    for drive in drives:
-        count, names = len(drive.images), ", ".join(drive.cameras)
-        log.info("drive %s: %d images of cameras %s", drive.name, count, names)
-    # What does not belong together is told before any long work.
-    whole = join_drives(drives)
-    if base is not None:
-        check_together(base, whole, config.map.base or "")
-    survey = take_survey(whole, config.mapping)
-    key = result_key(config, drives, contents, room.key())
-    about = describe_run(name, whole, paths, config.drive)
-    mapped = replace(config, mapping=survey.mapping)
-    task = _Task(mapped, room, folder, about, seconds, progress, viewer, detect, crew)
-    with timed(seconds, "check"):
-        max_gap_s, workers = config.drive.max_gap_s, _workers(config)
-        inspection = join(inspect_each(drives, contents, max_gap_s, room, workers, progress, crew))
-    try:
-        return _map_and_judge(task, inspection, contents, survey, base), key
-    except (MappingError, AdjustError) as failure:
-        if not inspection.has_failed:
-            raise
-        return _without_map(task, inspection, failure), key
-
-
-def _map_and_judge(
-    task: _Task, inspection: Inspection, contents: Contents, survey: Survey, base: Base | None
-) -> RunResult:
-    """Detect, map, check and write."""
-    config, drive, seconds, progress = task.config, inspection.drive, task.seconds, task.progress
-    with closing(task.viewer):
-        with timed(seconds, "detect"):
-            task.viewer.begun(task.folder, drive)
-            detections = _detect(task, drive, contents)
-        with timed(seconds, "map"):
-            hands = task.room, progress, task.viewer, task.crew
-            sets = map_camera_sets(drive, contents.key(drive), detections, survey, base, *hands)
-    methods = {name: one.methods for name, one in sets.items()}
-    best, checked = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
-    with timed(seconds, "judge"):
-        found = check_result(drive, methods, inspection.ground)
-        surveyed = check_survey(survey, best, checked)
-        unfit = check_known_sizes(config.mapping.known_sizes, best)
-        verdict = Verdict.of([*inspection.findings, *found, *unfit, *surveyed])
-    with timed(seconds, "evaluate"):
-        described = inspection.drive_as_described
-        judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
-    changed = {} if best.changes is None else {"changes": changes_json(best.changes)}
-    metrics = {**task.about, "verdict": verdict.as_json(), **judgement.metrics, **changed, "seconds": seconds}
-    headlines = judgement.headlines
-    if checked is not None:
-        metrics["check_points"] = checked.figures()
-        headlines = [*headlines, checked.headline]
-        write_check_points(checked, task.folder / "check_points.csv")
-    maps = (config.all_maps, config.export)
-    write_results(task.folder, described, detections, methods, judgement, metrics, verdict, *maps)
-    if config.mosaic:
-        with timed(seconds, "mosaic"):
-            tell = partial(progress, "mosaic")
-            write_mosaic(task.folder, described, device=config.mapping.device, progress=tell)
-    with timed(seconds, "report"):
-        write_page(task.folder, described)
-    return task.result(metrics, headlines, verdict)
-
-
-def _without_map(task: _Task, inspection: Inspection, failure: V2hdmError) -> RunResult:
-    """The result of a run whose checks failed and of which no map came."""
-    failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
-    verdict = Verdict.of([*inspection.findings, failed])
-    metrics = {**task.about, "verdict": verdict.as_json(), "results": {}}
-    write_json(task.folder / "metrics.json", metrics)
-    write_page(task.folder, inspection.drive_as_described)
-    return task.result(metrics, (), verdict)
-
-
-def _drive_folders(config: RunConfig, seconds: dict[str, float], progress: Progress) -> tuple[Path, ...]:
-    if config.simulate is None:
-        if not config.drive.paths:
-            raise ConfigError(NO_DRIVE)
-        return config.drive.paths
-    if config.drive.paths:
-        raise ConfigError(
-            "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
-        )
-    with timed(seconds, "render"):
-        folder = rendered_drive(
-            config.simulate, Path(config.cache), _workers(config), partial(progress, "render")
-        )
-    return (folder,)
-
-
-def _detect(task: _Task, drive: Drive, contents: Contents) -> list[ImageDetections]:
-    tell = partial(task.progress, "detect")
-    workers = _workers(task.config)
-    detections = detect_in_pieces(
-        drive, contents, task.config.detector, task.room, workers, tell, task.detect, task.viewer.detected
+    context = context or Context.of(cache, progress, workers)
+    options, reading = options or MappingOptions(), reading or ReadOptions()
+    settings = detector.options if isinstance(detector, Detector) else detector
+    settings = settings or DetectorOptions.for_mapping()
+    sources = [drive] if isinstance(drive, Source) else list(drive)
+    check_choice(options, len(sources), base is not None)
+    read = read_all(sources, reading, context)
+    earlier, survey = _given(read.whole, options, base)
+    checked = _check(read, reading, context)
+    about = describe_run(name or read.whole.name, read.whole, _paths(sources), reading)
+    unjudged = Result(
+        about, read.drives, read.contents, checked.drive_as_described, context.seconds, options.device
     )
+    try:
+        with closing(context.viewer):
+            detections = _detect(checked.drive, read.contents, settings, context)
+            sets = _associate_and_adjust(checked.drive, read.contents, detections, survey, earlier, context)
+    except (MappingError, AdjustError) as failure:
+        if not checked.has_failed:
+            raise
+        return _without_map(unjudged, checked, failure)
+    return _judge(unjudged, checked, detections, sets, survey, context)
+
+
+def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
+    """Read several drives, each by the executor of ``context``, and join them.
+
+    Raises:
+        DriveError: one cannot be read, or they do not belong together.
+    """
+    executor = context.executor or ALONE
+    with context.timed("read"):
+        begun = [executor.begin(partial(_read_one, one, options)) for one in sources]
+        found = [wait() for wait in begun]
+    for drive, _ in found:
+        _log.info(
+            "drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras)
+        )
+    drives = tuple(drive for drive, _ in found)
+    digests = {path: digest for _, contents in found for path, digest in contents.digests.items()}
+    return Read(drives, join_drives(drives), Contents(digests))
+
+
+def _read_one(source: Source, options: ReadOptions) -> tuple[Drive, Contents]:
+    drive = source if isinstance(source, Drive) else read_drive(Path(source), options)
+    return drive, Contents.of([drive])
+
+
+def _paths(sources: Sequence[Source]) -> list[Path]:
+    return [one.root if isinstance(one, Drive) else Path(one) for one in sources]
+
+
+def _given(drive: Drive, options: MappingOptions, base: Path | str | None) -> tuple[Base | None, Survey]:
+    """The earlier map and the survey: what does not belong to the drive is refused before any long work."""
+    earlier = None if base is None else read_base(Path(base))
+    if earlier is not None:
+        check_together(earlier, drive, str(base))
+    return earlier, take_survey(drive, options)
+
+
+def _check(read: Read, reading: ReadOptions, context: Context) -> Inspection:
+    with context.timed("check"):
+        return join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+
+
+def _detect(
+    drive: Drive, contents: Contents, options: DetectorOptions, context: Context
+) -> list[ImageDetections]:
+    unknown = unknown_network(options.model) if options.model is not None else None
+    if unknown is not None:
+        _log.warning("%s", unknown)
+    with context.timed("detect"):
+        context.viewer.begun(context.folder, drive)
+        detections = detect_in_pieces(drive, contents, options, context, context.detect or detect_images)
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)
-    log.info(
+    _log.info(
         "detected %d markings and %d pieces of lane paint in %d images", markings, lanes, len(detections)
     )
     return detections
 
 
-def _workers(config: RunConfig) -> int:
-    return config.workers or os.cpu_count() or 1
+def _associate_and_adjust(
+    drive: Drive,
+    contents: Contents,
+    detections: Sequence[ImageDetections],
+    survey: Survey,
+    base: Base | None,
+    context: Context,
+) -> dict[str, MappedSet]:
+    with context.timed("map"):
+        return map_camera_sets(drive, contents.key(drive), detections, survey, base, context)
+
+
+def _judge(
+    result: Result,
+    checked: Inspection,
+    detections: Sequence[ImageDetections],
+    sets: dict[str, MappedSet],
+    survey: Survey,
+    context: Context,
+) -> Result:
+    methods = {name: one.methods for name, one in sets.items()}
+    best, compared = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
+    with context.timed("judge"):
+        found = check_result(checked.drive, methods, checked.ground)
+        unfit = check_known_sizes(survey.mapping.known_sizes, best)
+        verdict = Verdict.of([*checked.findings, *found, *unfit, *check_survey(survey, best, compared)])
+    with context.timed("evaluate"):
+        judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
+    figures = {
+        **judgement.metrics,
+        **({} if best.changes is None else {"changes": changes_json(best.changes)}),
+    }
+    figures["seconds"] = context.seconds
+    headlines = tuple(judgement.headlines)
+    if compared is not None:
+        figures["check_points"] = compared.figures()
+        headlines = (*headlines, compared.headline)
+    return replace(
+        result,
+        verdict=verdict,
+        figures=figures,
+        headlines=headlines,
+        detections=tuple(detections),
+        methods=methods,
+        judgement=judgement,
+        check_points=compared,
+    )
+
+
+def _without_map(result: Result, checked: Inspection, failure: V2hdmError) -> Result:
+    """The result of a drive whose checks failed and of which no map came."""
+    failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
+    return replace(result, verdict=Verdict.of([*checked.findings, failed]), figures={"results": {}})

@@ -17,8 +17,8 @@ from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.importers.mirror import mirrored
 from v2hdm.io.texts import take_name
 from v2hdm.pipeline.config import RunConfig, run_name
-from v2hdm.pipeline.context import Progress
 from v2hdm.pipeline.finished import NOTHING_CHANGED, RunResult, finished, is_of, key_of_finished
+from v2hdm.progress import Progress
 from v2hdm.store.cache.codec import CodecError, decode, encode
 from v2hdm.store.cache.keys import key_of
 from v2hdm.store.cache.store import Store

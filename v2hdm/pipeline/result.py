@@ -1,15 +1,10 @@
-"""What a run was made of: the drive, the date, the versions of what computed it.
-
-The adjusted trajectory as files: poses in the format of TUM, and how well they are known.
-
-A run's results as files.
-"""
+"""The result of a mapped drive, and its files."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,7 +13,7 @@ import numpy as np
 
 from v2hdm import __version__
 from v2hdm.detection.batch import read_image
-from v2hdm.errors import MapFileError
+from v2hdm.errors import MapFileError, MappingError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.calibration.document import Provenance, write_calibration
@@ -35,10 +30,14 @@ from v2hdm.io.maps.residuals import FILE as RESIDUALS
 from v2hdm.io.maps.residuals import write_residuals
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
+from v2hdm.pipeline.camera_sets import BEST
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
+from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory, Visit
+from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
-from v2hdm.report.outputs import write_json
+from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.store.cache.keys import library_versions
 from v2hdm.store.files import replace_text
 from v2hdm.verdict import Verdict
@@ -102,61 +101,146 @@ def _recorded(visit: Visit, stamp_s: FloatArray, before: FloatArray) -> FloatArr
 
 _log = logging.getLogger(__name__)
 
-BEST = "Opt"
-"""The method whose map and calibration are the run's result."""
 
+@dataclass(frozen=True)
+class Result:
+    """The map of a drive, its calibrations, trajectory and verdict.
 
-def write_results(
-    folder: Path,
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    sets: CameraSets,
-    judgement: Judgement,
-    metrics: Mapping[str, Any],
-    verdict: Verdict,
-    all_maps: bool = False,
-    formats: Sequence[str] = ("geojson",),
-) -> None:
-    """Write map, calibrations, trajectory, metrics and pictures of a run into ``folder``.
+    Attributes:
+        about: name, date, versions and the drive, as ``metrics.json`` begins.
+        drives: as they were read.
+        contents: digests of their images.
+        drive: what was mapped, several drives as one; its clocks are corrected.
+        seconds: how long each step took, s.
+        device: what torch computed on.
+        verdict: all findings, the worst first; ``verdict.status`` is PASS, WARN or FAIL.
+        figures: those of ``metrics.json`` beside what it begins with.
+        headlines: sentences for a reader.
+        detections: in each image of ``drive``.
+        methods: results by camera set, then by method; those of all cameras come last.
+        judgement: the figures of the evaluation; None where no map was made.
+        check_points: a survey's check points against the map; None without any.
 
-    Args:
-        folder: where to.
-        drive: what was mapped.
-        detections: what was found in its images.
-        sets: results by camera set, then by method; the last set's are the run's result.
-        judgement: its figures.
-        metrics: what goes into ``metrics.json``.
-        verdict: on the run.
-        all_maps: whether to write the map of every method and camera set as well.
-        formats: those of the map, of :data:`v2hdm.io.maps.formats.FORMATS`.
+    >>> saved = result.save(folder / "port")
+    >>> sorted(path.name for path in saved.glob("*.geojson"))
+    ['excluded.geojson', 'map.geojson']
+    >>> result.trajectory.map_from_vehicle.shape[1:], result.trajectory.sigma.shape[1:]
+    ((4, 4), (6,))
     """
-    methods = list(sets.values())[-1]
-    best, told = methods[BEST], verdict.as_json()
-    write_map(_along_route(with_heights(best.hd_map, drive.road), drive), folder, "map", formats, told)
-    about = Provenance.today(drive.name, told)
+
+    about: Mapping[str, Any]
+    drives: tuple[Drive, ...]
+    contents: Contents
+    drive: Drive
+    seconds: dict[str, float]
+    device: str = "cpu"
+    verdict: Verdict = field(default_factory=lambda: Verdict(()))
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    headlines: Sequence[str] = ()
+    detections: Sequence[ImageDetections] = ()
+    methods: CameraSets = field(default_factory=dict)
+    judgement: Judgement | None = None
+    check_points: CheckTable | None = None
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """What ``metrics.json`` holds."""
+        return {**self.about, "verdict": self.verdict.as_json(), **self.figures}
+
+    @property
+    def best(self) -> MethodResult:
+        """The joint optimisation with all cameras.
+
+        Raises:
+            MappingError: no map came of the drive; the verdict says why.
+        """
+        if not self.methods:
+            raise MappingError(f"{self.about['name']}: no map came of this drive; its verdict says why")
+        return list(self.methods.values())[-1][BEST]
+
+    @property
+    def map(self) -> HdMap:
+        """The map, in the frame ``map``: m, its lane lines in the direction in which they were passed."""
+        return _along_route(with_heights(self.best.hd_map, self.drive.road), self.drive)
+
+    @property
+    def calibrations(self) -> Mapping[str, Calibration]:
+        """By camera ``cam_from_vehicle`` (4, 4) and the covariance (6, 6) of its tangent."""
+        return self.best.calibrations
+
+    @property
+    def trajectory(self) -> AdjustedPoses:
+        """``map_from_vehicle`` (F, 4, 4) at the images' times, on the flat road; sigmas (F, 6): m, rad."""
+        poses = self.best.poses
+        assert poses is not None  # of the joint optimisation they always are
+        return poses
+
+    def save(
+        self,
+        folder: Path | str,
+        formats: Sequence[str] = ("geojson",),
+        all_maps: bool = False,
+        mosaic: bool = False,
+    ) -> Path:
+        """Write all that ``v2hdm map`` writes into ``folder``, whole or not at all; returns the folder.
+
+        Args:
+            folder: is made, or has an earlier result, which is replaced; nobody else's file is.
+            formats: of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``.
+            all_maps: whether the map of every method and camera set is written, into ``maps/``.
+            mosaic: whether the ground is shown from above, too.
+
+        Raises:
+            ConfigError: there is something else in the folder, or a format cannot be written.
+        """
+        with result_folder(Path(folder), "folder") as partial:
+            self.write(partial, formats, all_maps, mosaic, Context(seconds=self.seconds))
+        return Path(folder)
+
+    def write(
+        self, folder: Path, formats: Sequence[str], all_maps: bool, mosaic: bool, context: Context
+    ) -> None:
+        """Write what :meth:`save` does into a folder that is still unfinished."""
+        from v2hdm.mosaic.result import write_mosaic
+        from v2hdm.report.page.write import write_page
+
+        if self.judgement is not None:
+            _write_map(folder, self, formats, self.judgement)
+            if all_maps:
+                _write_maps(folder / "maps", self.drive, self.methods)
+        write_json(folder / "metrics.json", self.metrics)
+        if mosaic and self.methods:
+            with context.timed("mosaic"):
+                write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
+        with context.timed("report"):
+            write_page(folder, self.drive)
+
+
+def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: Judgement) -> None:
+    """Write map, calibrations, trajectory and pictures."""
+    drive, best, verdict = result.drive, result.best, result.verdict.as_json()
+    write_map(result.map, folder, "map", formats, verdict)
+    about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)
         clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
         path = folder / f"calibration_{name}.yaml"
-        write_calibration(calibration, path, clock_s=clock_s, verdict=told, about=about)
+        write_calibration(calibration, path, clock_s=clock_s, verdict=verdict, about=about)
         _write_calibration_forms(calibration, about, path)
-    if best.poses is not None:
-        write_trajectories(best.poses, drive, folder)
+    write_trajectories(result.trajectory, drive, folder)
     if best.residuals is not None:
         write_residuals(best.residuals, folder / RESIDUALS)
     if best.changes is not None:
         write_changes(best.changes, best.hd_map, folder, _route(drive))
-    _write_exclusions(folder / "excluded.geojson", drive, sets)
-    if all_maps:
-        _write_maps(folder / "maps", drive, sets)
-    write_json(folder / "metrics.json", metrics)
-    maps = {name: result.hd_map for name, result in methods.items()}
-    route_map = _route(drive)
-    save_birdseye(folder / "birdseye.png", maps, BEST, route_map, judgement.truth)
+    if result.check_points is not None:
+        write_check_points(result.check_points, folder / "check_points.csv")
+    _write_exclusions(folder / "excluded.geojson", drive, result.methods)
+    maps = {name: one.hd_map for name, one in list(result.methods.values())[-1].items()}
+    save_birdseye(folder / "birdseye.png", maps, BEST, _route(drive), judgement.truth)
     if any(judgement.growth.values()):
         save_growth(folder / "growth.png", judgement.growth)
     for name in best.calibrations:
-        image = _fullest_image(drive, name, detections)
+        image = _fullest_image(drive, name, result.detections)
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
 
 
