@@ -10,13 +10,10 @@ from pathlib import Path
 
 from v2hdm.cli.main import parser_of
 
-_ROUGH_MOUNTING = (1.6, 5.0, 60.0)
-
 
 def run(arguments: Sequence[str]) -> None:
     """Detect in every image of a source."""
     parser = parser_of("detect")
-    parser.set_defaults(rough_mounting=_ROUGH_MOUNTING)
     parser.add_argument(
         "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"
     )
@@ -34,9 +31,7 @@ def run(arguments: Sequence[str]) -> None:
         nargs=3,
         metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
         help="without a calibration: about how high the camera is, how far it looks down, its horizontal "
-        "field of view (default: {:g} {:g} {:g}); intrinsics of --camera overrule the last".format(
-            *_ROUGH_MOUNTING
-        ),
+        "field of view (default: 1.6 5 60); intrinsics of --camera overrule the last",
     )
     parser.add_argument(
         "--linear", action="store_true", help="grey values are proportional to light, not sRGB"
@@ -49,6 +44,6 @@ def run(arguments: Sequence[str]) -> None:
         "--draw", type=Path, metavar="DIR", help="folder for the images with detections drawn"
     )
     parsed = parser.parse_args(arguments)
-    from v2hdm.pipeline.detect_images import watch
+    from v2hdm.cli.detect_files import detect_to_files
 
-    watch(parsed)
+    detect_to_files(parsed)

@@ -207,7 +207,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     hd_map = read_geojson(parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map)
     calibrations = trusted_calibrations(parsed.map if parsed.map.is_dir() else parsed.map.parent)
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
-    _check_together(hd_map, calibrations, drive)
+    check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     with result_folder(folder, "--output") as unfinished:
         detections = detect_all(
@@ -240,7 +240,8 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     return explained
 
 
-def _check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
+def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
+    """Refuse a map without markings, without a calibration of the drive's cameras, or of another frame."""
     if not hd_map.markings:
         raise MapFileError("the map has no markings; nothing can be localised in it")
     if not set(drive.cameras) & set(calibrations):

@@ -1,134 +1,148 @@
-"""The detector over a source of images: JSON lines and drawings out, latencies at the end."""
+"""The detector over a source of images: files, a drive, a video or a live camera."""
 
 from __future__ import annotations
 
-import argparse
-import errno
-import json
-import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple, TextIO
 
-import cv2
 import numpy as np
 
 from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.frames import Frame, camera_frames, image_frames, list_images, video_frames
 from v2hdm.detection.horizon import PitchVote
 from v2hdm.detection.image_file import IMAGE_SUFFIXES
-from v2hdm.detection.json_line import as_record
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
-from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, read_drive
 from v2hdm.records import CameraInfo, Drive
-from v2hdm.store.files import forget_stdout, whole_file
-from v2hdm.store.inputs import note_input, refuse_input
-from v2hdm.store.outputs import GrowingFolder, growing_folder
+from v2hdm.store.inputs import note_input
+
+ROUGH_MOUNTING = (1.6, 5.0, 60.0)
+"""Height (m), pitch (deg) and horizontal field of view (deg) of a camera of which nothing is known."""
 
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
 
-_FIRST = b'{"source": '
-"""What every line of detections begins with."""
-
-_STAGES = ("read", "net", "propose", "lanes", "fit", "judge")
+_Frames = Iterator[tuple[Frame, RoadDetector | None]]
+"""Frames to look at, and the detector for each as far as it is known before the first."""
 
 
-class _Job(NamedTuple):
-    """Frames to look at, and the detector for each as far as it is known before the first."""
+@dataclass(frozen=True)
+class Detected:
+    """One image and what it shows: the frame, the camera's name, and markings and lanes on the road."""
 
-    frames: Iterator[tuple[Frame, RoadDetector | None]]
-    live: bool = False
+    frame: Frame
+    camera: str
+    road: Road
 
 
-def watch(parsed: argparse.Namespace) -> None:
-    """Detect in every image of a source.
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What is known of a source's camera, and how many of its images are wanted."""
 
-    A live camera is watched until Ctrl-C; for any other source that is raised on, and no file is written.
+    source: str
+    camera: Path | None
+    camera_name: str | None
+    mounting: Sequence[float] | None
+    linear: bool
+    limit: int | None
+
+
+def detect_images(
+    source: str | Path | int,
+    *,
+    camera: str | Path | None = None,
+    camera_name: str | None = None,
+    mounting: Sequence[float] | None = None,
+    linear: bool = False,
+    detector: Detector | DetectorOptions | None = None,
+    limit: int | None = None,
+    stopwatch: Stopwatch | None = None,
+) -> Iterator[Detected]:
+    """Find markings and lanes in images one after another; the base install is enough.
 
     Args:
-        parsed: the arguments of :mod:`v2hdm.cli.detect`.
+        source: an image, a folder of images, a drive, a video, or the index of a live camera.
+        camera: file of the camera's calibration, which gives metres, or of its intrinsics alone.
+        camera_name: which camera of intrinsics that hold several.
+        mounting: without a calibration, height (m), pitch (deg, down) and horizontal field of view (deg).
+        linear: grey values are proportional to light, not sRGB.
+        detector: the detector, or its settings.
+        limit: stop after so many images.
+        stopwatch: takes the time of each stage.
+
+    Returns:
+        An iterator over the images; corners are (4, 2) px in the image as recorded, the top-left pixel's
+        centre at (0, 0), and (4, 2) m in the frame ``vehicle`` where the camera is calibrated.
 
     Raises:
-        V2hdmError: what a user got wrong.
+        DriveError: the source cannot be read; while iterating, an image.
+        ConfigError: the arguments do not go together.
+        DetectorError: the model cannot be used.
+
+    >>> found = next(detect_images(port.root, limit=1))
+    >>> found.camera, found.frame.pixels.shape
+    ('front', (360, 640, 3))
     """
-    cv2.setNumThreads(1)
-    options = DetectorOptions(model=parsed.model, threads=parsed.threads)
-    lens = _lens(parsed)
-    if parsed.camera is None or lens is not None:
-        options.max_range_m = _ROUGH_RANGE_M
-    detector = Detector.load(options=options)
-    unknown = unknown_network(parsed.model) if parsed.model is not None else None
-    job = _job(parsed, detector, lens)
-    stopwatch = Stopwatch()
-    failure = None
-    with _drawings(parsed.draw) as drawings, _lines(parsed.output) as stream:
-        try:
-            for frame, road, found in _found(job, parsed, detector, lens, stopwatch):
-                print(json.dumps(as_record(frame, road.camera.info.name, found)), file=stream)
-                if job.live:
-                    stream.flush()
-                if drawings is not None:
-                    _draw(drawings, frame, found)
-        except KeyboardInterrupt:
-            if not job.live:
-                raise
-        except DriveError as error:
-            if not (job.live and stopwatch.images):
-                raise
-            failure = error  # hours of a camera that was unplugged are kept
-    _report(stopwatch)
-    if unknown is not None:
-        print(unknown, file=sys.stderr)
-    if failure:
-        raise failure
+    named = None if camera is None else Path(camera)
+    asked = _Asked(
+        source=str(source),
+        camera=named,
+        camera_name=camera_name,
+        mounting=mounting,
+        linear=linear,
+        limit=limit,
+    )
+    lens = _lens(asked)
+    if not isinstance(detector, Detector):
+        options = replace(detector) if detector is not None else DetectorOptions()
+        if camera is None or lens is not None:
+            options.max_range_m = _ROUGH_RANGE_M
+        detector = Detector.load(options=options)
+    return _found(_frames(asked, detector, lens), asked, detector, lens, stopwatch or Stopwatch())
 
 
-def _lens(parsed: argparse.Namespace) -> CameraInfo | None:
+def _lens(asked: _Asked) -> CameraInfo | None:
     """The intrinsics of ``--camera`` where they are all that the file holds, as other tools write it."""
-    if parsed.camera is None:
-        if parsed.camera_name is not None:
+    if asked.camera is None:
+        if asked.camera_name is not None:
             raise ConfigError("--camera-name: names a camera in the file of --camera; add that")
         return None
-    if not is_calibration(parsed.camera):
-        return read_intrinsics(parsed.camera, parsed.camera_name, "--camera-name")
-    if parsed.camera_name is not None:
-        raise ConfigError(f"--camera-name: {parsed.camera} is the calibration of one camera; drop it")
-    if parsed.mounting is not None:
+    if not is_calibration(asked.camera):
+        return read_intrinsics(asked.camera, asked.camera_name, "--camera-name")
+    if asked.camera_name is not None:
+        raise ConfigError(f"--camera-name: {asked.camera} is the calibration of one camera; drop it")
+    if asked.mounting is not None:
         raise ConfigError(
             "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
         )
     return None
 
 
-def _job(parsed: argparse.Namespace, detector: Detector, lens: CameraInfo | None) -> _Job:
-    """What the source is, and which detector its frames want."""
-    if parsed.limit is not None and parsed.limit < 1:
-        raise ConfigError(f"--limit {parsed.limit}: give the number of images to stop after, 1 or more")
+def _frames(asked: _Asked, detector: Detector, lens: CameraInfo | None) -> _Frames:
+    """The frames of whatever the source is."""
+    if asked.limit is not None and asked.limit < 1:
+        raise ConfigError(f"--limit {asked.limit}: give the number of images to stop after, 1 or more")
     road = None
-    if parsed.camera is not None and lens is None:
-        road = RoadDetector.calibrated(detector, parsed.camera, parsed.linear)
-    path = Path(parsed.source)
-    if parsed.source.isdecimal():
+    if asked.camera is not None and lens is None:
+        road = RoadDetector.calibrated(detector, asked.camera, asked.linear)
+    path = Path(asked.source)
+    if asked.source.isdecimal():
         if path.exists():
             raise ConfigError(
                 f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
                 "or start from another folder for the camera"
             )
         info = lens or (road and road.camera.info)
-        frames = camera_frames(int(parsed.source), (info.width, info.height) if info else None)
-        return _Job(((frame, road) for frame in frames), live=True)
+        frames = camera_frames(int(asked.source), (info.width, info.height) if info else None)
+        return ((frame, road) for frame in frames)
     if not path.exists():
         raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
     if path.is_dir():
@@ -136,20 +150,20 @@ def _job(parsed: argparse.Namespace, detector: Detector, lens: CameraInfo | None
         if paths:
             for image in paths:
                 note_input(image)
-            return _Job((frame, road) for frame in image_frames(paths))
+            return ((frame, road) for frame in image_frames(paths))
         if any(reader.accepts(path) for reader in READERS.values()):
-            return _Job(_drive_frames(path, detector, road, lens))
+            return _drive_frames(path, detector, road, lens)
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
     note_input(path)
     if READERS["bag"].accepts(path):
-        return _Job(_drive_frames(path, detector, road, lens))
+        return _drive_frames(path, detector, road, lens)
     frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
-    return _Job((frame, road) for frame in frames)
+    return ((frame, road) for frame in frames)
 
 
 def _drive_frames(
     path: Path, detector: Detector, road: RoadDetector | None, lens: CameraInfo | None
-) -> Iterator[tuple[Frame, RoadDetector]]:
+) -> _Frames:
     """The images of a drive; if a calibration was given, those of its camera."""
     if lens is not None:
         raise ConfigError(
@@ -170,7 +184,7 @@ def _drive_frames(
     return _frames_of(drive, roads)
 
 
-def _frames_of(drive: Drive, roads: Mapping[str, RoadDetector]) -> Iterator[tuple[Frame, RoadDetector]]:
+def _frames_of(drive: Drive, roads: Mapping[str, RoadDetector]) -> _Frames:
     """Each of the images, read when its turn comes, with the detector of its camera."""
     for image in drive.images:
         if image.camera in roads:
@@ -180,14 +194,14 @@ def _frames_of(drive: Drive, roads: Mapping[str, RoadDetector]) -> Iterator[tupl
 
 
 def _found(
-    job: _Job,
-    parsed: argparse.Namespace,
+    all_frames: _Frames,
+    asked: _Asked,
     detector: Detector,
     lens: CameraInfo | None,
     stopwatch: Stopwatch,
-) -> Iterator[tuple[Frame, RoadDetector, Road]]:
+) -> Iterator[Detected]:
     """Every frame with what it shows."""
-    frames = iter(job.frames if parsed.limit is None else islice(job.frames, parsed.limit))
+    frames = islice(all_frames, asked.limit)
     rough: RoadDetector | None = None
     vote = PitchVote()
     while True:
@@ -198,26 +212,26 @@ def _found(
                 stopwatch.discard()
                 return
             if road is None:
-                road = rough = rough or _rough_road(frame, parsed, detector, lens)
+                road = rough = rough or _rough_road(frame, asked, detector, lens)
             _check_size(frame, road)
             found = road.detect(frame.pixels)
-        yield frame, road, found
+        yield Detected(frame, road.camera.info.name, found)
         if road is not rough:
             continue
         pitch_rad = vote.add([lane.image for lane in found.lanes], detector.view(road.camera))
         if pitch_rad is not None:
-            rough = _rough_road(frame, parsed, detector, lens, float(np.rad2deg(pitch_rad)))
+            rough = _rough_road(frame, asked, detector, lens, float(np.rad2deg(pitch_rad)))
 
 
 def _rough_road(
     frame: Frame,
-    parsed: argparse.Namespace,
+    asked: _Asked,
     detector: Detector,
     lens: CameraInfo | None,
     seen_pitch_deg: float | None = None,
 ) -> RoadDetector:
     """A detector for a camera of unknown mounting; it says what it takes that to be."""
-    height_m, pitch_deg, fov_deg = parsed.mounting or parsed.rough_mounting
+    height_m, pitch_deg, fov_deg = asked.mounting or ROUGH_MOUNTING
     if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
         raise ConfigError(
             f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
@@ -232,8 +246,8 @@ def _rough_road(
             file=sys.stderr,
         )
         pitch_deg = seen_pitch_deg
-    elif parsed.mounting is None:
-        known = "no --camera" if lens is None else f"no mounting in {parsed.camera}"
+    elif asked.mounting is None:
+        known = "no --camera" if lens is None else f"no mounting in {asked.camera}"
         print(
             f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide "
             "(--mounting says otherwise); positions in px only",
@@ -244,7 +258,7 @@ def _rough_road(
     calibration = rough_calibration(name, columns, rows, height_m, pitch_deg, fov_deg)
     if lens is not None:
         calibration = replace(calibration, info=lens)
-    return RoadDetector(detector, camera_from_calibration(calibration, parsed.linear))
+    return RoadDetector(detector, camera_from_calibration(calibration, asked.linear))
 
 
 def _check_size(frame: Frame, road: RoadDetector) -> None:
@@ -256,90 +270,3 @@ def _check_size(frame: Frame, road: RoadDetector) -> None:
             f"{frame.source}: the image is {width}x{height}, but {where} of camera '{info.name}' is for "
             f"{info.width}x{info.height}; give images of that size, or the calibration of these"
         )
-
-
-@contextmanager
-def _lines(output: Path | None) -> Iterator[TextIO]:
-    """Where the JSON lines go; a file appears when it is complete."""
-    if output is None:
-        try:
-            yield sys.stdout
-            sys.stdout.flush()
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            forget_stdout()
-            raise DriveError(
-                f"standard output: cannot be written ({error.strerror}); give an --output with room for it"
-            ) from error
-        return
-    try:
-        if output.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        refuse_input(output)
-        if output.is_file() and not _is_ours(output):
-            raise ConfigError(f"{output}: is there already and holds no detections; give another --output")
-        if output.exists() and not output.is_file():  # a pipe, or /dev/null
-            with output.open("w", encoding="utf-8") as stream:
-                yield stream
-            return
-        with whole_file(output) as partial, partial.open("w", encoding="utf-8") as stream:
-            yield stream
-    except OSError as error:
-        raise DriveError(f"{output}: cannot write there ({error.strerror}); give another --output") from error
-
-
-def _is_ours(output: Path) -> bool:
-    """Whether a file holds JSON lines of ours, or nothing."""
-    with output.open("rb") as stream:
-        begin = stream.read(len(_FIRST))
-    return begin in (b"", _FIRST)
-
-
-@contextmanager
-def _drawings(folder: Path | None) -> Iterator[GrowingFolder | None]:
-    """The folder of the drawings, if any are wanted."""
-    if folder is None:
-        yield None
-        return
-    with growing_folder(folder, "--draw") as drawings:
-        yield drawings
-
-
-def _draw(drawings: GrowingFolder, frame: Frame, found: Road) -> None:
-    """Write the frame with its detections drawn, at once or not at all."""
-    drawn = draw_detections(
-        frame.pixels, [marking.image for marking in found.markings], [lane.image for lane in found.lanes]
-    )
-    _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    drawings.write(f"{frame.name}.jpg", packed.tobytes())
-
-
-def _report(stopwatch: Stopwatch) -> None:
-    """How long it took, on stderr."""
-    if not stopwatch.images:
-        print("no images", file=sys.stderr)
-        return
-    print(f"{stopwatch.images} images{_peak_memory()}", file=sys.stderr)
-    print(f"{'latency, ms':12s} {'p50':>7s} {'p90':>7s} {'p99':>7s}", file=sys.stderr)
-    stages = [stage for stage in _STAGES if stage in stopwatch.stages]
-    stages += [stage for stage in stopwatch.stages if stage not in _STAGES]
-    times_s = {stage: stopwatch.times_s(stage) for stage in stages}
-    times_s["other"] = stopwatch.total_s() - sum(times_s.values())
-    times_s["all"] = stopwatch.total_s()
-    for stage, seconds in times_s.items():
-        p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
-        print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)
-
-
-def _peak_memory() -> str:
-    """The most memory that this process ever held, where the operating system counts it."""
-    status = Path("/proc/self/status")
-    if status.is_file():  # getrusage would count what the parent held when it started us
-        peak = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM")), "")
-        return f", peak memory {int(peak.split()[1]) * 1024 / 1e6:.0f} MB" if peak else ""
-    if sys.platform != "darwin":
-        return ""
-    import resource
-
-    return f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.0f} MB"
