@@ -16,6 +16,7 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
+from v2hdm.cli import detect_files as watch
 from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
@@ -25,7 +26,6 @@ from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.io.calibration.document import Provenance
 from v2hdm.io.calibration.formats import write_calibration_as
 from v2hdm.io.maps import write_calibration
-from v2hdm.pipeline import detect_images as watch
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 
 DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]
