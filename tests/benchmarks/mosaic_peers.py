@@ -21,12 +21,12 @@ import numpy as np
 import torch
 
 from v2hdm.detection.image_file import read_bgr
+from v2hdm.io.drive.of_result import drive_of
 from v2hdm.mosaic.blend import whole
 from v2hdm.mosaic.canvas import Canvas
 from v2hdm.mosaic.files import MULTIPLE_PX
 from v2hdm.mosaic.result import RESOLUTION_M, ground_of
 from v2hdm.mosaic.shots import Lens, Shot
-from v2hdm.pipeline.mosaic import drive_of_result
 
 Undistort = Callable[[str, np.ndarray], np.ndarray]
 
@@ -101,7 +101,7 @@ def main() -> None:
     parsed = parser.parse_args()
     torch.set_num_threads(parsed.threads)
     cv2.setNumThreads(parsed.threads)
-    ground = ground_of(parsed.result, drive_of_result(parsed.result), parsed.resolution)
+    ground = ground_of(parsed.result, drive_of(parsed.result, None), parsed.resolution)
     shots, lenses = ground.after[: parsed.images], ground.lenses
     seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in shots])
     canvas = Canvas.around(seen, parsed.resolution, MULTIPLE_PX)

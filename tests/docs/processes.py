@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 LOADED = (
     "torch", "kornia", "scipy.optimize", "hydra", "matplotlib.pyplot", "rasterio", "pyogrio", "ezdxf",
     "v2hdm.cli.compose", "v2hdm.cli.terminal", "v2hdm.verdict.check", "v2hdm.pipeline.detect_images",
-    "v2hdm.pipeline.mosaic", "v2hdm.localization", "v2hdm.calibration", "v2hdm.adjust.kernels",
+    "v2hdm.mosaic.result", "v2hdm.localization", "v2hdm.calibration", "v2hdm.adjust.kernels",
     "rosbags.highlevel",
 )  # fmt: skip
 

@@ -5,10 +5,13 @@ docs/mosaic.md describes it.
 
 from __future__ import annotations
 
+import logging
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.main import parser_of
+from v2hdm.errors import DriveError, MapFileError
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -19,13 +22,41 @@ def run(arguments: Sequence[str]) -> None:
         "--drive", type=Path, help="the drive's folder (default: where it was when it was mapped)"
     )
     parser.add_argument(
-        "--resolution", type=float, metavar="M", help="side of a pixel on the ground (default: 0.02 m)"
+        "--resolution", type=float, metavar="M", default=0.02, help="side of a pixel on the ground (0.02 m)"
     )
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
-    from v2hdm.pipeline.mosaic import mosaic_of_result
+    from v2hdm.io.drive.of_result import drive_of
+    from v2hdm.mosaic.result import write_mosaic
+    from v2hdm.pipeline.config import check_device
+    from v2hdm.store.outputs import added_to
 
-    for line in mosaic_of_result(parsed):
-        print(line)
+    logging.basicConfig(format="%(message)s")
+    check_device(parsed.device)
+    if not parsed.result.is_dir():
+        raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
+    drive = drive_of(parsed.result, parsed.drive)
+    if drive is None:
+        raise DriveError(
+            f"{parsed.result}: its drive is not where it was; give its folder with --drive, or map it anew"
+        )
+    if drive.joined:
+        raise MapFileError(
+            f"{parsed.result} is of several drives; a mosaic shows one: map them one by one for it"
+        )
+    with added_to(parsed.result, "RESULT") as folder:
+        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, _show)["sharpness"]
+    if found["edges"]:
+        print(
+            f"paint edges {100 * found['edge_width_before_m']:.1f} cm wide before, "
+            f"{100 * found['edge_width_after_m']:.1f} cm after the optimisation: "
+            f"{found['after_over_before']:.1f} times as sharp (median of {found['edges']} sides)"
+        )
+    print(f"mosaic in {parsed.result}")
+
+
+def _show(done: int, total: int) -> None:
+    if done == total or done % 200 == 0:
+        print(f"put {done} of {total} images on the ground", file=sys.stderr, flush=True)
