@@ -103,7 +103,9 @@ def lines_of(extras: str) -> list[str]:
 
 
 def _small(line: str) -> str:
-    program, *rest = re.sub(r"^python -m v2hdm\.", "v2hdm ", line).split()
+    program, *rest = line.split()
+    if program == "python":
+        return line
     return " ".join([program, *smaller(rest)])
 
 

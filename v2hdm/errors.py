@@ -1,4 +1,4 @@
-"""What can go wrong, as one small family.
+"""Errors, as one small family.
 
 Every error a user can cause is a :class:`V2hdmError`: its message is one line that says what is
 wrong, where, and what to do about it. Commands print that line and exit with code 2; anything
@@ -47,7 +47,7 @@ EXIT_FAILED_VERDICT = 3
 
 
 def describe(error: BaseException) -> str | None:
-    """What a user reads of an error, in one line; None for what is a bug of ours."""
+    """An error in one line, as a user reads it; None for what is a bug of ours."""
     if isinstance(error, V2hdmError):
         return str(error)
     if isinstance(error, MemoryError):

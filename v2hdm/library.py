@@ -35,7 +35,7 @@ class Calibrated:
 
     @property
     def calibration(self) -> Calibration:
-        """That of the only camera.
+        """The calibration of the only camera.
 
         Raises:
             ValueError: there is none, or several.

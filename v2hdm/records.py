@@ -504,7 +504,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where one camera sits: ``cam_from_vehicle`` (4 x 4).
+    """The calibration of one camera: ``cam_from_vehicle`` (4 x 4) is where it sits.
 
     ``covariance`` (6, 6) is that of the left-perturbation tangent of ``cam_from_vehicle``, in the
     order translation (m), rotation (rad); None where the method has none.
@@ -521,5 +521,5 @@ class Calibration:
 
     @property
     def centre_vehicle(self) -> FloatArray:
-        """Where the camera's centre is (3,) in the frame ``vehicle``: forward, left, up, m."""
+        """The camera's centre (3,) in the frame ``vehicle``: forward, left, up, m."""
         return np.asarray(-self.cam_from_vehicle[:3, :3].T @ self.cam_from_vehicle[:3, 3])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from v2hdm.verdict.movement import Movement
 
 _LEAST = 1e-12
-"""Smaller probabilities are not told apart."""
+"""Smaller probabilities are all the same."""
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -33,8 +33,8 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument("--name", help="what to call the camera (default: as the intrinsics call it)")
     parser.add_argument("--image", type=Path, help="the image that was clicked in, for the picture")
     for option, default, unit, of in (("pixel", 0.5, "PX", "clicking"), ("survey", 0.01, "M", "surveying")):
-        told = _SIGMA.format(of, unit.lower())
-        parser.add_argument(f"--{option}-sigma", type=float, default=default, metavar=unit, help=told)
+        meaning = _SIGMA.format(of, unit.lower())
+        parser.add_argument(f"--{option}-sigma", type=float, default=default, metavar=unit, help=meaning)
     parser.add_argument(
         "--output", type=Path, help="folder for the results (default: outputs/<camera>-calibrate)"
     )

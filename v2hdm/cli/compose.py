@@ -91,7 +91,7 @@ def work_on(
     Raises:
         ConfigError: A key or value is wrong, or Hydra cannot make the output folder.
     """
-    # Hydra prints composition errors its own way and exits with 1 unless told to raise them.
+    # Hydra prints composition errors its own way and exits with 1 unless it is asked to raise them.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     if {"--help", "-h"} & set(arguments):
         from v2hdm.cli.keys_help import help_text
@@ -172,7 +172,7 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
 _OF_COPY = re.compile(r"In 'run/chosen_run_file': \w+ raised while composing config:;? ")
 
 
-class _JobFailed(Exception):  # noqa: N818  # told already: it only carries a code between processes
+class _JobFailed(Exception):  # noqa: N818  # reported already: it only carries a code between processes
     """A job of a sweep did not end well."""
 
     def __init__(self, code: int) -> None:
@@ -185,7 +185,7 @@ _OF_WORK = "while working, after the configuration was composed"
 
 @dataclass
 class _Task:
-    """What Hydra calls with each composed configuration; launchers take it into other processes."""
+    """The work that Hydra calls with each composed configuration; launchers take it into other processes."""
 
     work: Callable[[Job], int | None]
     command: Command
@@ -329,7 +329,7 @@ _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous
 
 
 def _advice(message: str, schema: type[Any]) -> str:
-    """What to do about an error of Hydra."""
+    """Advice on an error of Hydra."""
     if _UNQUOTED.search(message):
         return "a value with signs or letters of its own wants quotes: \"drive.path='müll (1)'\""
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)

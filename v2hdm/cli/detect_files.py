@@ -27,7 +27,7 @@ from v2hdm.store.inputs import refuse_input
 from v2hdm.store.outputs import GrowingFolder, growing_folder
 
 _FIRST = b'{"source": '
-"""What every line of detections begins with."""
+"""The beginning of every line of detections."""
 
 _STAGES = ("read", "net", "propose", "lanes", "fit", "judge")
 
@@ -82,7 +82,7 @@ def detect_to_files(parsed: argparse.Namespace) -> None:
 
 @contextmanager
 def _lines(output: Path | None) -> Iterator[TextIO]:
-    """Where the JSON lines go; a file appears when it is complete."""
+    """The stream of JSON lines; a file appears when it is complete."""
     if output is None:
         try:
             yield sys.stdout

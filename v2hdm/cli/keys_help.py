@@ -79,7 +79,7 @@ def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
 
 
 def meaning_of(schema: type[Any], name: str) -> str:
-    """What the docstring of a dataclass, or of what it extends, says about one of its keys."""
+    """The meaning of a key by the docstring of its dataclass, or of one that this extends."""
     for owner in schema.__mro__:
         text = inspect.cleandoc(owner.__doc__ or "") if "__doc__" in vars(owner) else ""
         prose, _, attributes = text.partition("Attributes:\n")
@@ -121,9 +121,12 @@ def _kind(hint: Any) -> str:
 
 
 def _default(one: Field[Any]) -> str:
-    if one.default is MISSING and one.default_factory is MISSING:
+    if one.default is not MISSING:
+        value = one.default
+    elif one.default_factory is not MISSING:
+        value = one.default_factory()
+    else:
         return "required"
-    value = one.default if one.default is not MISSING else one.default_factory()  # type: ignore[misc]
     if is_dataclass(value) or isinstance(value, dict):
         return ""
     text = str(value.value if isinstance(value, Enum) else value)

@@ -182,7 +182,7 @@ def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
 
 
 def _to_the_end(work: Callable[[], int | None]) -> int:
-    """Do the work and write all that it printed, while it can still be told that nobody reads it."""
+    """Do the work and write all that it printed, while an error of writing can still be reported."""
     try:
         code = work() or 0
     except SystemExit:  # argparse, after --help
@@ -232,7 +232,7 @@ def answer_signals() -> None:
 
 
 def version_line() -> str:
-    """What is installed, in one line: this package, the libraries that count, and the detector's weights.
+    """The versions, in one line: of this package, the libraries that count, and the detector's weights.
 
     Nothing of it is imported: it answers where an install is broken, too.
     """

@@ -68,8 +68,8 @@ def map_camera_sets(
         MappingError: no map can be made.
         AdjustError: the adjustment fails.
     """
-    sets, room, executor = camera_sets(drive), context.cache, context.executor or ALONE
-    begun = room.key(drive_key, list(detections), survey.mapping)
+    sets, cache, executor = camera_sets(drive), context.cache, context.executor or ALONE
+    begun = cache.key(drive_key, list(detections), survey.mapping)
     jobs = []
     for number, (name, cameras) in enumerate(sets.items()):
         last = number == len(sets) - 1
@@ -82,10 +82,10 @@ def map_camera_sets(
         # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
         shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
         begin = partial(executor.begin if shared_out else ALONE.begin, work)
-        jobs.append((room.key(begun, name, cameras, steps, of_last), begin))
+        jobs.append((cache.key(begun, name, cameras, steps, of_last), begin))
     context.progress("map", 0, len(sets))
     found = {}
-    for name, mapped in zip(sets, room.each_made(STAGE, MappedSet, jobs), strict=True):
+    for name, mapped in zip(sets, cache.each_made(STAGE, MappedSet, jobs), strict=True):
         found[name] = mapped
         context.viewer.mapped(name, mapped.methods)
         context.progress("map", len(found), len(sets))
@@ -103,9 +103,9 @@ def _map_set(
     last: bool,
     executor: Crew,
 ) -> MappedSet:
-    tell, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
+    log_step, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
     methods = run_methods(
-        drive, detections, cameras, survey.mapping, tell, growth_steps, base, grey_reader(drive), executor
+        drive, detections, cameras, survey.mapping, log_step, growth_steps, base, grey_reader(drive), executor
     )
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None

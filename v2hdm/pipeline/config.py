@@ -23,7 +23,7 @@ NO_DRIVE = (
 
 @dataclass(kw_only=True)
 class DriveConfig(ReadOptions):
-    """Where the drive is, and how to read it: ``path`` is its folder or bag, None where it is rendered.
+    """The drive and how to read it: ``path`` is its folder or bag, None where it is rendered.
 
     A list of paths are drives through one site, which are mapped together (docs/living-map.md).
     """

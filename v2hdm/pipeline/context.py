@@ -34,7 +34,7 @@ class Viewer(Protocol):
         """Detection in a drive's images has begun; ``folder`` takes what a viewer keeps of the run."""
 
     def detected(self, detections: Sequence[ImageDetections]) -> None:
-        """What was found in some more of its images, in any order."""
+        """Detections in some more of its images, in any order."""
 
     def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
         """The results by method of a set of cameras, ``front`` or ``both``; all cameras come last."""

@@ -45,7 +45,7 @@ class Detected:
 
 @dataclass(frozen=True, kw_only=True)
 class _Asked:
-    """What is known of a source's camera, and how many of its images are wanted."""
+    """A source, what is known of its camera, and how many of its images are wanted."""
 
     source: str
     camera: Path | None

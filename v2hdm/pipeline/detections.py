@@ -50,9 +50,9 @@ def detect_in_pieces(
     Raises:
         V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
     """
-    room, progress, show = context.cache, context.steps("detect"), context.viewer.detected
-    detector_key = room.key(options, model_key(options))
-    masks = room.made(
+    cache, progress, show = context.cache, context.steps("detect"), context.viewer.detected
+    detector_key = cache.key(options, model_key(options))
+    masks = cache.made(
         "own_vehicle",
         key_of(detector_key, contents.key(drive)),
         _Masks,
@@ -61,7 +61,7 @@ def detect_in_pieces(
     )
     drive = with_masks(drive, masks)
     keys = _keys(drive, contents, detector_key)
-    pieces = {start: room.take(STAGE, key, _Piece) for start, key in keys.items()}
+    pieces = {start: cache.take(STAGE, key, _Piece) for start, key in keys.items()}
     missing = [start for start, piece in pieces.items() if piece is None]
     total = len(drive.images)
     todo = [i for start in missing for i in range(start, min(start + PIECE, total))]
@@ -79,7 +79,7 @@ def detect_in_pieces(
         start = found.image - found.image % PIECE
         begun.append(replace(found, image=found.image - start))
         if len(begun) == min(PIECE, total - start):
-            pieces[start] = room.keep(STAGE, keys[start], _Piece, begun)
+            pieces[start] = cache.keep(STAGE, keys[start], _Piece, begun)
             begun.clear()
         progress(total - len(todo) + done, total)
 
@@ -89,7 +89,7 @@ def detect_in_pieces(
 
 
 def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
-    """What is known of the pieces, by their first images, under the drive's numbers of images."""
+    """The known pieces, by their first images, under the drive's numbers of images."""
     return [
         replace(found, image=start + found.image) for start, piece in pieces.items() for found in piece or ()
     ]

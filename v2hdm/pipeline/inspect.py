@@ -55,7 +55,7 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
         drive: as it was read.
         max_gap_s: longest gap between two poses that is interpolated across, s.
         workers: processes to work in.
-        progress: told how many cameras are done, and of how many.
+        progress: called with how many cameras are done, and of how many.
     """
     ground = estimate_cameras(drive, workers, progress)
     findings = tuple(check_drive(drive, ground))

@@ -44,7 +44,7 @@ from v2hdm.verdict import Verdict
 
 
 def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
-    """What ``metrics.json`` begins with: name, version, date (UTC), the drive at ``paths`` as it was read."""
+    """The beginning of ``metrics.json``: name, version, date (UTC), the drive at ``paths`` as it was read."""
     return {
         "name": name,
         "version": __version__,
@@ -144,7 +144,7 @@ class Result:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """What ``metrics.json`` holds."""
+        """The content of ``metrics.json``."""
         return {**self.about, "verdict": self.verdict.as_json(), **self.figures}
 
     @property
@@ -277,7 +277,7 @@ def _write_calibration_forms(calibration: Calibration, about: Provenance, path: 
 
 
 def _write_exclusions(path: Path, drive: Drive, sets: CameraSets) -> None:
-    """What the best method left out, of every camera set."""
+    """Write the candidates that the best method left out, of every camera set."""
     excluded = [
         ExcludedMarking(one.kind, one.position_map, one.sightings, one.reason, name)
         for name, methods in sets.items()
