@@ -6,13 +6,14 @@ They take a drive or its folder, print and write nothing, and return a verdict a
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.io.drive import ReadOptions
 from v2hdm.io.drive import read_drive as _read
+from v2hdm.progress import Steps
 from v2hdm.records import Calibration, CameraInfo, Drive, HdMap, ImageDetections
 from v2hdm.verdict import Verdict
 
@@ -21,9 +22,6 @@ if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.localization.run import Localised
     from v2hdm.mapping.options import MappingOptions
     from v2hdm.simulate import PortConfig
-
-Steps = Callable[[int, int], None]
-"""Progress of one task: called with how many steps are done, and of how many."""
 
 
 @dataclass(frozen=True)

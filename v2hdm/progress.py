@@ -14,6 +14,13 @@ _EVERY_S = 10.0
 """Between two lines on one task."""
 
 
+Steps = Callable[[int, int], None]
+"""Progress of one task: called with how many steps are done, and of how many."""
+
+Share = Callable[[float, str], None]
+"""Called with the share of the work that is done, and with what is being done."""
+
+
 class Progress(Protocol):
     """Shows how many steps of a named piece of long work are done, and of how many."""
 
@@ -65,13 +72,10 @@ def progress_bars(console: Console) -> Iterator[Progress]:
 
 
 @contextmanager
-def share_of_work(
-    console: Console, first: str, transient: bool = False
-) -> Iterator[Callable[[float, str], None]]:
+def share_of_work(console: Console, first: str, transient: bool = False) -> Iterator[Share]:
     """One bar over all that is done, which begins with ``first``; it goes away in the end if ``transient``.
 
-    What it yields is called with the share of the work that is done, and with what is being done. In a log
-    there is a line every ten seconds, and one in the end.
+    In a log there is a line every ten seconds, and one in the end.
     """
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bars
@@ -90,7 +94,7 @@ def share_of_work(
         yield lambda share, doing: bar.update(task, completed=share, description=doing)
 
 
-def _share_lines(write: Callable[[str], None]) -> Callable[[float, str], None]:
+def _share_lines(write: Callable[[str], None]) -> Share:
     written_s = -_EVERY_S
 
     def show(share: float, doing: str) -> None:

@@ -18,7 +18,7 @@ from v2hdm.detection import weights
 from v2hdm.detection.markings.evidence import FEATURES
 from v2hdm.detection.markings.judge import SHAPES, TOLD
 from v2hdm.detection.markings.rectified import CHANNELS
-from v2hdm.progress import TellShare
+from v2hdm.progress import Share
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
     order = Order(source=run, into=into, precision="float32", judge_images=100, lane_images=100)
     before = digests(into)
 
-    def killed(gathered: fit_judge.Gathered, tell: TellShare) -> None:
+    def killed(gathered: fit_judge.Gathered, tell: Share) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:

@@ -12,14 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from v2hdm.progress import Progress, silent
+from v2hdm.progress import Progress, Steps, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 
 if TYPE_CHECKING:  # loads torch, which a finished run does without
-    from collections.abc import Callable
-
     from v2hdm.detection.batch import Detect
     from v2hdm.mapping.crew import Crew
     from v2hdm.mapping.results import MethodResult
@@ -94,7 +92,7 @@ class Context:
         """The number of processes to work in."""
         return self.workers or os.cpu_count() or 1
 
-    def steps(self, task: str) -> Callable[[int, int], None]:
+    def steps(self, task: str) -> Steps:
         """The progress of one task: called with how many steps are done, and of how many."""
         return partial(self.progress, task)
 
