@@ -4,6 +4,7 @@
 #   make check   format, lint, types, import contracts
 #   make docs    build the documentation's site into site/
 #   make audit   known weaknesses of the installed packages
+#   make installs  the wheel with one extra at a time: what the documents promise there
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
 
-.PHONY: map test check docs audit clean
+.PHONY: map test check docs audit installs clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
@@ -36,6 +37,9 @@ docs: $(DEV_INSTALLED)
 
 audit: $(DEV_INSTALLED)
 	$(BIN)/python -m tests.audit
+
+installs: $(DEV_INSTALLED)
+	$(BIN)/python -m tests.installs
 
 clean:
 	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -1,39 +1,35 @@
-"""The command ``python -m export checkpoint=CHECKPOINT output=v2hdm/detection/weights/default.onnx``."""
+"""``python -m export checkpoint=CHECKPOINT output=FILE.onnx``: its arguments are Hydra overrides."""
 
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.door import answer_signals, open_door
+from v2hdm.cli.main import Command, answer_signals
 
 if TYPE_CHECKING:
-    from v2hdm.cli.config import Job
+    from v2hdm.cli.compose import Job
 
-_INTERRUPTED = "interrupted; nothing was written"
+_COMMAND = Command("python -m export", "Export a checkpoint of the detector to ONNX.", "train")
 
 
 def main() -> int:
-    """Run the command, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
-    return _settle(_export)
-
-
-_settle = partial(open_door, "export", "train", _INTERRUPTED)
+    """Export; returns the exit code."""
+    return _COMMAND.guard(_export)
 
 
 def _export() -> int:
     from export.config import ExportConfig
-    from v2hdm.cli.config import work_on
+    from v2hdm.cli.compose import work_on
 
-    return work_on("export", ExportConfig, _run, _settle, __doc__ or "")
+    return work_on(_COMMAND, "export", ExportConfig, _run, sys.argv[1:])
 
 
 def _run(job: Job) -> None:
     from export.config import ExportConfig
     from export.console import export
-    from v2hdm.cli.config import to_dataclass
+    from v2hdm.cli.compose import to_dataclass
 
     config = to_dataclass(job.composed, ExportConfig, "`python -m export checkpoint=... output=...`")
     output = Path(config.output)

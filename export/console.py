@@ -10,11 +10,11 @@ from export.config import ExportConfig, Precision, check_export
 from export.manifest import record_network
 from export.onnx_file import export_float, export_int8
 from export.source import Source, read_source
-from v2hdm.progress import TellShare, share_of_work
+from v2hdm.progress import Share, share_of_work
 from v2hdm.store.inputs import note_input, refuse_input
 
 
-def run(config: ExportConfig, tell: TellShare = lambda share, doing: None) -> str:
+def run(config: ExportConfig, tell: Share = lambda share, doing: None) -> str:
     """Export as configured; returns what there is to say about it.
 
     Raises:
@@ -34,7 +34,7 @@ def run(config: ExportConfig, tell: TellShare = lambda share, doing: None) -> st
     return f"{output}: {size_mb:.2f} MB, step {source.label['steps']}, mean IoU {iou:.3f}, {parity}"
 
 
-def _export(source: Source, output: Path, config: ExportConfig, tell: TellShare) -> str:
+def _export(source: Source, output: Path, config: ExportConfig, tell: Share) -> str:
     """Export, and say how near the file is to the network."""
     if config.precision is Precision.float32:
         return f"parity {export_float(source, output, config.opset, config.tolerance):.1e}"

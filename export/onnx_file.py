@@ -25,7 +25,7 @@ from models.marking_net import MULTIPLE
 from train.checkpoint import Checkpoint
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
-from v2hdm.progress import TellShare
+from v2hdm.progress import Share
 from v2hdm.store.files import whole_file
 
 _PARITY_SEED_OFFSET = 1_000_003
@@ -62,7 +62,7 @@ def export_float(source: Source, path: Path, opset: int, tolerance: float) -> fl
     return difference
 
 
-def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell: TellShare) -> Parity:
+def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell: Share) -> Parity:
     """Write a network to an ONNX file that computes with bytes; see :mod:`export.int8`.
 
     Inputs, outputs and label are those of :func:`export_float`.
@@ -156,7 +156,7 @@ def _checked(source: Source, path: Path, opset: int) -> onnx.ModelProto:
     return to_onnx(deepcopy(source.net).fold(), opset)
 
 
-def _images(seed: int, frames: int, tell: TellShare, start: float, share: float) -> list[NDArray[np.uint8]]:
+def _images(seed: int, frames: int, tell: Share, start: float, share: float) -> list[NDArray[np.uint8]]:
     """All that the detector shows its network of some renders."""
     images: list[NDArray[np.uint8]] = []
     for index, seen in enumerate(looks(seed, frames)):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from v2hdm.pipeline import DriveConfig, RunConfig
+from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.simulate.port.drive import rendered_drive

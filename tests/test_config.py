@@ -11,9 +11,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from v2hdm.cli import config
+from v2hdm.cli import compose as config
 from v2hdm.errors import ConfigError
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
 
 RUNS = sorted(path.stem for path in (config.conf_dir() / "run").glob("*.yaml"))
 

@@ -8,8 +8,8 @@ import pytest
 
 from export.config import ExportConfig
 from train.config import TrainConfig
-from v2hdm.cli.config_help import help_text, keys_of
-from v2hdm.pipeline import RunConfig
+from v2hdm.cli.keys_help import help_text, keys_of
+from v2hdm.pipeline.config import RunConfig
 
 
 @pytest.mark.parametrize("schema", [RunConfig, TrainConfig, ExportConfig])
@@ -21,8 +21,8 @@ def test_every_key_is_explained(schema: type) -> None:
 
 
 def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped() -> None:
-    page = help_text("Maps: ``python -m v2hdm.map``.", RunConfig, Path(__file__).parents[1] / "conf")
-    assert "python -m v2hdm.map [key=value ...]" in page
+    page = help_text("v2hdm map", "Maps.", RunConfig, Path(__file__).parents[1] / "conf")
+    assert "v2hdm map [key=value ...]" in page
     assert "mapping.max_range_m (number, 16.0)\n      Observations farther than" in page
     assert "Shipped runs: kitti, port1, port2" in page
     assert all(key.name in page for key in keys_of(RunConfig))

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from export.config import ExportConfig
-from v2hdm.cli.config import Job, work_on
+from v2hdm.cli.compose import Job, work_on
+from v2hdm.cli.main import Command
 from v2hdm.errors import ConfigError
 
+COMMAND = Command("export", "Exports.")
 
-def sweep(monkeypatch: pytest.MonkeyPatch, folder: Path, launcher: str) -> None:
+
+def sweep(folder: Path, launcher: str) -> list[str]:
     if launcher == "joblib":
         pytest.importorskip(
             "hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed"
         )
     line = ("--multirun", "checkpoint=a", "opset=18,19", f"hydra/launcher={launcher}")
     places = (f"output={folder / 'net.onnx'}", f"hydra.sweep.dir={folder}")
-    monkeypatch.setattr(sys, "argv", ["export", *line, *places])
+    return [*line, *places]
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
 def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(
-    launcher: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    launcher: str, tmp_path: Path
 ) -> None:
     def work(job: Job) -> int:
         folder = Path(job.folder(str(tmp_path)))
@@ -33,14 +35,13 @@ def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(
         (folder / "opset").write_text(str(job.composed.opset))
         return 3 if job.composed.opset == 19 else 0
 
-    sweep(monkeypatch, tmp_path, launcher)
-    assert work_on("export", ExportConfig, work, lambda do: do() or 0, "") == 3
+    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path, launcher)) == 3
     written = {path.parent.name: path.read_text() for path in tmp_path.glob("*/opset")}
     assert written == {"0-opset=18": "18", "1-opset=19": "19"}
 
 
 def test_a_job_that_fails_names_itself_and_the_others_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     done: list[int] = []
 
@@ -49,16 +50,6 @@ def test_a_job_that_fails_names_itself_and_the_others_go_on(
             raise ConfigError("not this one")
         done.append(job.composed.opset)
 
-    said: list[str] = []
-
-    def settle(do) -> int:
-        try:
-            return do() or 0
-        except ConfigError as error:
-            said.append(str(error))
-            return 2
-
-    sweep(monkeypatch, tmp_path, "basic")
-    assert work_on("export", ExportConfig, work, settle, "") == 2
+    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path, "basic")) == 2
     assert done == [19]
-    assert said == ["job 0-opset=18: not this one"]
+    assert "error: job 0-opset=18: not this one" in capsys.readouterr().err.splitlines()

@@ -1,38 +1,36 @@
-"""The training command: ``python -m train [key=value ...]``."""
+"""``python -m train [key=value ...]`` trains the detector; its arguments are Hydra overrides."""
 
 from __future__ import annotations
 
 import sys
-from functools import partial
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.door import answer_signals, open_door
+from v2hdm.cli.main import Command, answer_signals
 
 if TYPE_CHECKING:
-    from v2hdm.cli.config import Job
+    from v2hdm.cli.compose import Job
 
-_INTERRUPTED = "interrupted; what was saved until then is kept"
+_COMMAND = Command(
+    "python -m train", "Train the detector.", "train", "interrupted; what was saved until then is kept"
+)
 
 
 def main() -> int:
-    """Run the command, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
-    return _settle(_train)
-
-
-_settle = partial(open_door, "train", "train", _INTERRUPTED)
+    """Train; returns the exit code."""
+    return _COMMAND.guard(_train)
 
 
 def _train() -> int:
     from train.config import TrainConfig
-    from v2hdm.cli.config import work_on
+    from v2hdm.cli.compose import work_on
 
-    return work_on("train", TrainConfig, _run, _settle, __doc__ or "")
+    return work_on(_COMMAND, "train", TrainConfig, _run, sys.argv[1:])
 
 
 def _run(job: Job) -> None:
     from train.config import TrainConfig
     from train.console import train
-    from v2hdm.cli.config import to_dataclass
+    from v2hdm.cli.compose import to_dataclass
 
     config = to_dataclass(job.composed, TrainConfig, "set it on the command line")
     config.output = job.folder(config.output)

@@ -16,8 +16,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from v2hdm.cli.door import EXIT_USER_ERROR
-from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.errors import EXIT_USER_ERROR, ConfigError, V2hdmError
 
 _T = TypeVar("_T")
 

@@ -1,4 +1,4 @@
-"""The command ``python -m train.ship runs/gpu`` makes a trained network the detector's own.
+"""``python -m train.ship runs/gpu`` makes a trained network the detector's own.
 
 It exports the network, fits the judge, the confidence and the score of lanes to it, and puts all of them with
 their manifest where the detector looks for them. Nothing is put there before everything is done.
@@ -11,15 +11,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.door import answer_signals, open_door
+from v2hdm.cli.main import Command, answer_signals
 
-_INTERRUPTED = "interrupted; the same command goes on from here, and the detector's files are as they were"
+_COMMAND = Command(
+    "python -m train.ship",
+    "Make a trained network the detector's own.",
+    "train",
+    "interrupted; the same command goes on from here, and the detector's files are as they were",
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code is 0, or 2 with one line on stderr for what a user can mend."""
     parsed = _parser().parse_args(arguments)
-    return open_door("train.ship", "train", _INTERRUPTED, lambda: _ship(parsed))
+    return _COMMAND.guard(lambda: _ship(parsed))
 
 
 def _ship(parsed: argparse.Namespace) -> None:

@@ -24,7 +24,7 @@ from train.exported import read_exported
 from train.fit_judge import Gathered
 from v2hdm.detection import weights
 from v2hdm.errors import ConfigError
-from v2hdm.progress import TellShare, share_of_work
+from v2hdm.progress import Share, share_of_work
 from v2hdm.store.files import whole_file
 from v2hdm.workers import share_out
 
@@ -75,7 +75,7 @@ class Order:
         return f"python -m train.ship {self.source} --precision {self.precision} {images}{kept}"
 
 
-def ship(order: Order, tell: TellShare) -> Path:
+def ship(order: Order, tell: Share) -> Path:
     """Export, fit, and put the files in place; returns the folder that they are in.
 
     Raises:
@@ -135,7 +135,7 @@ def _state(order: Order) -> str:
     return digest.hexdigest()[:12]
 
 
-def _export(order: Order, folder: Path, tell: TellShare) -> None:
+def _export(order: Order, folder: Path, tell: Share) -> None:
     """Write the network that runs on the vehicle and, unless it was rounded before, that of float32."""
     network, source = folder / weights.NETWORK_FILE.name, order.network
     if network.is_file():
@@ -149,7 +149,7 @@ def _export(order: Order, folder: Path, tell: TellShare) -> None:
     print(export(config, lambda share, doing: tell(_EXPORTED * share, f"exporting the network: {doing}")))
 
 
-def _fit_judge(order: Order, folder: Path, tell: TellShare) -> None:
+def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
     parts = [
         fit_judge.Part(numbers, order.judge_images, folder / weights.NETWORK_FILE.name, folder / f"{k}.npz")
         for k, numbers in enumerate(_in_parts(order.judge_images))
@@ -174,7 +174,7 @@ def _fit_judge(order: Order, folder: Path, tell: TellShare) -> None:
     fit_judge.write_both(judge, confidence, order.judge_images, folder)
 
 
-def _fit_lane_score(order: Order, folder: Path, tell: TellShare) -> None:
+def _fit_lane_score(order: Order, folder: Path, tell: Share) -> None:
     network = folder / weights.NETWORK_FILE.name
     parts = [
         fit_lane_score.Part(numbers, order.lane_images, network) for numbers in _in_parts(order.lane_images)

@@ -1,72 +1,8 @@
-"""The on-vehicle door: ``python -m v2hdm.detect SOURCE`` finds markings and lanes in images.
+"""``python -m v2hdm.detect`` is ``v2hdm detect``."""
 
-It needs the base install only (numpy, opencv, onnxruntime, PyYAML): no torch, no Hydra. One JSON object
-a line and image; latency percentiles at the end on stderr. docs/detect.md describes both.
-"""
-
-from __future__ import annotations
-
-import argparse
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
-from v2hdm.cli.door import ShowVersion, answer_signals, open_door
-
-_ROUGH_MOUNTING = (1.6, 5.0, 60.0)
-_INTERRUPTED = "interrupted before the last image; no --output was written"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; the exit code is 0, or 2 with one line on stderr for what a user got wrong."""
-    return open_door("v2hdm.detect", None, _INTERRUPTED, lambda: _watch(arguments))
-
-
-def _watch(arguments: Sequence[str] | None) -> None:
-    parsed = _parser().parse_args(arguments)
-    from v2hdm.pipeline.watch import watch
-
-    watch(parsed)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m v2hdm.detect", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--version", action=ShowVersion)
-    parser.set_defaults(rough_mounting=_ROUGH_MOUNTING)
-    parser.add_argument(
-        "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"
-    )
-    parser.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="the camera's calibration: gives metres; or its intrinsics, as written by Kalibr, OpenCV, ROS "
-        "or COLMAP",
-    )
-    parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
-    parser.add_argument(
-        "--mounting",
-        type=float,
-        nargs=3,
-        metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
-        help="without a calibration: about how high the camera is, how far it looks down, its horizontal "
-        "field of view (default: {:g} {:g} {:g}); intrinsics of --camera overrule the last".format(
-            *_ROUGH_MOUNTING
-        ),
-    )
-    parser.add_argument(
-        "--linear", action="store_true", help="grey values are proportional to light, not sRGB"
-    )
-    parser.add_argument("--model", help="ONNX file of the detector (default: the one that is shipped)")
-    parser.add_argument("--threads", type=int, default=1, help="threads of the network (default: 1)")
-    parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
-    parser.add_argument("--output", type=Path, help="file for the JSON lines (default: stdout)")
-    parser.add_argument(
-        "--draw", type=Path, metavar="DIR", help="folder for the images with detections drawn"
-    )
-    return parser
-
+from v2hdm.cli.main import main
 
 if __name__ == "__main__":
-    answer_signals()
-    sys.exit(main())
+    sys.exit(main(["detect", *sys.argv[1:]]))

@@ -1,7 +1,7 @@
-"""What can go wrong, as one small family.
+"""Errors, as one small family.
 
 Every error a user can cause is a :class:`V2hdmError`: its message is one line that says what is
-wrong, where, and what to do about it. The doors print that line and exit with code 2; anything
+wrong, where, and what to do about it. Commands print that line and exit with code 2; anything
 else that is raised is a bug of ours and keeps its traceback.
 """
 
@@ -40,3 +40,25 @@ class AdjustError(V2hdmError):
 
 class LabelError(V2hdmError):
     """Labels to train the detector from are missing, damaged or of a class that is not known."""
+
+
+EXIT_USER_ERROR = 2
+EXIT_FAILED_VERDICT = 3
+
+
+def describe(error: BaseException) -> str | None:
+    """An error in one line, as a user reads it; None for what is a bug of ours."""
+    if isinstance(error, V2hdmError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "the memory is not enough for this; give less at once, or fewer workers"
+    # Disks that are full, gone or read-only can fail any call.
+    if isinstance(error, OSError) and not isinstance(error, ConnectionError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}; free space or check the disk, then start again"
+    return None
+
+
+def one_line(message: str) -> str:
+    """A message whose words come from files of strangers: none ends the line or moves the cursor."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))

@@ -5,44 +5,81 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
+    from rich.console import Console
 
 _EVERY_S = 10.0
 """Between two lines on one task."""
 
-TellShare = Callable[[float, str], None]
-"""Is told what share of the work is done, and what is being done."""
+
+Steps = Callable[[int, int], None]
+"""Progress of one task: called with how many steps are done, and of how many."""
+
+Share = Callable[[float, str], None]
+"""Called with the share of the work that is done, and with what is being done."""
 
 
-class TellSteps(Protocol):
-    """Is told how many steps of a task are done, and of how many."""
+class Progress(Protocol):
+    """Shows how many steps of a named piece of long work are done, and of how many."""
 
     def __call__(self, task: str, done: int, total: int) -> None:
         """``done`` of ``total`` steps of ``task`` are finished."""
 
 
-def progress_lines(write: Callable[[str], None]) -> TellSteps:
+def silent(task: str, done: int, total: int) -> None:
+    """A :class:`Progress` that shows nothing."""
+
+
+def progress_lines(write: Callable[[str], None]) -> Progress:
     """For a log: a line when a task begins and when it ends, and every ten seconds between."""
-    told_s: dict[str, float] = {}
+    written_s: dict[str, float] = {}
 
     def advance(task: str, done: int, total: int) -> None:
         now_s = time.monotonic()
-        if task not in told_s or done == total or now_s - told_s[task] >= _EVERY_S:
-            told_s[task] = now_s
+        if task not in written_s or done == total or now_s - written_s[task] >= _EVERY_S:
+            written_s[task] = now_s
             write(f"{task}: {done} of {total}")
 
     return advance
 
 
 @contextmanager
-def share_of_work(console: Console, first: str, transient: bool = False) -> Iterator[TellShare]:
+def progress_bars(console: Console) -> Iterator[Progress]:
+    """A bar per task, made the first time that a task reports; lines where there is no terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    if not console.is_terminal:
+        yield progress_lines(console.print)
+        return
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(40),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Bars(*columns, console=console) as bars:
+        tasks = {}
+
+        def advance(task: str, done: int, total: int) -> None:
+            if task not in tasks:
+                tasks[task] = bars.add_task(task, total=total)
+            bars.update(tasks[task], completed=done, total=total)
+
+        yield advance
+
+
+@contextmanager
+def share_of_work(console: Console, first: str, transient: bool = False) -> Iterator[Share]:
     """One bar over all that is done, which begins with ``first``; it goes away in the end if ``transient``.
 
     In a log there is a line every ten seconds, and one in the end.
     """
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
     if not console.is_terminal:
         yield _share_lines(lambda line: console.print(line, highlight=False, markup=False, soft_wrap=True))
         return
@@ -52,19 +89,19 @@ def share_of_work(console: Console, first: str, transient: bool = False) -> Iter
         TimeElapsedColumn(),
         TextColumn("{task.description}"),
     )
-    with Progress(*columns, console=console, transient=transient) as bar:
+    with Bars(*columns, console=console, transient=transient) as bar:
         task = bar.add_task(first, total=1.0)
         yield lambda share, doing: bar.update(task, completed=share, description=doing)
 
 
-def _share_lines(write: Callable[[str], None]) -> TellShare:
-    told_s = -_EVERY_S
+def _share_lines(write: Callable[[str], None]) -> Share:
+    written_s = -_EVERY_S
 
-    def tell(share: float, doing: str) -> None:
-        nonlocal told_s
+    def show(share: float, doing: str) -> None:
+        nonlocal written_s
         now_s = time.monotonic()
-        if now_s - told_s >= _EVERY_S or share >= 1.0:
-            told_s = now_s
+        if now_s - written_s >= _EVERY_S or share >= 1.0:
+            written_s = now_s
             write(f"{share:4.0%}  {doing}")
 
-    return tell
+    return show

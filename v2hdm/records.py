@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -350,6 +351,10 @@ class HdMap:
 
     ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None if
     unknown; ``largest_id`` the largest id ever given, also to what is gone, 0 where it is a feature's.
+
+    >>> marking = result.map.markings[0]
+    >>> marking.corners_map.shape, marking.covariance_m2.shape
+    ((4, 2), (8, 8))
     """
 
     markings: tuple[Marking, ...]
@@ -358,6 +363,53 @@ class HdMap:
     symbols: tuple[Symbol, ...] = ()
     drift_over_m: float | None = None
     largest_id: int = 0
+
+    def to_geodataframe(self) -> Any:
+        """The features as a ``geopandas.GeoDataFrame``, a row each: id, layer, kind, sightings, geometry.
+
+        Geometries are longitude, latitude and ellipsoidal height, m (EPSG:4326), where the map has an origin,
+        and metres of the frame ``map`` otherwise.
+
+        Raises:
+            ModuleNotFoundError: geopandas is not installed; the message names the extra.
+
+        >>> frame = result.map.to_geodataframe()
+        >>> len(frame) == len(result.map.markings) + len(result.map.lanes) + len(result.map.symbols)
+        True
+        """
+        try:
+            import geopandas
+            import pyproj
+            import shapely
+        except ModuleNotFoundError as missing:
+            what = "to_geodataframe needs geopandas: install the gis extra, pip install 'v2hdm[gis]'"
+            raise ModuleNotFoundError(what, name=missing.name) from None
+        layers = (("marking", self.markings), ("lane", self.lanes), ("symbol", self.symbols))
+        rows = []
+        for layer, features in layers:
+            for one in features:
+                points = getattr(one, _POINTS[type(one)])
+                heights_m = np.zeros(len(points)) if one.heights_m is None else one.heights_m
+                shape = (shapely.LineString if layer == "lane" else shapely.Polygon)(
+                    np.column_stack([points, heights_m])
+                )
+                rows.append((one.id, layer, one.kind, one.sightings, shape))
+        columns = ["id", "layer", "kind", "sightings", "geometry"]
+        frame = geopandas.GeoDataFrame(rows, columns=columns, geometry="geometry")
+        if self.origin is None:
+            return frame
+        at = f"+lon_0={self.origin.longitude_deg!r} +lat_0={self.origin.latitude_deg!r}"
+        on_earth = pyproj.Transformer.from_pipeline(
+            f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {at} +h_0={self.origin.altitude_m!r} "
+            "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        )
+        geometry = shapely.transform(
+            frame.geometry.values, lambda xyz: np.column_stack(on_earth.transform(*xyz.T)), include_z=True
+        )
+        return frame.set_geometry(geometry, crs="EPSG:4326")
+
+
+_POINTS = {Marking: "corners_map", Lane: "points_map", Symbol: "outline_map"}
 
 
 class Fate(Enum):
@@ -431,12 +483,22 @@ class Truth:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where one camera sits: ``cam_from_vehicle`` (4 x 4).
+    """The calibration of one camera: ``cam_from_vehicle`` (4 x 4) is where it sits.
 
     ``covariance`` (6, 6) is that of its left-perturbation tangent, translation (m) then rotation (rad); None
     if unknown.
+
+    >>> calibration = result.calibrations["front"]
+    >>> sigma = np.sqrt(np.diag(calibration.covariance))
+    >>> bool(sigma[:3].max() < 0.1 and np.rad2deg(sigma[3:].max()) < 0.5)
+    True
     """
 
     info: CameraInfo
     cam_from_vehicle: FloatArray
     covariance: FloatArray | None = None
+
+    @property
+    def centre_vehicle(self) -> FloatArray:
+        """The camera's centre (3,) in the frame ``vehicle``: forward, left, up, m."""
+        return np.asarray(-self.cam_from_vehicle[:3, :3].T @ self.cam_from_vehicle[:3, 3])

@@ -1,4 +1,4 @@
-"""One check for the settings of all doors: every number is finite and within its range.
+"""One check for the settings of all commands: every number is finite and within its range.
 
 Ranges stand beside the dataclasses that they are of, by the keys that users write. A key in a list or a
 mapping shares the range of the list.

@@ -18,8 +18,8 @@ from hydra import compose, initialize_config_dir
 from tests.adjust.scene import Scene, make_scene
 from tests.benchmarks.adjust_accuracy import PLAIN, root_mean_cm, squared_bound_m2
 from v2hdm.adjust import Drift, PoseSigma, solve
-from v2hdm.cli import config
-from v2hdm.pipeline import RunConfig
+from v2hdm.cli import compose as config
+from v2hdm.pipeline.config import RunConfig
 from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.build import cam_from_vehicle
 from v2hdm.simulate.port.route import pose_noise

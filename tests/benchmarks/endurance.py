@@ -17,29 +17,20 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
+from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import read_drive
-from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline.camera_sets import map_camera_sets
 from v2hdm.pipeline.config import DriveConfig
-from v2hdm.pipeline.detections import detect_in_pieces
-from v2hdm.pipeline.evaluate import evaluate
-from v2hdm.pipeline.inspect import inspect
-from v2hdm.pipeline.keys import Contents
-from v2hdm.pipeline.survey import take_survey
-from v2hdm.pipeline.telling import silent
-from v2hdm.pipeline.viewer import Unwatched
-from v2hdm.pipeline.write import write_results
-from v2hdm.store.cache import StageCache
-from v2hdm.verdict import Verdict
-from v2hdm.verdict.results.solution import check_result
+from v2hdm.pipeline.context import Context
+from v2hdm.pipeline.map_drive import map_drive
+from v2hdm.records import Drive
 
 _FIRST = 0.1
 """Share of the whole after which memory must not grow."""
@@ -85,32 +76,19 @@ def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
 def mapping(drive: Path, images: int, cameras: tuple[str, ...]) -> Iterator[Sample]:
     """Samples of this process while it maps one drive again and again, after each round."""
     read = read_drive(drive, DriveConfig(cameras=list(cameras)))
-    contents, options = Contents.of([read]), MappingOptions()
-    tell = partial(silent, "detect")
+    found = detect_all(read, DetectorOptions(), os.cpu_count() or 1)
+
+    def replay(
+        drive: Drive, options: DetectorOptions, images: Sequence[int], workers: int, take: Any
+    ) -> None:
+        for index in images:
+            take(found[index])
+
     with TemporaryDirectory(prefix="endurance-") as scratch:
-        kept = StageCache(Path(scratch) / "cache")
-        found = detect_in_pieces(read, contents, DetectorOptions(), kept, os.cpu_count() or 1, tell)
-        inspection = inspect(read, 0.5, 1, tell)
-        drive_read, survey = inspection.drive, take_survey(read, options)
         for done in itertools.count(len(read.images), len(read.images)):
-            sets = map_camera_sets(
-                drive_read,
-                contents.key(drive_read),
-                found,
-                survey,
-                None,
-                StageCache(None),
-                silent,
-                Unwatched(),
-            )
-            methods = {name: one.methods for name, one in sets.items()}
-            verdict = Verdict.of(check_result(drive_read, methods, inspection.ground))
-            judged = evaluate(inspection.drive_as_described, found, methods, options, tell)
-            metrics = {**judged.metrics, "verdict": verdict.as_json()}
-            folder = Path(scratch) / "result"
-            folder.mkdir(exist_ok=True)
-            write_results(folder, inspection.drive_as_described, found, methods, judged, metrics, verdict)
-            del sets, methods, judged
+            result = map_drive(read, detector=DetectorOptions(), context=Context(detect=replay, workers=1))
+            result.save(Path(scratch) / "result")
+            del result
             gc.collect()
             yield done, resident_mb(os.getpid()), time.process_time()
             if done >= images:

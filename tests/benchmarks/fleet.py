@@ -34,10 +34,10 @@ from v2hdm.fleet.workers import DetectorActor, detect_by
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.inspect import inspect_each
-from v2hdm.pipeline.keys import read_visits
-from v2hdm.pipeline.telling import silent
-from v2hdm.store.cache import StageCache, key_of
+from v2hdm.pipeline.map_drive import read_all
+from v2hdm.store.cache import key_of
 
 OPTIONS = SolveOptions(coarse=False)
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -119,9 +119,9 @@ def visits(folders: Sequence[Path], repeats: int) -> None:
         crews: dict[str, Crew] = {"here": ALONE, "by tasks": RayCrew(2, str(Path.cwd()))}
         for who, crew in crews.items():
             began = time.perf_counter()
-            drives, contents = read_visits(config, config.drive.paths, crew)
-            max_gap_s = config.drive.max_gap_s
-            found[who] = inspect_each(drives, contents, max_gap_s, StageCache(None), 1, silent, crew)
+            context = Context(workers=1, executor=crew)
+            read = read_all(config.drive.paths, config.drive, context)
+            found[who] = inspect_each(read.drives, read.contents, config.drive.max_gap_s, context)
             wall[who].append(time.perf_counter() - began)
             print(f"  reading and checks {who}: {wall[who][-1]:.2f} s", flush=True)
     here, there = (min(times) for times in wall.values())

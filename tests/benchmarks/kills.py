@@ -25,9 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
-import v2hdm.pipeline.work  # noqa: F401  # loaded once, before any run is forked
+import v2hdm.pipeline.map_drive  # noqa: F401  # loaded once, before any run is forked
 from tests.ports import short_port
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.simulate import render_drive
 from v2hdm.store.pruning import items_of
 

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 
 from v2hdm.detection.frames import read_bgr
+from v2hdm.io.drive.of_result import drive_of
 from v2hdm.mosaic.blend import whole
 from v2hdm.mosaic.result import MULTIPLE_PX, RESOLUTION_M, ground_of
 from v2hdm.mosaic.shots import Canvas, Lens, Shot
-from v2hdm.pipeline.mosaic import drive_of_result
 
 Undistort = Callable[[str, np.ndarray], np.ndarray]
 
@@ -99,7 +99,7 @@ def main() -> None:
     parsed = parser.parse_args()
     torch.set_num_threads(parsed.threads)
     cv2.setNumThreads(parsed.threads)
-    ground = ground_of(parsed.result, drive_of_result(parsed.result), parsed.resolution)
+    ground = ground_of(parsed.result, drive_of(parsed.result, None), parsed.resolution)
     shots, lenses = ground.after[: parsed.images], ground.lenses
     seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in shots])
     canvas = Canvas.around(seen, parsed.resolution, MULTIPLE_PX)

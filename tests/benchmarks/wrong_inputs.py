@@ -26,11 +26,12 @@ from omegaconf import OmegaConf
 from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.poses import poses_faults
-from v2hdm.cli import config as hydra_config
+from v2hdm.cli import compose as hydra_config
 from v2hdm.errors import V2hdmError
 from v2hdm.io.maps import read_geojson
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.report.metrics import marking_metrics
 from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.workers import share_out

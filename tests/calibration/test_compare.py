@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from v2hdm.calibration.compare import FALSE_ALARM, movement
-from v2hdm.cli import calibration as door
+from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import exp
 from v2hdm.io.calibration import write_calibration
@@ -98,7 +98,7 @@ def test_the_door_tells_which_camera_has_moved(tmp_path: Path, capsys: pytest.Ca
         write_calibration(looking_ahead(), tmp_path / folder / "calibration_front.yaml")
         moved = turned(looking_ahead(rear), pitch_deg, 0)
         write_calibration(moved, tmp_path / folder / "calibration_rear.yaml")
-    assert door.main([str(tmp_path / "before"), str(tmp_path / "after")]) == 3
+    assert run(["calibrate", "compare", str(tmp_path / "before"), str(tmp_path / "after")]) == 3
     front, rear_line = capsys.readouterr().out.splitlines()
     assert front.startswith("front: not moved")
     assert rear_line.startswith("rear: MOVED")
@@ -113,12 +113,12 @@ def test_cameras_that_turn_alike_blame_the_heading(
         for name in ("front", "rear"):
             one = turned(looking_ahead(replace(INFO, name=name)), 0, yaw_deg)
             write_calibration(one, tmp_path / folder / f"calibration_{name}.yaml")
-    assert door.main([str(tmp_path / "before"), str(tmp_path / "after")]) == 3
+    assert run(["calibrate", "compare", str(tmp_path / "before"), str(tmp_path / "after")]) == 3
     assert "all cameras have turned alike" in capsys.readouterr().out
 
 
 def test_a_failed_drive_is_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "calibration_front.yaml"
     write_calibration(looking_ahead(), path, verdict={"status": "FAIL"})
-    assert door.main([str(path), str(path)]) == 2
+    assert run(["calibrate", "compare", str(path), str(path)]) == 2
     assert "verdict on its drive is FAIL" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""``python -m v2hdm.cli.calibrate``: other doors take what it writes, and every mistake is one line."""
+"""``v2hdm calibrate points``: other commands take what it writes, and every mistake is one line."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ import yaml
 from tests.calibration.site import CENTRE, INFO, MATRIX, PLACES, clicked, mounting, project, write_table
 from tests.docs.blocks import blocks, document
 from tests.drive.example import make_drive
-from v2hdm.cli import calibration
-from v2hdm.cli.calibrate import main
+from v2hdm.cli.main import run as run_command
 from v2hdm.detection.camera import camera_from_calibration
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
@@ -36,7 +35,7 @@ def intrinsics(tmp_path: Path) -> Path:
 def run(folder: Path, table: tuple[FloatArray, FloatArray], *arguments: object) -> int:
     path = write_table(folder, *table)
     output = [] if "--output" in arguments else ["--output", str(folder / "out")]
-    return main([str(path), *map(str, arguments), *output])
+    return run_command(["calibrate", "points", str(path), *map(str, arguments), *output])
 
 
 def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(
@@ -110,8 +109,8 @@ def test_two_calibrations_of_one_camera_say_that_it_has_not_moved(
     for name, seed, truth in (("monday", 1, None), ("friday", 2, None), ("knocked", 3, tilted)):
         table = clicked(seed, cam_from_vehicle=truth)
         assert run(tmp_path, table, "--intrinsics", intrinsics, "--output", tmp_path / name) == 0
-    assert calibration.main([str(tmp_path / "monday"), str(tmp_path / "friday")]) == 0
-    assert calibration.main([str(tmp_path / "monday"), str(tmp_path / "knocked")]) == 3
+    assert run_command(["calibrate", "compare", str(tmp_path / "monday"), str(tmp_path / "friday")]) == 0
+    assert run_command(["calibrate", "compare", str(tmp_path / "monday"), str(tmp_path / "knocked")]) == 3
     assert re.search(r"front: MOVED .* pitch \+(0\.9|1\.0)", capsys.readouterr().out)
 
 
@@ -250,7 +249,7 @@ def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, ca
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text(table.text)
     cv2.imwrite("yard.png", np.zeros((720, 1280, 3), np.uint8))
-    assert main(shlex.split(command.text)[3:]) == 0
+    assert run_command(shlex.split(command.text)[1:]) == 0
     shown = capsys.readouterr().out
     quoted = [line.strip() for line in re.findall(r"^    ((?:front:|  ).*)$", text, re.MULTILINE)]
     assert quoted

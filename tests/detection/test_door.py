@@ -16,13 +16,13 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.detect import main
+from v2hdm.cli import detect_files as watch
+from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.road import RoadDetector, draw_detections
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.io.calibration import Provenance, write_calibration, write_calibration_as
-from v2hdm.pipeline import watch
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 
 DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]
@@ -39,7 +39,7 @@ class Bench:
 
     def run(self, source: object, *arguments: object, calibrated: bool = True) -> int:
         camera = ["--camera", str(self.calibration)] if calibrated else []
-        return main([str(source), "--model", str(self.model), *camera, *map(str, arguments)])
+        return run(["detect", str(source), "--model", str(self.model), *camera, *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from train.examples import Example, example
-from v2hdm.detect import main
+from v2hdm.cli.main import run
 from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.pitch import PitchVote, estimate_pitch, guessed_pitch_rad
@@ -116,7 +116,9 @@ def test_a_stream_without_a_calibration_takes_the_pitch_that_its_lines_show(tmp_
     pitch_deg = np.rad2deg(np.arctan((359.5 - horizon_px) / focal_px))
     fov_deg = np.rad2deg(2 * np.arctan(640 / focal_px))
     mounting = [f"{value:.2f}" for value in (HEIGHT_M, pitch_deg + 4, fov_deg)]
-    assert main([str(tmp_path), "--mounting", *mounting, "--output", str(tmp_path / "out.jsonl")]) == 0
+    assert (
+        run(["detect", str(tmp_path), "--mounting", *mounting, "--output", str(tmp_path / "out.jsonl")]) == 0
+    )
     said = [text for text in capsys.readouterr().err.splitlines() if "meet on a horizon" in text]
     assert len(said) == 1
     assert "the lines of 2 " in said[0]

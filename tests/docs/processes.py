@@ -21,8 +21,9 @@ ROOT = Path(__file__).parents[2]
 
 LOADED = (
     "torch", "kornia", "scipy.optimize", "hydra", "matplotlib.pyplot", "rasterio", "pyogrio", "ezdxf",
-    "v2hdm.cli.config", "v2hdm.cli.console", "v2hdm.verdict.check", "v2hdm.pipeline.watch", "v2hdm.pipeline.mosaic", "v2hdm.localization",
-    "v2hdm.calibration", "v2hdm.adjust.engines.numba.engine", "rosbags.highlevel",
+    "v2hdm.cli.compose", "v2hdm.cli.terminal", "v2hdm.verdict.check", "v2hdm.pipeline.detect_images",
+    "v2hdm.mosaic.result", "v2hdm.localization", "v2hdm.calibration", "v2hdm.adjust.engines.numba.engine",
+    "rosbags.highlevel",
 )  # fmt: skip
 
 CLIENT = """#!{python} -IS
@@ -39,11 +40,14 @@ sys.exit(int(told) if told else 70)
 
 @contextlib.contextmanager
 def python_in(folder: Path) -> Iterator[Path]:
-    """A folder for ``PATH`` with the quick ``python``, as long as the context lasts."""
+    """A folder for ``PATH`` with the quick ``python`` and ``v2hdm``, as long as the context lasts."""
     address = str(folder / "socket")
     client = folder / "python"
     client.write_text(CLIENT.format(python=sys.executable, address=address))
     client.chmod(0o755)
+    script = folder / "v2hdm"
+    script.write_text(f'#!/bin/bash\nexec {client} -m v2hdm "$@"\n')
+    script.chmod(0o755)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
     server = subprocess.Popen([sys.executable, __file__, address], env=environment, cwd=folder)
     try:
@@ -113,8 +117,11 @@ def _run(arguments: list[str]) -> None:
         sys.argv = arguments
         runpy.run_path(arguments[0], run_name="__main__")
         return
-    sys.argv = smaller(arguments)[1:]
-    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+    module, *words = arguments[1:]
+    if module.startswith("v2hdm."):  # as v2hdm.map, which a user may write
+        module, words = "v2hdm", [module.removeprefix("v2hdm."), *words]
+    sys.argv = [module, *(smaller(words) if module == "v2hdm" else words)]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

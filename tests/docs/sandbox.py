@@ -37,7 +37,7 @@ def furnish(folder: Path) -> None:
     drive = read_drive(rendered)
     truth = read_truth(drive)
     _lay_out_recording(folder, rendered)
-    _survey_camera(folder, drive, truth)
+    survey_camera(folder, drive, truth)
     shutil.copy(result / "map.geojson", folder)
     write_geopackage(read_geojson(result / "map.geojson"), folder / "map.gpkg")
     shutil.copy(result / "calibration_front.yaml", folder)
@@ -58,7 +58,7 @@ def _lay_out_recording(folder: Path, rendered: Path) -> None:
     shutil.copy(image, folder / "image.jpg")
 
 
-def _survey_camera(folder: Path, drive: Drive, truth: Truth) -> None:
+def survey_camera(folder: Path, drive: Drive, truth: Truth) -> None:
     """``points.csv``: ten places on the ground, and the pixels that show them."""
     info = drive.cameras["front"].info
     rng = np.random.default_rng(3)

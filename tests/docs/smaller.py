@@ -12,14 +12,11 @@ SMALL_PORT = (
 
 
 def smaller(arguments: list[str]) -> list[str]:
-    """The arguments of ``python`` with what makes the command small."""
-    door, given = arguments[1], arguments[2:]
-    if (
-        door in ("v2hdm.cli.check", "v2hdm.cli.extrinsic", "v2hdm.cli.localize")
-        and "--list-topics" not in given
-    ):
+    """The arguments of ``v2hdm`` with what makes the command small."""
+    name, given = arguments[0], arguments[1:]
+    if (name in ("check", "localize") and "--list-topics" not in given) or given[:1] == ["ground"]:
         return [*arguments, "--workers", "1"]
-    if door != "v2hdm.map" or "--cfg=job" in given:
+    if name != "map" or "--cfg=job" in given:
         return arguments
     ports = [one for one in given if one.startswith("+run=port")]
     return [*arguments, *(SMALL_PORT if ports else ()), "workers=1"]

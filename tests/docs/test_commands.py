@@ -1,7 +1,7 @@
 """Every command in the README and in ``docs/`` does what it says, on one small rendered drive.
 
 The blocks of a document run in their order, in a folder of that document's own. What cannot be run here says
-so to its readers, with the reason; then the door that it names must exist and take its arguments.
+so to its readers, with the reason; then the command that it names must exist and take its arguments.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from tests.docs.blocks import ROOT, Block, blocks, document, documents
 from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
+from v2hdm.cli.main import COMMANDS
 from v2hdm.io.maps import read_geojson
 
 RUN_BY = {
-    "docs/calibrate.md": "tests/precalibration/test_door.py",
+    "docs/calibrate.md": "tests/calibration/test_door.py",
     "docs/living-map.md": "tests/pipeline/test_living_map.py",
     "docs/survey.md": "tests/pipeline/test_survey.py",
 }
@@ -34,8 +35,8 @@ SHELL = [block for name in documents() for block in blocks(name, "sh")]
 RUN = [block for block in SHELL if block.not_run_because is None and block.document not in RUN_BY]
 PYTHON = [block for name in documents() for block in blocks(name, "python")]
 NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
-COMPOSED = ("v2hdm.map", "v2hdm.experiment", "train", "export")
-"""Doors whose arguments are checked by composing their configuration."""
+COMPOSED = ("map", "experiment", "train", "export")
+"""Commands whose arguments are checked by composing their configuration."""
 
 FOREIGN = ("export", "pip", "ray", "rerun", "scontrol", "srun")
 """Programs of others that blocks call which are not run here."""
@@ -123,7 +124,7 @@ def test_the_first_block_of_the_readme_makes_a_map_and_a_report(furnished: Path)
 def test_a_documented_block_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
     folder = folder_of(block.document)
     for line in shell(block.text, folder).splitlines():
-        if re.fullmatch(r"[\w./-]+/[\w.-]+", line):  # a door that tells what it has written
+        if re.fullmatch(r"[\w./-]+/[\w.-]+", line):  # a command that reports what it has written
             assert (folder / line).exists(), line
 
 
@@ -140,28 +141,37 @@ def test_the_commands_that_other_tests_run_are_taken_from_the_document(name: str
 
 
 @pytest.mark.parametrize("block", NOT_RUN, ids=named)
-def test_what_is_not_run_names_doors_and_settings_that_are_there(
+def test_what_is_not_run_names_commands_and_settings_that_are_there(
     block: Block, shell: Shell, tmp_path: Path
 ) -> None:
     for line in block.lines:
-        called = re.search(r"(?:python|torchrun\b.*?) -m (.*)", line)
+        called = re.search(r"(?:(?:python|torchrun\b.*?) -m |\b(?=v2hdm ))(.*)", line)
         if called is None:
             program = re.sub(r"^(\w+=(\$\(|\S+ ))+", "", line).split()[0]
             assert program in FOREIGN, line
             continue
         module, *arguments = shlex.split(called.group(1))
+        if module == "v2hdm":
+            words = next(name.split() for name in COMMANDS if " ".join(arguments).startswith(name))
+            module, arguments = f"v2hdm.cli.{'_'.join(words)}", arguments[len(words) :]
         assert importlib.util.find_spec(module) is not None, line
-        if module in COMPOSED:
+        name = module.removeprefix("v2hdm.").removeprefix("cli.")
+        if name in COMPOSED:
             own = ROOT / "docs" / "own-class"
             if "--multirun" in arguments:  # one configuration is composed: the first of a sweep
                 arguments.remove("--multirun")
                 arguments = [re.sub(r"=([^\[{,]+),.*", r"=\1", one) for one in arguments]
             arguments = [one.replace("docs/own-class", str(own)) for one in arguments]
-            assert shell(shlex.join(["python", "-m", module, *arguments, "--cfg=job"]), tmp_path)
+            assert shell(shlex.join([*program_of(module), *arguments, "--cfg=job"]), tmp_path)
         else:
             source = "".join(path.read_text() for path in _sources(module))
             options = [one for one in arguments if one.startswith("--")]
             assert all(f'"{one}"' in source for one in options), line
+
+
+def program_of(module: str) -> list[str]:
+    own = module.startswith("v2hdm.")
+    return ["v2hdm", module.rpartition(".")[2]] if own else ["python", "-m", module]
 
 
 def _sources(module: str) -> list[Path]:
@@ -172,8 +182,10 @@ def _sources(module: str) -> list[Path]:
 @pytest.mark.parametrize("name", documents())
 def test_a_document_names_only_modules_extras_and_targets_that_are_there(name: str) -> None:
     text = document(name)
-    for module in re.findall(r"python -m ([a-z][a-z_0-9.]*[a-z_0-9])\\b", text):
+    for module in re.findall(r"python -m ([a-z][a-z_0-9.]*[a-z_0-9])\b", text):
         assert importlib.util.find_spec(module) is not None, module
+    for name in re.findall(r"(?:`|^)v2hdm (calibrate [a-z]+|[a-z]+)\b", text, re.MULTILINE):
+        assert name in COMMANDS, name
     for listed in re.findall(r"(?:\.|v2hdm|\.whl)\[([a-z, ]+)\]'", text):
         assert {one.strip() for one in listed.split(",")} <= set(EXTRAS), listed
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)

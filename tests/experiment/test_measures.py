@@ -12,7 +12,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from tests.experiment.scene import CALIBRATED, ESTIMATED, TRUE, experiment, plain_map, record
-from v2hdm.cli import config
+from v2hdm.cli.compose import conf_dir, register, to_dataclass
 from v2hdm.errors import ConfigError
 from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Site, jobs
@@ -20,9 +20,9 @@ from v2hdm.experiment.summary import claims, words, write_tables
 
 
 def composed(*overrides: str) -> ExperimentConfig:
-    config.register("experiment", ExperimentConfig)
-    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        return config.to_dataclass(compose("experiment", overrides=list(overrides)), ExperimentConfig, "")
+    register("experiment", ExperimentConfig)
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return to_dataclass(compose("experiment", overrides=list(overrides)), ExperimentConfig, "")
 
 
 def test_both_ports_are_driven_with_every_one_of_five_seeds() -> None:

@@ -28,7 +28,7 @@ from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
 from train.config import TrainConfig
 from train.exported import read_exported
-from v2hdm.cli.config import explain, register
+from v2hdm.cli.compose import explain, register
 from v2hdm.detection.network import METADATA_KEY, Network
 from v2hdm.errors import ConfigError, DetectorError
 

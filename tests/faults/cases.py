@@ -21,7 +21,7 @@ from v2hdm.io.calibration import write_calibration
 from v2hdm.io.maps import write_geojson
 from v2hdm.records import Calibration
 
-CHECK = "v2hdm.cli.check"
+CHECK = "v2hdm check"
 CHECKED = ("drive", "--no-ground", "--workers", "1", "--output", "out")
 
 
@@ -268,13 +268,12 @@ def texts() -> Iterator[Case]:
             # Of intrinsics any tool's file will do.
             either = f"{says}|no intrinsics of a known format" if file.startswith("front") else says
             yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), either)
-        yield Case(
-            f"calibration: {name}", "v2hdm.cli.calibration", ("a.yaml", "a.yaml"), write("a.yaml", text), says
-        )  # fmt: skip
+        both = ("a.yaml", "a.yaml")
+        yield Case(f"calibration: {name}", "v2hdm calibrate compare", both, write("a.yaml", text), says)
     for name, (text, says) in JSON_TEXTS.items():
         yield Case(
             f"map: {name}",
-            "v2hdm.cli.export",
+            "v2hdm export",
             ("map.geojson", "--format", "csv", "--output", "there"),
             write("map.geojson", text),
             says,
@@ -324,7 +323,7 @@ def names() -> Iterator[Case]:
         if isinstance(text, str):
             yield Case(
                 f"class in a map: {name}",
-                "v2hdm.cli.export",
+                "v2hdm export",
                 ("map.geojson", "--format", "csv", "--output", "there"),
                 _map_of_class(text),
                 says,
@@ -351,17 +350,17 @@ def _map_of_class(kind: str) -> Prepare:
 def images() -> Iterator[Case]:
     """Broken images, one by one and in a drive."""
     for name, (data, says) in IMAGES.items():
-        yield Case(f"image: {name}", "v2hdm.detect", ("a.jpg",), write("a.jpg", data), says)
+        yield Case(f"image: {name}", "v2hdm detect", ("a.jpg",), write("a.jpg", data), says)
         yield Case(
             f"image in a drive: {name}", CHECK, CHECKED, drive(write("front/images/000001.jpg", data)), says
         )  # fmt: skip
     yield Case(
-        "image: damaged inside", "v2hdm.detect", ("a.jpg",), write("a.jpg", damaged_inside()), "damaged"
+        "image: damaged inside", "v2hdm detect", ("a.jpg",), write("a.jpg", damaged_inside()), "damaged"
     )
     deep = picture(".png", depth=np.uint16)
-    yield Case("image: 16 bits", "v2hdm.detect", ("a.png",), write("a.png", deep), "16 bits")
-    yield Case("image: a pipe", "v2hdm.detect", ("imgs",), _imgs(pipe("imgs/b.jpg")), "device")
-    yield Case("image: a folder", "v2hdm.detect", ("imgs",), _imgs(folder_instead("imgs/b.jpg")), "folder")
+    yield Case("image: 16 bits", "v2hdm detect", ("a.png",), write("a.png", deep), "16 bits")
+    yield Case("image: a pipe", "v2hdm detect", ("imgs",), _imgs(pipe("imgs/b.jpg")), "device")
+    yield Case("image: a folder", "v2hdm detect", ("imgs",), _imgs(folder_instead("imgs/b.jpg")), "folder")
     turned = with_orientation(picture(), 6)
     yield Case(
         "image in a drive: turned", CHECK, CHECKED, drive(write("front/images/000001.jpg", turned)), "EXIF"
@@ -429,7 +428,7 @@ def _names(key: str, value: object) -> str:
 def outputs() -> Iterator[Case]:
     """Outputs that are inputs, the user's, somebody else's or nowhere."""
     imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
-    detect = "v2hdm.detect"
+    detect = "v2hdm detect"
     yield Case("draw into the source", detect, ("imgs", "--draw", "imgs"), imgs, "no results of ours")
     yield Case("output is the source", detect, ("imgs/a.jpg", "--output", "imgs/a.jpg"), imgs, "inputs")
     yield Case(
@@ -477,11 +476,11 @@ def outputs() -> Iterator[Case]:
         name = f"result on a disk with room for {most} bytes"
         yield Case(name, CHECK, CHECKED, drive(), "cannot be written", disk_bytes=most)
     yield Case(
-        "export onto the map", "v2hdm.cli.export", ("map.geojson", "--format", "geojson"),
+        "export onto the map", "v2hdm export", ("map.geojson", "--format", "geojson"),
         lambda root: write_geojson(make_map(), root / "map.geojson"), "written over",
     )  # fmt: skip
     yield Case(
-        "export onto a link to the map", "v2hdm.cli.export",
+        "export onto a link to the map", "v2hdm export",
         ("map.geojson", "--format", "csv", "--output", "there"), _linked_map, "written over",
     )  # fmt: skip
 
@@ -543,20 +542,20 @@ def arguments() -> Iterator[Case]:
         "imgs --mounting 1.6 5 600": "--mounting",
     }.items():
         imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
-        yield Case(f"detect {line}", "v2hdm.detect", line.split(), imgs, says)
+        yield Case(f"detect {line}", "v2hdm detect", line.split(), imgs, says)
     for line, says in {
         "nowhere nowhere": "nowhere",
         "precious.txt precious.txt": "precious.txt",
         ". .": "no calibration_",
     }.items():
-        yield Case(f"calibration {line}", "v2hdm.cli.calibration", line.split(), _both(), says)
+        yield Case(f"calibration {line}", "v2hdm calibrate compare", line.split(), _both(), says)
     for line, says in {
         "nowhere.geojson --format csv": "nowhere.geojson",
         "precious.txt --format csv": "precious",
         "map.geojson --format pdf": "pdf",
         ". --format csv": "",
     }.items():
-        yield Case(f"export {line}", "v2hdm.cli.export", line.split(), _both(), says)
+        yield Case(f"export {line}", "v2hdm export", line.split(), _both(), says)
 
 
 SETTINGS = {
@@ -661,9 +660,9 @@ def settings() -> Iterator[Case]:
     """Settings of the doors that Hydra configures."""
     for line, says in SETTINGS.items():
         words = (line.strip("'"), "workers=1") if "workers" not in line else (line,)
-        yield Case(f"map {line}", "v2hdm.map", ("drive.path=drive", *words), drive(), says)
+        yield Case(f"map {line}", "v2hdm map", ("drive.path=drive", *words), drive(), says)
     for line, says in SIMULATED.items():
-        yield Case(f"map {line}", "v2hdm.map", ("+run=port2", "workers=1", line), _both(), says)
+        yield Case(f"map {line}", "v2hdm map", ("+run=port2", "workers=1", line), _both(), says)
     for line, says in TRAINING.items():
         end = () if line.startswith(("minutes", "steps")) else ("steps=1",)
         words = (line, *end) if line.startswith("validation") else (line, *end, "validation.images=0")
@@ -681,9 +680,9 @@ def settings() -> Iterator[Case]:
         data = text.encode() if isinstance(text, str) else text
         says = says if "expected" not in says else "mine|list|dict|config"
         yield Case(
-            f"run file: {name}", "v2hdm.map", run, _run_file(header + data), f"{says}|mine.yaml|configuration"
+            f"run file: {name}", "v2hdm map", run, _run_file(header + data), f"{says}|mine.yaml|configuration"
         )
-    yield Case("run file without its header", "v2hdm.map", run, _run_file(b"name: x\n"), "@package _global_")
+    yield Case("run file without its header", "v2hdm map", run, _run_file(b"name: x\n"), "@package _global_")
 
 
 def _run_file(data: bytes) -> Prepare:

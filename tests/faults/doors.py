@@ -101,7 +101,7 @@ class Doors:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             # Through a process of its own, which may take as long as numba needs to compile.
-            command = [sys.executable, "-m", "v2hdm.map", *map_arguments(self.drive)]
+            command = [sys.executable, "-m", "v2hdm map", *map_arguments(self.drive)]
             ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
             assert ended.returncode in (0, 3), ended.stderr
             folder.replace(self._made)
@@ -118,43 +118,43 @@ class Doors:
     def _maps(self) -> Iterator[Situation]:
         done = self.given("cache", "out/run")
         arguments = map_arguments(self.drive, "all_maps=true", f"export=[{_FORMATS}]")
-        yield Situation(Case("map again, all files", "v2hdm.map", arguments, done, ""))
+        yield Situation(Case("map again, all files", "v2hdm map", arguments, done, ""))
         yield Situation(
-            Case("map with a mosaic", "v2hdm.map", (*map_arguments(self.drive), "mosaic=true"), done, "")
+            Case("map with a mosaic", "v2hdm map", (*map_arguments(self.drive), "mosaic=true"), done, "")
         )
-        yield Situation(Case("map", "v2hdm.map", map_arguments(self.drive), self.given(), ""))
+        yield Situation(Case("map", "v2hdm map", map_arguments(self.drive), self.given(), ""))
         update = (*map_arguments(self.drive), "map.base=base/out/run", "name=update")
         given = _Given(self.mapped(), ("cache", "out/run"), ("out/run", "base/out/run"))
-        yield Situation(Case("update", "v2hdm.map", update, given, ""))
+        yield Situation(Case("update", "v2hdm map", update, given, ""))
 
     def _of_drives(self) -> Iterator[Situation]:
         common = (str(self.drive), "--workers", "1", "--output", "out")
-        yield Situation(Case("check", "v2hdm.cli.check", common, self.given(), ""))
-        yield Situation(Case("extrinsic", "v2hdm.cli.extrinsic", common, self.given(), ""))
+        yield Situation(Case("check", "v2hdm check", common, self.given(), ""))
+        yield Situation(Case("extrinsic", "v2hdm calibrate ground", common, self.given(), ""))
         localised = ("out/run", str(self.drive), "--workers", "1", "--output", "where")
-        yield Situation(Case("localize", "v2hdm.cli.localize", localised, self.given("out/run"), ""))
+        yield Situation(Case("localize", "v2hdm localize", localised, self.given("out/run"), ""))
         port = f"+ports={{small: {{drive: {{path: {self.drive}}}}}}}"
         only = ("~run@ports.port1", "~run@ports.port2", "recipes=[ours]")
         experiment = (port, *only, "workers=1", "output=out", "cache=cache")
         yield Situation(
-            Case("experiment", "v2hdm.experiment.__main__", experiment, self.given("cache"), ""), grows=True
+            Case("experiment", "v2hdm experiment", experiment, self.given("cache"), ""), grows=True
         )
 
     def _of_results(self) -> Iterator[Situation]:
         done = self.given("out/run")
-        yield Situation(Case("mosaic", "v2hdm.cli.mosaic", ("out/run",), done, ""), grows=True)
-        yield Situation(Case("report", "v2hdm.report.__main__", ("out/run",), done, ""), grows=True)
+        yield Situation(Case("mosaic", "v2hdm mosaic", ("out/run",), done, ""), grows=True)
+        yield Situation(Case("report", "v2hdm report", ("out/run",), done, ""), grows=True)
         formats = [word for name in _FORMATS.split(",") for word in ("--format", name)]
         given = ("out/run/map.geojson", *formats, "--output", "there")
-        yield Situation(Case("export", "v2hdm.cli.export", given, done, ""), grows=True)
+        yield Situation(Case("export", "v2hdm export", given, done, ""), grows=True)
         forms = ("camera_info", "static_transform", "urdf", "kalibr", "opencv")
         formats = [word for name in forms for word in ("--format", name)]
         given = ("out/run/calibration_front.yaml", *formats, "--output", "there")
-        yield Situation(Case("export a calibration", "v2hdm.cli.export", given, done, ""), grows=True)
+        yield Situation(Case("export a calibration", "v2hdm export", given, done, ""), grows=True)
 
     def _of_files(self) -> Iterator[Situation]:
         detect = ("images", "--limit", "3", "--output", "found.jsonl", "--draw", "drawn")
-        yield Situation(Case("detect", "v2hdm.detect", detect, self.images, ""), grows=True)
+        yield Situation(Case("detect", "v2hdm detect", detect, self.images, ""), grows=True)
         yield calibrating()
         tiny = ("net.widths=[16,16,16,16]", "net.dilations=[1]", "net.separable=true", "net.wide_kinds=false")
         data = (
@@ -193,7 +193,7 @@ class _Given:
 def calibrating() -> Situation:
     """The door to a pre-calibration."""
     words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
-    return Situation(Case("calibrate", "v2hdm.cli.calibrate", words, _points, ""))
+    return Situation(Case("calibrate", "v2hdm calibrate points", words, _points, ""))
 
 
 def _points(root: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
+import inspect
 import io
 import logging
 import os
@@ -25,8 +26,10 @@ from pathlib import Path
 
 import pytest
 
+from v2hdm.cli.main import run as run_command
+
 LONGEST_S = 60
-HYDRA_DOORS = ("v2hdm.map", "v2hdm.experiment.__main__", "train.__main__", "export.__main__")
+HYDRA_DOORS = ("v2hdm map", "v2hdm experiment", "train.__main__", "export.__main__")
 
 Prepare = Callable[[Path], None]
 Ran = tuple[int | str, str, str]
@@ -39,7 +42,7 @@ class Case:
 
     Attributes:
         name: says what is wrong.
-        door: the module whose ``main`` is run.
+        door: the command, or else the module whose ``main`` is run.
         arguments: of its command line.
         prepare: makes the inputs in the folder that the door is run in.
         says: what the line of error has in it, a regular expression.
@@ -118,7 +121,6 @@ class TookTooLongError(BaseException):
 
 def run_here(case: Case) -> Ran:
     """Run the door of a case in this process and in this folder."""
-    module = importlib.import_module(case.door)
     error, output = io.StringIO(), io.StringIO()
     logger = logging.getLogger()
     handlers, level = list(logger.handlers), logger.level
@@ -131,8 +133,12 @@ def run_here(case: Case) -> Ran:
         logger.handlers = []
         with full_disk(case.disk_bytes):
             try:
-                main = module.main
-                code = main() if case.door in HYDRA_DOORS else main(list(case.arguments))
+                program, *words = case.door.split()
+                if words:
+                    code = run_command([*words, *case.arguments])
+                else:
+                    main = importlib.import_module(program).main
+                    code = main(list(case.arguments)) if inspect.signature(main).parameters else main()
             except SystemExit as exit_:
                 code = exit_.code if isinstance(exit_.code, int | str) else 0
             except BaseException as failure:

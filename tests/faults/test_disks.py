@@ -28,7 +28,7 @@ def detecting() -> Situation:
             (root / "images" / name).write_bytes(picture(height=96, width=128))
 
     words = ("images", "--output", "found.jsonl", "--draw", "drawn")
-    return Situation(Case("detect", "v2hdm.detect", words, prepare, ""), grows=True)
+    return Situation(Case("detect", "v2hdm detect", words, prepare, ""), grows=True)
 
 
 @pytest.mark.parametrize(("situation", "places"), [(detecting(), 5), (calibrating(), 1)])

@@ -18,7 +18,6 @@ import pytest
 
 pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
-from v2hdm import pipeline
 from v2hdm.detection import network
 from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
@@ -29,7 +28,8 @@ from v2hdm.fleet.plan import Row, exit_code, plan, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.workers import DetectorActor, ProgressActor, detect_by, map_drive, open_detectors
 from v2hdm.io.drive import read_drive
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
@@ -221,7 +221,7 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
     assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
     (job,) = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"]).jobs
-    alone = pipeline.run(job.config, job.config_yaml).folder
+    alone = run(job.config, job.config_yaml).folder
     for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory.tum"):
         assert (tmp_path / "out" / "good" / name).read_bytes() == (alone / name).read_bytes(), name
 

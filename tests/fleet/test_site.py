@@ -16,12 +16,12 @@ pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 
 from tests.fleet.test_fleet import written
-from v2hdm import pipeline
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.crew import RayCrew
 from v2hdm.fleet.plan import Row, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.workers import map_drive
+from v2hdm.pipeline.run import run
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
@@ -85,7 +85,7 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
     overrides = [*settings, f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}"]
     (job,) = plan_site(files, overrides, "port").jobs
     with one_thread():
-        alone = pipeline.run(job.config, job.config_yaml).folder
+        alone = run(job.config, job.config_yaml).folder
     result = tmp_path / "out" / "port"
     for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory_friday.tum"):
         assert (result / name).read_bytes() == (alone / name).read_bytes(), name

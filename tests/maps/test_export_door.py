@@ -1,4 +1,4 @@
-"""``python -m v2hdm.cli.export``: what goes along, what comes back, and what a user may get wrong."""
+"""``v2hdm export``: what goes along, what comes back, and what a user may get wrong."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ import pytest
 from tests.docs.blocks import ROOT, blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
-from v2hdm.cli import export
+from v2hdm.cli.main import run
 from v2hdm.io.calibration import write_calibration
-from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage_verdict, write_geojson, write_geopackage
+from v2hdm.io.maps import read_geojson, read_geopackage_verdict
+from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.records import Calibration
 
 VERDICT = {"status": "PASS"}
@@ -36,13 +39,13 @@ def test_every_format_of_a_map_is_documented() -> None:
 
 
 def test_the_verdict_goes_along(folder: Path) -> None:
-    assert export.main(["map.geojson", "--format", "gpkg", "--output", "there"]) == 0
+    assert run(["export", "map.geojson", "--format", "gpkg", "--output", "there"]) == 0
     assert read_geopackage_verdict(folder / "there" / "map.gpkg") == VERDICT
 
 
 def test_an_edited_geopackage_becomes_the_geojson_again(folder: Path) -> None:
     before = read_geojson(folder / "map.geojson")
-    assert export.main(["map.gpkg", "--format", "geojson"]) == 0
+    assert run(["export", "map.gpkg", "--format", "geojson"]) == 0
     after = read_geojson(folder / "map.geojson")
     for old, new in zip(before.markings, after.markings, strict=True):
         np.testing.assert_array_equal(new.corners_map, old.corners_map)
@@ -66,7 +69,7 @@ def test_an_edited_geopackage_becomes_the_geojson_again(folder: Path) -> None:
 def test_what_a_user_must_mend_is_one_line(
     folder: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert export.main(arguments) == 2
+    assert run(["export", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert message in error
@@ -75,7 +78,7 @@ def test_what_a_user_must_mend_is_one_line(
 
 def test_without_its_package_a_format_is_one_line_that_names_the_extra(folder: Path) -> None:
     (folder / "pyogrio.py").write_text('raise ModuleNotFoundError("not installed", name="pyogrio")')
-    arguments = [sys.executable, "-m", "v2hdm.cli.export", "map.geojson", "--format", "gpkg"]
+    arguments = [sys.executable, "-m", "v2hdm", "export", "map.geojson", "--format", "gpkg"]
     done = subprocess.run(
         arguments, cwd=folder, env={"PYTHONPATH": f"{folder}:{ROOT}"}, capture_output=True, text=True
     )

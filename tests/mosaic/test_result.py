@@ -14,7 +14,7 @@ import pytest
 import rasterio
 
 from tests.mosaic import scene
-from v2hdm.cli import mosaic
+from v2hdm.cli.main import run
 from v2hdm.geometry.geodetic import geodetic_from_enu
 from v2hdm.io.drive.of_result import METRICS
 from v2hdm.mosaic.blend import Sheet
@@ -31,7 +31,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def told(result: Path) -> dict:
-    assert mosaic.main([str(result)]) == 0
+    assert run(["mosaic", str(result)]) == 0
     return json.loads((result / "mosaic.json").read_text())
 
 
@@ -121,7 +121,7 @@ def test_what_is_no_result_ends_in_one_line(
     folder = tmp_path / "result"
     shutil.copytree(result, folder)
     spoil(folder)
-    assert mosaic.main([str(folder)]) == 2
+    assert run(["mosaic", str(folder)]) == 2
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
@@ -131,7 +131,7 @@ def test_what_is_no_result_ends_in_one_line(
 def test_a_resolution_that_makes_no_mosaic_is_one_line(
     resolution: str, result: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert mosaic.main([str(result), f"--resolution={resolution}"]) == 2
+    assert run(["mosaic", str(result), f"--resolution={resolution}"]) == 2
     assert "resolution of" in capsys.readouterr().err
 
 
@@ -144,7 +144,7 @@ def test_without_rasterio_the_picture_is_made_and_the_extra_is_named(
     folder = tmp_path / "result"
     shutil.copytree(result, folder, ignore=shutil.ignore_patterns("mosaic*"))
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    assert mosaic.main([str(folder), "--resolution=0.05"]) == 0
+    assert run(["mosaic", str(folder), "--resolution=0.05"]) == 0
     assert "pip install 'v2hdm[gis]'" in caplog.text
     assert not (folder / "mosaic.tif").exists()
     assert json.loads((folder / "mosaic.json").read_text())["geotiff"] is None

@@ -12,9 +12,9 @@ import pytest
 from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, finished
-from v2hdm.pipeline.config import run_name
-from v2hdm.pipeline.finished import note_finished, take_or_make
+from v2hdm.pipeline import finished
+from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
+from v2hdm.pipeline.finished import RunResult, note_finished, take_or_make
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
 from v2hdm.store.cache import StageCache, code_key, key_of
 from v2hdm.store.remote import RemoteFolder, download

@@ -15,12 +15,13 @@ import pytest
 
 from tests.docs.blocks import blocks, document
 from tests.mapping.scene import Scene, SceneOptions, make_scene, repainted
-from v2hdm import map as door
+from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.writing import write_drive
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.pipeline import work
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
 
@@ -65,9 +66,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "check_drive", lambda *_: [])
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
         patch.chdir(folder)
-        for command in ("python -m v2hdm.map drive.path=drives/monday name=monday", BOTH, LATER):
-            patch.setattr(sys, "argv", [*shlex.split(command)[2:], "workers=1"])
-            assert door.main() == 0
+        for command in ("v2hdm map drive.path=drives/monday name=monday", BOTH, LATER):
+            assert run(["map", *shlex.split(command)[2:], "workers=1"]) == 0
     return folder / "outputs"
 
 

@@ -18,8 +18,12 @@ from v2hdm.detection import batch
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, work
+from v2hdm.pipeline import detections
 from v2hdm.pipeline import inspect as inspection
+from v2hdm.pipeline import run as running
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.finished import RunResult
+from v2hdm.pipeline.run import run
 from v2hdm.store.pruning import items_of
 
 SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
@@ -74,7 +78,7 @@ def test_another_mapping_setting_needs_no_image_again(site: Path, monkeypatch: p
 def test_with_nothing_changed_the_result_is_taken_as_it_lies(
     site: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(work, "map_drives", refused)
+    monkeypatch.setattr(running, "map_and_save", refused)
     again = run(config(site, "first", workers=2))
     metrics = json.loads((site / "first" / "short" / "metrics.json").read_text())
     assert again.metrics["results"].keys() == metrics["results"].keys()
@@ -84,7 +88,8 @@ def test_with_nothing_changed_the_result_is_taken_as_it_lies(
 
 def test_a_finished_result_is_known_without_torch(site: Path) -> None:
     code = (
-        "import sys; from v2hdm.pipeline import DriveConfig, RunConfig, run\n"
+        "import sys\n"
+        "from v2hdm.pipeline.config import DriveConfig, RunConfig\nfrom v2hdm.pipeline.run import run\n"
         f"run(RunConfig(name='short', drive=DriveConfig(path={str(site / 'drive')!r}), workers=1,"
         f" output={str(site / 'first')!r}, cache={str(site / 'cache')!r}))\n"
         "print('torch' in sys.modules)"
@@ -110,8 +115,8 @@ def test_what_is_missing_or_damaged_is_made_anew(
     made: list[RunResult] = []
     before = (site / "first" / "short" / "map.geojson").read_bytes()
     harm(site / "first" / "short")
-    original = work.map_drives
-    monkeypatch.setattr(work, "map_drives", lambda *given: made.append(original(*given)) or made[-1])
+    original = running.map_and_save
+    monkeypatch.setattr(running, "map_and_save", lambda *given: made.append(original(*given)) or made[-1])
     run(config(site, "first"))
     assert made
     assert (site / "first" / "short" / "map.geojson").read_bytes() == before
@@ -134,15 +139,17 @@ def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(
 
 KILLED = """
 import os, signal, sys
-from v2hdm.pipeline import DriveConfig, RunConfig, detections, run
-original, kept = detections.StageCache.put, []
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
+from v2hdm.store.cache import StageCache
+original, kept = StageCache.put, []
 def put(cache, stage, *rest):
     found = original(cache, stage, *rest)
     kept.append(stage)
     if kept.count("detect") == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return found
-detections.StageCache.put = put
+StageCache.put = put
 drive = DriveConfig(path=sys.argv[1])
 run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], workers=1))
 """

@@ -23,9 +23,9 @@ from v2hdm.io.maps.evidence import read_residuals
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import run
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.run import run
 from v2hdm.records import Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.verdict import Status

@@ -24,7 +24,8 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions, SurveyOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.run import run
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.report.metrics import driven_past
 
@@ -98,7 +99,7 @@ def documented(site: Site) -> tuple[Path, str]:
     (command,) = DOCUMENTED.lines
     settings = ["drive.cameras=[front]", "all_maps=true", "workers=1", "output=outputs", "name=short"]
     done = subprocess.run(
-        [sys.executable, *shlex.split(command)[1:], *settings],
+        [sys.executable, "-m", *shlex.split(command), *settings],
         cwd=site.folder,
         capture_output=True,
         text=True,

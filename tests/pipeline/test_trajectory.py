@@ -9,7 +9,7 @@ import numpy as np
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mapping.results import AdjustedPoses
-from v2hdm.pipeline.trajectory import write_trajectories
+from v2hdm.pipeline.result import write_trajectories
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from tests.simulate.conftest import FRONT, tiny_port
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.cli.config import compose_run_file, conf_dir, to_dataclass
+from v2hdm.cli.compose import compose_run_file, conf_dir, to_dataclass
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
 from v2hdm.simulate import simulate_port
 from v2hdm.simulate.port import drive

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from v2hdm.cli import cache as command
+from v2hdm.cli.main import run
 from v2hdm.store.cache import StageCache, entry_name
 from v2hdm.store.folders import LIST, note_use
 from v2hdm.store.lock import IN_USE, in_use
@@ -145,16 +146,16 @@ def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path: Path) 
 
 
 def test_the_command_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.main(["list", "--cache", str(cache)]) == 0
+    assert run(["cache", "list", "--cache", str(cache)]) == 0
     assert "detect" in capsys.readouterr().out
     path = StageCache(cache).path("detect", KEYS[1])
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert command.main(["verify", "--cache", str(cache)]) == 0
+    assert run(["cache", "verify", "--cache", str(cache)]) == 0
     printed = capsys.readouterr().out
     assert str(path) in printed
     assert "read 4 entries, 1 of them damaged" in printed
     assert not path.exists()
-    assert command.main(["prune", "--cache", str(cache), "--gb", "0"]) == 0
+    assert run(["cache", "prune", "--cache", str(cache), "--gb", "0"]) == 0
     assert "removed 3 entries" in capsys.readouterr().out
     assert not left(cache)
 
@@ -168,7 +169,7 @@ def test_the_command_reports_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(cache.parent)
-    assert command.main(arguments) == 2
+    assert run(["cache", *arguments]) == 2
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from v2hdm.cli.config import Job
+from v2hdm.cli.compose import Job
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import whole_file
 from v2hdm.store.remote import RemoteFolder, place_of

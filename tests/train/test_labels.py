@@ -19,7 +19,7 @@ from train.labels_image import Shape
 from train.labels_raster import coverage
 from train.targets import IGNORE
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.cli.config import register
+from v2hdm.cli.compose import register
 from v2hdm.errors import ConfigError, LabelError
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND
 

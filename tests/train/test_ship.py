@@ -17,7 +17,7 @@ from train.shipment import Order
 from v2hdm.detection import weights
 from v2hdm.detection.classifier import AMONG, SHAPES
 from v2hdm.detection.evidence import CHANNELS, FEATURES
-from v2hdm.progress import TellShare
+from v2hdm.progress import Share
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
     order = Order(source=run, into=into, precision="float32", judge_images=100, lane_images=100)
     before = digests(into)
 
-    def killed(gathered: fit_judge.Gathered, tell: TellShare) -> None:
+    def killed(gathered: fit_judge.Gathered, tell: Share) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:

@@ -21,7 +21,7 @@ from train.config import DataConfig, LossConfig, TrainConfig
 from train.loop import Trainer
 from train.scenes.scenes import TrainingSample
 from train.targets import Targets, targets
-from v2hdm.cli.config import register
+from v2hdm.cli.compose import register
 from v2hdm.errors import ConfigError
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from v2hdm.errors import ConfigError
 from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps import read_geojson
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.context import Context, Unwatched
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.run import run
 from v2hdm.records import ImageDetections
-from v2hdm.store.cache import StageCache
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]
@@ -159,10 +161,11 @@ def test_images_are_shown_as_they_are_looked_at(small_drive: Path, tmp_path: Pat
     drive = read_drive(small_drive, DriveConfig(limit=3))
     shown: list[list[int]] = []
 
-    def show(found: Sequence[ImageDetections]) -> None:
-        shown.append([one.image for one in found])
+    class Watching(Unwatched):
+        def detected(self, detections: Sequence[ImageDetections]) -> None:
+            shown.append([one.image for one in detections])
 
     for _ in range(2):
-        cache = StageCache(tmp_path)
-        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), cache, 1, lambda *_: None, show=show)
+        context = replace(Context.of(tmp_path, workers=1), viewer=Watching())
+        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), context)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

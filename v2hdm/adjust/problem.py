@@ -158,6 +158,10 @@ class Problem:
     distances between corners. ``camera_prior``, if given, is what markings outside this problem say of the
     cameras. ``visit`` (J,), if given, numbers the visit that each frame is of, from 0 and rising; there is
     then one ``pose_sigma`` for all visits or one for each.
+
+    >>> problem = build_problem(port, result.detections)
+    >>> problem.intrinsic.shape, problem.observations.pinhole_px.shape[1:]
+    ((1, 4), (2,))
     """
 
     intrinsic: FloatArray

@@ -36,6 +36,10 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
 
     Raises:
         AdjustError: the problem is malformed; the message names the offending item.
+
+    >>> solution = solve(build_problem(port, result.detections))
+    >>> solution.cam_from_vehicle.shape, solution.corners_map.shape[1:]
+    ((1, 4, 4), (2,))
     """
     began = time.perf_counter()
     options = options or SolveOptions()

@@ -129,5 +129,5 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
         if covariance is None or np.linalg.eigvalsh(covariance).min() <= 0:
             raise MapFileError(
                 f"{who}: the {which} calibration has no covariance, so that no movement can be told from its "
-                "error; take one that python -m v2hdm.map or v2hdm.cli.extrinsic wrote"
+                "error; take one that v2hdm map or v2hdm calibrate ground wrote"
             )

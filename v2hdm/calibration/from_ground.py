@@ -59,7 +59,7 @@ def estimate_mountings(parsed: argparse.Namespace) -> bool:
     """Estimate every camera's mounting, print it with the verdict on the drive, and write it.
 
     Args:
-        parsed: the arguments of :mod:`v2hdm.cli.extrinsic`.
+        parsed: the arguments of :mod:`v2hdm.cli.calibrate_ground`.
 
     Returns:
         Whether the verdict is FAIL.

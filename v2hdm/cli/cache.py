@@ -1,30 +1,33 @@
-"""The cache door: ``python -m v2hdm.cli.cache list`` says what is kept; ``prune`` and ``verify`` mend it."""
+"""``v2hdm cache list`` says what is kept; ``prune`` and ``verify`` mend it (docs/cache.md)."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.door import ShowVersion, answer_signals, open_door
+from v2hdm.cli.main import parser_of
 
 if TYPE_CHECKING:
     from v2hdm.store.pruning import Item
 
-_INTERRUPTED = "interrupted; what was removed so far is made anew when it is needed"
 _GB = 1e9
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; the exit code is 0, or 2 where a user must mend something."""
-    parsed = _parser().parse_args(arguments)
-    return open_door("v2hdm.cli.cache", None, _INTERRUPTED, lambda: _work(parsed))
-
-
-def _work(parsed: argparse.Namespace) -> None:
+def run(arguments: Sequence[str]) -> None:
+    """List, prune or verify a cache."""
+    parser = parser_of("cache")
+    actions = parser.add_subparsers(dest="what", required=True)
+    shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
+    pruned = actions.add_parser(
+        "prune", help="remove what was not used for longest, and what killed runs left"
+    )
+    pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
+    verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
+    for action in (shown, pruned, verified):
+        action.add_argument("--cache", default="cache", help="the folder or URL (default: cache)")
+    parsed = parser.parse_args(arguments)
     from v2hdm.errors import ConfigError
     from v2hdm.store.pruning import items_of, prune, remove_damaged
     from v2hdm.store.remote import place_of
@@ -60,25 +63,3 @@ def _show(items: Sequence[Item], when: str) -> None:
 
 def _size(size: int) -> str:
     return f"{size / _GB:.2f} GB" if size >= _GB else f"{size / 1e6:.1f} MB"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m v2hdm.cli.cache", description="What the cache of runs keeps (docs/cache.md)."
-    )
-    parser.add_argument("--version", action=ShowVersion)
-    actions = parser.add_subparsers(dest="what", required=True)
-    shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
-    pruned = actions.add_parser(
-        "prune", help="remove what was not used for longest, and what killed runs left"
-    )
-    pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
-    verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
-    for action in (shown, pruned, verified):
-        action.add_argument("--cache", default="cache", help="the folder or URL (default: cache)")
-    return parser
-
-
-if __name__ == "__main__":
-    answer_signals()
-    sys.exit(main())

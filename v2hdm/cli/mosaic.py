@@ -1,50 +1,62 @@
-"""The door to the mosaic: ``python -m v2hdm.cli.mosaic RESULT`` shows the ground of a finished run from above.
+"""``v2hdm mosaic RESULT``: the ground from above, as a GeoTIFF and as pictures before and after.
 
-Of all images, with the adjusted poses and calibrations: a GeoTIFF, a picture, and the same ground before and
-after the optimisation side by side. docs/mosaic.md describes it.
+docs/mosaic.md describes it.
 """
 
 from __future__ import annotations
 
-import argparse
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.door import ShowVersion, answer_signals, open_door
-
-_INTERRUPTED = "interrupted; files that stand in the result folder are whole"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; 0, or 2 with one line on stderr for what a user must mend."""
-    parsed = _parser().parse_args(arguments)
-    return open_door("v2hdm.cli.mosaic", "map", _INTERRUPTED, lambda: _mosaic(parsed))
+from v2hdm.cli.main import parser_of
+from v2hdm.errors import DriveError, MapFileError
 
 
-def _mosaic(parsed: argparse.Namespace) -> None:
-    import torch  # noqa: F401  # its absence is told before that of what is built on it
-
-    from v2hdm.pipeline.mosaic import mosaic_of_result
-
-    for line in mosaic_of_result(parsed):
-        print(line)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m v2hdm.cli.mosaic", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--version", action=ShowVersion)
-    parser.add_argument("result", type=Path, help="result folder of v2hdm.map")
+def run(arguments: Sequence[str]) -> None:
+    """Add the mosaic to a result."""
+    parser = parser_of("mosaic")
+    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
     parser.add_argument(
         "--drive", type=Path, help="the drive's folder (default: where it was when it was mapped)"
     )
     parser.add_argument(
-        "--resolution", type=float, metavar="M", help="side of a pixel on the ground (default: 0.02 m)"
+        "--resolution", type=float, metavar="M", default=0.02, help="side of a pixel on the ground (0.02 m)"
     )
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
-    return parser
+    parsed = parser.parse_args(arguments)
+    import torch  # noqa: F401  # its absence is reported before that of what is built on it
+
+    from v2hdm.io.drive.of_result import drive_of
+    from v2hdm.mosaic.result import write_mosaic
+    from v2hdm.pipeline.config import check_device
+    from v2hdm.store.results import added_to
+
+    logging.basicConfig(format="%(message)s")
+    check_device(parsed.device)
+    if not parsed.result.is_dir():
+        raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
+    drive = drive_of(parsed.result, parsed.drive)
+    if drive is None:
+        raise DriveError(
+            f"{parsed.result}: its drive is not where it was; give its folder with --drive, or map it anew"
+        )
+    if drive.joined:
+        raise MapFileError(
+            f"{parsed.result} is of several drives; a mosaic shows one: map them one by one for it"
+        )
+    with added_to(parsed.result, "RESULT") as folder:
+        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, _show)["sharpness"]
+    if found["edges"]:
+        print(
+            f"paint edges {100 * found['edge_width_before_m']:.1f} cm wide before, "
+            f"{100 * found['edge_width_after_m']:.1f} cm after the optimisation: "
+            f"{found['after_over_before']:.1f} times as sharp (median of {found['edges']} sides)"
+        )
+    print(f"mosaic in {parsed.result}")
 
 
-if __name__ == "__main__":
-    answer_signals()
-    sys.exit(main())
+def _show(done: int, total: int) -> None:
+    if done == total or done % 200 == 0:
+        print(f"put {done} of {total} images on the ground", file=sys.stderr, flush=True)

@@ -31,6 +31,11 @@ class Detector:
     """Finds markings and lanes in single images.
 
     A detector holds an onnxruntime session and per-camera tables; use one per process.
+
+    >>> detector = Detector.load()
+    >>> markings, lanes = detector.detect(cv2.imread(str(port.images[6].path)), port.cameras["front"])
+    >>> markings[0].corners_px.shape, markings[0].covariance_px.shape
+    ((4, 2), (8, 8))
     """
 
     def __init__(self, network: Network, options: DetectorOptions, catalogue: Catalogue | None = None):

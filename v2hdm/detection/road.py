@@ -124,7 +124,7 @@ class RoadDetector:
         options: DetectorOptions | None = None,
         linear_response: bool = False,
     ) -> RoadDetector:
-        """A detector for the camera of a calibration YAML that ``python -m v2hdm.map`` wrote.
+        """A detector for the camera of a calibration YAML that ``v2hdm map`` wrote.
 
         ``model`` is an ONNX file, None the shipped one; ``linear_response`` says that grey values are
         proportional to radiance, not sRGB-coded.

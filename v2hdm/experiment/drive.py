@@ -11,7 +11,7 @@ import gzip
 import json
 import shutil
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -28,9 +28,11 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.camera_sets import camera_sets
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.inspect import Inspection, inspect_each
 from v2hdm.pipeline.keys import Contents, model_key
+from v2hdm.progress import Progress
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_metrics, growth_figures
 from v2hdm.simulate import rendered_drive, surveyed_cameras
@@ -56,9 +58,6 @@ def stored(path: Path, key: str) -> dict[str, Any] | None:
         return None
     return content
 
-
-Progress = Callable[[str, int, int], None]
-"""Called with a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
 
@@ -139,12 +138,10 @@ def _find(job: Job, workers: int, progress: Progress) -> None:
     truth = read_truth(drive)
     store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
     cache, contents = StageCache(job.cache), Contents.of([drive])
-    max_gap_s = job.site.drive.max_gap_s
+    context = Context(cache, progress, workers=workers)
     with cache.in_use():
-        (inspection,) = inspect_each([drive], contents, max_gap_s, cache, workers, progress)
-        detections = detect_in_pieces(
-            inspection.drive, contents, job.detector, cache, workers, partial(progress, "detect")
-        )
+        (inspection,) = inspect_each([drive], contents, job.site.drive.max_gap_s, context)
+        detections = detect_in_pieces(inspection.drive, contents, job.detector, context)
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
         if stored(path, key) is None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from v2hdm.errors import ConfigError
 from v2hdm.extras import need
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
 
 LOCAL = "local"
 """The address of a Ray of our own on this machine."""

@@ -14,12 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from rich.text import Text
 
-from v2hdm.cli.config import compose_run_file, to_dataclass, to_yaml
-from v2hdm.cli.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
-from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.cli.compose import compose_run_file, to_dataclass, to_yaml
+from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, ConfigError, V2hdmError, one_line
 from v2hdm.io.safe.texts import shown, take_name
-from v2hdm.pipeline import RunConfig
-from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.report.terminal import new_table
 from v2hdm.store.remote import place_of
 

@@ -14,15 +14,16 @@ import cv2
 import ray
 from ray.exceptions import RayActorError, RayTaskError
 
-from v2hdm.cli.door import told
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import DriveError, WorkerError
+from v2hdm.errors import DriveError, WorkerError, describe
 from v2hdm.fleet.cluster import DETECTORS_A_GPU
 from v2hdm.fleet.plan import Job, Row
-from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.config import RunConfig
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.finished import RunResult, take_or_make
+from v2hdm.pipeline.run import map_and_save
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
 
@@ -179,7 +180,7 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
         mapped = partial(_mapped, job, detectors, report)
         result, kept = take_or_make(job.config, mapped, job.config.resume, report)
     except Exception as error:  # a drive that fails is a row, and the others go on
-        line = told(error)
+        line = describe(error)
         if line is not None:
             return Row.of_error(job.name, job.source, line), ""
         line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
@@ -190,13 +191,9 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
 def _mapped(
     job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, cache: StageCache
 ) -> RunResult:
-    # They load torch, which a finished result does not need.
+    # It loads torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
-    from v2hdm.mapping.crew import ALONE, Crew
-    from v2hdm.pipeline.work import map_drives
 
-    crew: Crew = ALONE
-    if len(config.drive.paths) > 1:
-        crew = RayCrew(len(detectors), str(Path.cwd()))
-    detect = partial(detect_by, detectors)
-    return map_drives(config, cache, job.config_yaml, report, detect=detect, crew=crew)
+    crew = RayCrew(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
+    context = Context(progress=report, detect=partial(detect_by, detectors), executor=crew)
+    return map_and_save(config, cache, job.config_yaml, context)

@@ -109,11 +109,10 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
     except pyproj.exceptions.CRSError:
         raise error(f"{where}: unknown crs '{crs}'; give an EPSG code such as EPSG:25832") from None
     ellipsoid = system.ellipsoid
-    minor_m = _SEMI_MAJOR_M * (1 - _FLATTENING)
     if (
         ellipsoid is None
         or abs(ellipsoid.semi_major_metre - _SEMI_MAJOR_M) > _SAME_ELLIPSOID_M
-        or abs(ellipsoid.semi_minor_metre - minor_m) > _SAME_ELLIPSOID_M
+        or abs(ellipsoid.semi_minor_metre - _SEMI_MAJOR_M * (1 - _FLATTENING)) > _SAME_ELLIPSOID_M
     ):
         raise error(
             f"{where}: {crs} ({system.name}) is of no satellite datum; convert the coordinates to one with "

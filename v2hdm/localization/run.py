@@ -150,7 +150,7 @@ def localize(
         MapFileError: map, calibrations and drive do not belong together.
         MappingError: the images hold no marking.
     """
-    _check_together(hd_map, calibrations, drive)
+    check_together(hd_map, calibrations, drive)
     if detections is None:
         detections = detect_all(
             drive, DetectorOptions.for_mapping(), workers, progress or (lambda done, total: None)
@@ -178,7 +178,8 @@ def localize(
     )
 
 
-def _check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
+def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
+    """Refuse a map without markings, without a calibration of the drive's cameras, or of another frame."""
     if not hd_map.markings:
         raise MapFileError("the map has no markings; nothing can be localised in it")
     if not set(drive.cameras) & set(calibrations):
@@ -260,7 +261,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     hd_map = read_geojson(parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map)
     calibrations = trusted_calibrations(parsed.map if parsed.map.is_dir() else parsed.map.parent)
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
-    _check_together(hd_map, calibrations, drive)
+    check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     with result_folder(folder, "--output") as unfinished:
         workers = parsed.workers or os.cpu_count() or 1

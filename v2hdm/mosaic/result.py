@@ -283,7 +283,7 @@ def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float
     """By camera its calibration, and how much later than stamped its images were taken, s."""
     files = sorted(folder.glob("calibration_*.yaml"))
     if not files:
-        raise MapFileError(f"{folder}: no calibration_*.yaml in it; give the result folder of v2hdm.map")
+        raise MapFileError(f"{folder}: no calibration_*.yaml in it; give the result folder of v2hdm map")
     calibrations, clock_s = {}, {}
     for file in files:
         calibration = read_calibration(file)

@@ -1,4 +1,4 @@
-"""An earlier map at the door: read and held against the drive; and what became of it, as files."""
+"""An earlier map: read and held against the drive; its changes, as files."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _left_out(path: Path) -> tuple[tuple[str, FloatArray, int], ...]:
 
 
 def changes_json(changes: Changes) -> dict[str, Any]:
-    """What ``metrics.json`` says of an earlier map: counts, and each change with its evidence."""
+    """The changes in ``metrics.json``: counts, and each change with its evidence."""
     counted = Counter(one.fate for one in changes.changes)
     return {
         "counts": {"same": changes.same, **{fate.value: counted[fate] for fate in Fate}},

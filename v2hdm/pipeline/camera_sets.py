@@ -12,16 +12,16 @@ from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.survey import Survey, compare_survey
-from v2hdm.pipeline.telling import Progress
-from v2hdm.pipeline.viewer import Viewer
-from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
 from v2hdm.site.changes import Base
-from v2hdm.store.cache import StageCache
 
 _log = logging.getLogger(__name__)
+
+BEST = "Opt"
+"""The method whose map and calibration are the result."""
 
 STAGE = "map"
 
@@ -49,10 +49,7 @@ def map_camera_sets(
     detections: Sequence[ImageDetections],
     survey: Survey,
     base: Base | None,
-    cache: StageCache,
-    progress: Progress,
-    viewer: Viewer,
-    crew: Crew = ALONE,
+    context: Context,
 ) -> dict[str, MappedSet]:
     """Map a drive with each set of cameras, where that is not known yet.
 
@@ -62,32 +59,31 @@ def map_camera_sets(
         detections: what was found in its images.
         survey: control points for the mapping; check points, held against the finished map of all cameras.
         base: an earlier map that is brought up to date with all cameras.
-        cache: keeps the results.
-        progress: told how many sets are done.
-        viewer: shown the results of each set.
-        crew: maps the sets, and what belongs to one visit of several.
+        context: keeps the results, shows them, and maps the sets and what belongs to one visit of several.
 
     Raises:
         MappingError: no map can be made.
         AdjustError: the adjustment fails.
     """
-    sets = camera_sets(drive)
+    sets, cache, executor = camera_sets(drive), context.cache, context.executor or ALONE
     begun = cache.key(drive_key, list(detections), survey.mapping)
     jobs = []
     for number, (name, cameras) in enumerate(sets.items()):
         last = number == len(sets) - 1
         of_last = (base, survey.check) if last else None
-        work = partial(_map_set, drive, detections, name, cameras, survey, base if last else None, last, crew)
+        work = partial(
+            _map_set, drive, detections, name, cameras, survey, base if last else None, last, executor
+        )
         # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
         shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
-        begin = partial(crew.begin if shared_out else ALONE.begin, work)
+        begin = partial(executor.begin if shared_out else ALONE.begin, work)
         jobs.append((cache.key(begun, name, cameras, of_last), begin))
-    progress("map", 0, len(sets))
+    context.progress("map", 0, len(sets))
     found = {}
     for name, mapped in zip(sets, cache.get_or_make_each(STAGE, MappedSet, jobs), strict=True):
         found[name] = mapped
-        viewer.mapped(name, mapped.methods)
-        progress("map", len(found), len(sets))
+        context.viewer.mapped(name, mapped.methods)
+        context.progress("map", len(found), len(sets))
     return found
 
 
@@ -99,10 +95,12 @@ def _map_set(
     survey: Survey,
     base: Base | None,
     last: bool,
-    crew: Crew,
+    executor: Crew,
 ) -> MappedSet:
-    tell, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(drive, detections, cameras, survey.mapping, tell, base, grey_reader(drive), crew)
+    log_step, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
+    methods = run_methods(
+        drive, detections, cameras, survey.mapping, log_step, base, grey_reader(drive), executor
+    )
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None
     # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.

@@ -7,7 +7,7 @@ drive they are.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.store.cache import StageCache, key_of
+from v2hdm.store.cache import key_of
 
 _log = logging.getLogger(__name__)
 
@@ -34,11 +35,8 @@ def detect_in_pieces(
     drive: Drive,
     contents: Contents,
     options: DetectorOptions,
-    cache: StageCache,
-    workers: int,
-    progress: Callable[[int, int], None],
+    context: Context,
     detect: Detect = detect_images,
-    show: Callable[[_Piece], None] = lambda found: None,
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order, where that is not known yet.
 
@@ -46,15 +44,13 @@ def detect_in_pieces(
         drive: what to look at.
         contents: of its images.
         options: detector settings.
-        cache: keeps what was found.
-        workers: processes, one thread each.
-        progress: called as ``progress(done, total)`` with numbers of images.
+        context: keeps what was found; its viewer is shown first all that is known, then image by image.
         detect: takes the place of processes of this machine.
-        show: given what was found as it comes: first all that is known, then image by image.
 
     Raises:
         V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
     """
+    cache, progress, show = context.cache, context.steps("detect"), context.viewer.detected
     detector_key = cache.key(options, model_key(options))
     masks = cache.get_or_make(
         "own_vehicle",
@@ -88,12 +84,12 @@ def detect_in_pieces(
         progress(total - len(todo) + done, total)
 
     if todo:
-        detect(drive, options, todo, workers, take)
+        detect(drive, options, todo, context.processes, take)
     return _together(pieces)
 
 
 def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
-    """What is known of the pieces, by their first images, under the drive's numbers of images."""
+    """The known pieces, by their first images, under the drive's numbers of images."""
     return [
         replace(found, image=start + found.image) for start, piece in pieces.items() for found in piece or ()
     ]

@@ -71,7 +71,7 @@ def evaluate(
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:
-    """What a method says of itself, without truth."""
+    """The figures of a method that need no truth."""
     reasons = Counter(exclusion.reason for exclusion in result.excluded)
     figures: dict[str, Any] = {
         "excluded": len(result.excluded),

@@ -18,7 +18,7 @@ from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
-from v2hdm.pipeline.telling import Progress
+from v2hdm.progress import Progress
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of
 from v2hdm.store.folders import note_use

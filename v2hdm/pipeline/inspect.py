@@ -12,10 +12,10 @@ from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
-from v2hdm.mapping.crew import ALONE, Crew
+from v2hdm.mapping.crew import ALONE
+from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
-from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 
 log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
         drive: as it was read.
         max_gap_s: longest gap between two poses that is interpolated across, s.
         workers: processes to work in.
-        progress: told how many cameras are done, and of how many.
+        progress: called with how many cameras are done, and of how many.
     """
     ground = estimate_cameras(drive, workers, progress)
     findings = tuple(input_findings(drive, ground))
@@ -70,13 +70,7 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
 
 
 def inspect_each(
-    drives: Sequence[Drive],
-    contents: Contents,
-    max_gap_s: float,
-    cache: StageCache,
-    workers: int,
-    progress: Callable[[str, int, int], None],
-    crew: Crew = ALONE,
+    drives: Sequence[Drive], contents: Contents, max_gap_s: float, context: Context
 ) -> list[Inspection]:
     """As :func:`inspect` of each drive, or what it found before of the same, with the same lines in the log.
 
@@ -84,16 +78,13 @@ def inspect_each(
         drives: as they were read.
         contents: of their images.
         max_gap_s: as there.
-        cache: keeps what is found.
-        workers: as there.
-        progress: told how far the checks of each drive are.
-        crew: inspects.
+        context: keeps what is found, inspects, and shows how far the checks of each drive are.
     """
-    jobs = []
+    jobs, executor, cache = [], context.executor or ALONE, context.cache
     for drive in drives:
-        tell = partial(progress, "check" if len(drives) == 1 else f"check {drive.name}")
-        work = partial(inspect, drive, max_gap_s, workers, tell)
-        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(crew.begin, work)))
+        steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
+        work = partial(inspect, drive, max_gap_s, context.processes, steps)
+        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(executor.begin, work)))
     return list(cache.get_or_make_each("check", Inspection, jobs))
 
 

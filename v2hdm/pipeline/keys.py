@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
-from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.records import Drive, Image
 from v2hdm.store.cache import key_of
 from v2hdm.store.files import file_digest
 
 if TYPE_CHECKING:
-    from v2hdm.mapping.crew import Crew  # loads torch, which a finished result does not need
+    pass  # loads torch, which a finished result does not need
 
 
 @dataclass(frozen=True)
@@ -74,19 +73,6 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     return key_of(
         code, asked, model_key(config.detector), paths, [contents.key(drive) for drive in drives], read
     )
-
-
-def read_visits(config: RunConfig, paths: Sequence[Path], crew: Crew) -> tuple[list[Drive], Contents]:
-    """The drives of a run, each read by ``crew``, and the contents of their images; raises DriveError."""
-    begun = [crew.begin(partial(_read_visit, path, config.drive)) for path in paths]
-    read = [wait() for wait in begun]
-    digests = {path: digest for _, contents in read for path, digest in contents.digests.items()}
-    return [drive for drive, _ in read], Contents(digests)
-
-
-def _read_visit(path: Path, options: ReadOptions) -> tuple[Drive, Contents]:
-    drive = read_drive(path, options)
-    return drive, Contents.of([drive])
 
 
 def read_drives(config: RunConfig, paths: Sequence[Path]) -> list[Drive]:

@@ -28,11 +28,11 @@ _NAMED = 5
 
 @dataclass(frozen=True)
 class Survey:
-    """What a run takes of a survey.
+    """A survey as a run uses it.
 
     Attributes:
         mapping: the settings of the mapping, with the control points in place of the file.
-        check: what the mapping is not told of.
+        check: points that are kept from the mapping.
         points: all points of the file.
         elsewhere: where they would lie, had the file meant something else, by what (N, 2).
     """
@@ -94,13 +94,13 @@ def compare_survey(survey: Survey, drive: Drive, best: MethodResult) -> CheckTab
 
 
 def check_survey(survey: Survey, best: MethodResult, compared: CheckTable | None) -> list[Finding]:
-    """What follows from a survey, and from its check points where they were compared."""
+    """The findings on a survey, and on its check points where they were compared."""
     findings = check_frame(survey.found(best)) if survey.points else []
     return findings if compared is None else [check_points(compared), *findings]
 
 
 def route_of(drive: Drive) -> FloatArray:
-    """Where the vehicle was (F, 2)."""
+    """The route (F, 2) of the vehicle, m."""
     return np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
 
 
@@ -111,7 +111,7 @@ def _check_near(
     drive: Drive,
     range_m: float,
 ) -> None:
-    """Tell of points that no image can show; refuse a survey all of whose points are."""
+    """Warn of points that no image can show; refuse a survey that has no others."""
     route = KDTree(route_of(drive))
     away_m = route.query(_positions(points))[0]
     far = np.flatnonzero(away_m > range_m)

@@ -62,7 +62,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """All findings of a run, the worst first; those of equal rank keep the order of their checks."""
+    """All findings of a run, the worst first; those of equal rank keep the order of their checks.
+
+    >>> result.verdict.lines[0].startswith("verdict: PASS (nothing raised")
+    True
+    >>> result.verdict.raised
+    ()
+    """
 
     findings: tuple[Finding, ...]
 

@@ -103,20 +103,20 @@ def damaged_networks(order: Order) -> Iterator[Row]:
         shutil.copy(NETWORK_FILE, root / "mine.onnx")
 
     arguments = ("images", "--limit", "1", "--model", "mine.onnx", "--output", "found.jsonl")
-    yield from _told(order, Situation(Case("network", "v2hdm.detect", arguments, prepare, "")), "mine.onnx")
+    yield from _told(order, Situation(Case("network", "v2hdm detect", arguments, prepare, "")), "mine.onnx")
 
 
 def damaged_caches(order: Order) -> Iterator[Row]:
     """Entries of the cache: they are made anew, and the map is the same to the byte."""
     made = order.doors.given("cache")
-    case = Case("cache", "v2hdm.map", map_arguments(order.doors.drive), made, "")
+    case = Case("cache", "v2hdm map", map_arguments(order.doors.drive), made, "")
     yield from _told(order, Situation(case), "cache/stages/[!f]*/*.v2hdm")
 
 
 def damaged_results(order: Order) -> Iterator[Row]:
     """Files of a result, before the same run again, and before the doors that read results."""
     doors, done = order.doors, order.doors.given("out/run")
-    again = Case("run again", "v2hdm.map", map_arguments(doors.drive), doors.given("cache", "out/run"), "")
+    again = Case("run again", "v2hdm map", map_arguments(doors.drive), doors.given("cache", "out/run"), "")
     yield from _told(order, Situation(again), "out/run/*")
     for situation in doors.all():
         if situation.name == "update":
@@ -125,10 +125,10 @@ def damaged_results(order: Order) -> Iterator[Row]:
             yield from _told(order, situation, "out/run/*.[gjty][esua]*")
     for source, form in (("map.geojson", "csv"), ("calibration_front.yaml", "kalibr")):
         words = (f"out/run/{source}", "--format", form, "--output", "there")
-        case = Case(f"export {source}", "v2hdm.cli.export", words, done, "")
+        case = Case(f"export {source}", "v2hdm export", words, done, "")
         yield from _told(order, Situation(case, grows=True), f"out/run/{source}")
     words = ("out/run/calibration_front.yaml", "out/run")
-    compare = Case("compare calibrations", "v2hdm.cli.calibration", words, done, "")
+    compare = Case("compare calibrations", "v2hdm calibrate compare", words, done, "")
     yield from _told(order, Situation(compare), "out/run/calibration_front.yaml")
 
 

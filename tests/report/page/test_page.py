@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, PLACES, SHIFT_PX, make_result, make_site
+from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
 from v2hdm.io.maps.evidence import COLUMNS, read_residuals
 from v2hdm.records import DIAMOND, Drive, Marking
-from v2hdm.report.__main__ import main
 from v2hdm.report.outputs import write_json
 from v2hdm.report.page import pictures
 from v2hdm.report.page.document import document, write_page
@@ -229,18 +229,18 @@ def test_the_door_finds_the_drive_and_names_what_is_wrong(
 ) -> None:
     make_result(tmp_path)
     result = tmp_path / "result"
-    assert main([str(result)]) == 0
+    assert run(["report", str(result)]) == 0
     assert capsys.readouterr().out.startswith(f"{result / 'report.html'}: ")
     pictures_of = re.compile(r'id="pictures">\{"m1"')
     assert pictures_of.search((result / "report.html").read_text())
-    assert main([str(tmp_path)]) == 2
+    assert run(["report", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith(f"error: {tmp_path}: no metrics.json in it")
     lines = (result / "residuals.csv").read_text().splitlines()
     (result / "residuals.csv").write_text("\n".join([*lines[:3], "front/0.png,front,x"]) + "\n")
-    assert main([str(result)]) == 2
+    assert run(["report", str(result)]) == 2
     assert "residuals.csv: line 4" in capsys.readouterr().err
     (result / "residuals.csv").write_text("a,b\n")
-    assert main([str(result)]) == 2
+    assert run(["report", str(result)]) == 2
     assert ",".join(COLUMNS) in capsys.readouterr().err
 
 

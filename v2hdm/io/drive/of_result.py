@@ -36,7 +36,7 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     another one.
     """
     if not (folder / METRICS).is_file():
-        raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm.map")
+        raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm map")
     stated = load_json(folder / METRICS, MapFileError).get("drive")
     stated = stated if isinstance(stated, dict) else {}
     try:

@@ -101,9 +101,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         DriveError: the drive's truth is damaged.
     """
     if not (folder / "metrics.json").is_file():
-        raise MapFileError(
-            f"{folder}: no result of python -m v2hdm.map (no metrics.json in it); give its folder"
-        )
+        raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
     metrics = load_json(folder / "metrics.json", MapFileError)
     sets = list(metrics.get("results") or {})
     has_map = (folder / "map.geojson").is_file()

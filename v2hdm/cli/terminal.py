@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from v2hdm import pipeline
-from v2hdm.pipeline.config import run_name
-from v2hdm.pipeline.telling import logging_to
-from v2hdm.progress import progress_lines
+from v2hdm.pipeline.config import RunConfig, run_name
+from v2hdm.pipeline.context import logging_to
+from v2hdm.pipeline.run import run
+from v2hdm.progress import progress_bars
 from v2hdm.report.terminal import changes_table, results_table
 from v2hdm.verdict import Status, Verdict
 from v2hdm.viewer import RerunViewer, check_viewer
@@ -21,13 +18,13 @@ from v2hdm.viewer import RerunViewer, check_viewer
 _STYLES = {Status.PASS: "bold green", Status.WARN: "bold yellow", Status.FAIL: "bold red"}
 
 
-def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
+def run_on_terminal(config: RunConfig, config_yaml: str) -> Verdict:
     """Run the pipeline, show what it does and found, and return the verdict on it."""
     console = Console()
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
-    with logging_to(handler), _bars(console) as progress:
-        result = pipeline.run(config, config_yaml, progress, viewer)
+    with logging_to(handler), progress_bars(console) as progress:
+        result = run(config, config_yaml, progress, viewer)
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)
@@ -42,26 +39,3 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
         )
     console.print(f"results in {result.place}: open report.html", highlight=False, soft_wrap=True)
     return result.verdict
-
-
-@contextmanager
-def _bars(console: Console) -> Iterator[pipeline.Progress]:
-    """A progress bar per task, made the first time that a task reports; lines where there is no terminal."""
-    if not console.is_terminal:
-        yield progress_lines(console.print)
-        return
-    columns = (
-        TextColumn("{task.description:<28}"),
-        BarColumn(40),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bars:
-        tasks = {}
-
-        def advance(task: str, done: int, total: int) -> None:
-            if task not in tasks:
-                tasks[task] = bars.add_task(task, total=total)
-            bars.update(tasks[task], completed=done, total=total)
-
-        yield advance

@@ -1,6 +1,6 @@
-"""Hydra at the doors: a configuration composed, checked against its schema, turned into dataclasses.
+"""Hydra, for commands only: a configuration composed, checked against its schema, turned into dataclasses.
 
-Below the doors only dataclasses travel. Every key of ``conf/`` is checked, so that a typo stops a run
+Below the commands only dataclasses travel. Every key of ``conf/`` is checked, so that a typo stops a run
 before anything is read.
 """
 
@@ -26,6 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from v2hdm.cli.main import Command
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.safe.texts import read_yaml
 
@@ -69,11 +70,11 @@ class Job:
 
 
 def work_on(
+    command: Command,
     name: str,
     schema: type[Any],
     work: Callable[[Job], int | None],
-    settle: Callable[[Callable[[], int | None]], int],
-    about: str,
+    arguments: Sequence[str],
 ) -> int:
     """Compose ``conf/<name>.yaml`` with the command line and work on it, once as a rule.
 
@@ -81,33 +82,33 @@ def work_on(
     other processes, and ends with the code of the first that failed.
 
     Args:
+        command: whose work it is; a job of a sweep that fails is one line, as the command's own failure.
         name: of the configuration.
         schema: the dataclass that it builds on.
         work: what to do; returns an exit code, or None for 0.
-        settle: does the work of a job of a sweep and tells on the terminal what went wrong with it.
-        about: what ``--help`` begins with.
+        arguments: the command line.
 
     Raises:
         ConfigError: A key or value is wrong, or Hydra cannot make the output folder.
     """
-    # Hydra prints composition errors its own way and exits with 1 unless told to raise them.
+    # Hydra prints composition errors its own way and exits with 1 unless it is asked to raise them.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    if {"--help", "-h"} & set(sys.argv[1:]):
-        from v2hdm.cli.config_help import help_text
+    if {"--help", "-h"} & set(arguments):
+        from v2hdm.cli.keys_help import help_text
 
-        print(help_text(about, schema, conf_dir()))
+        print(help_text(command.name, command.says, schema, conf_dir()))
         return 0
-    if {"--multirun", "-m"} & set(sys.argv[1:]):  # Hydra would make folders that are called like URLs
-        for one in sys.argv[1:]:
+    if {"--multirun", "-m"} & set(arguments):  # Hydra would make folders that are called like URLs
+        for one in arguments:
             if one.startswith("output="):
                 _refuse_url(one.removeprefix("output="))
-    for path in _own_files(sys.argv[1:]):
+    for path in _own_files(arguments):
         read_yaml(path, ConfigError)  # OmegaConf would expand whatever aliases repeat
     register(name, schema)
-    task = _Task(work, settle, tuple(sys.argv[1:]))
+    task = _Task(work, command, tuple(arguments))
     compose = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(task)
     given = sys.argv
-    sys.argv = [given[0], *_options_first(given[1:])]
+    sys.argv = [command.name, *_options_first(arguments)]
     try:
         compose()
     except _JobFailed as failure:
@@ -117,7 +118,7 @@ def work_on(
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
         if _OF_WORK in getattr(error, "__notes__", ()):
             raise
-        raise _composition_error(error, schema, given[1:]) from error
+        raise _composition_error(error, schema, list(arguments)) from error
     finally:
         sys.argv = given
     if task.failure:
@@ -171,7 +172,7 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
 _OF_COPY = re.compile(r"In 'run/chosen_run_file': \w+ raised while composing config:;? ")
 
 
-class _JobFailed(Exception):  # noqa: N818  # told already: it only carries a code between processes
+class _JobFailed(Exception):  # noqa: N818  # reported already: it only carries a code between processes
     """A job of a sweep did not end well."""
 
     def __init__(self, code: int) -> None:
@@ -184,10 +185,10 @@ _OF_WORK = "while working, after the configuration was composed"
 
 @dataclass
 class _Task:
-    """What Hydra calls with each composed configuration; launchers take it into other processes."""
+    """The work that Hydra calls with each composed configuration; launchers take it into other processes."""
 
     work: Callable[[Job], int | None]
-    settle: Callable[[Callable[[], int | None]], int]
+    command: Command
     arguments: tuple[str, ...]
     codes: list[int] = field(default_factory=list)
     failure: list[BaseException] = field(default_factory=list)
@@ -203,7 +204,7 @@ class _Task:
         swept = [one for one in running.overrides.task if one not in self.arguments]
         label = re.sub(r"[^\w.=,+-]+", "_", f"{running.job.num}-{','.join(swept)}")[:_LABEL_LETTERS]
         try:
-            code = self.settle(lambda: self._labelled(Job(composed, label.rstrip("-."))))
+            code = self.command.guard(lambda: self._labelled(Job(composed, label.rstrip("-."))))
         except Exception as error:
             error.add_note(_OF_WORK)
             raise
@@ -328,7 +329,7 @@ _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous
 
 
 def _advice(message: str, schema: type[Any]) -> str:
-    """What to do about an error of Hydra."""
+    """Advice on an error of Hydra."""
     if _UNQUOTED.search(message):
         return "a value with signs or letters of its own wants quotes: \"drive.path='müll (1)'\""
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)

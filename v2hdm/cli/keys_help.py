@@ -1,4 +1,4 @@
-"""``--help`` of the doors that Hydra configures: every key with its default, explained by its dataclass.
+"""``--help`` of the commands that Hydra configures: every key with its default, explained by its dataclass.
 
 The docstrings are the only source: an entry of ``Attributes``, else the sentences that name the key.
 """
@@ -15,9 +15,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-_WIDTH = 100
 _USAGE = """\
-Usage: python -m {door} [key=value ...] [--config-dir FOLDER] [--multirun]
+Usage: {command} [key=value ...] [--config-dir FOLDER] [--multirun]
 
   +run=NAME           a run: what conf/run/NAME.yaml or FOLDER/run/NAME.yaml sets
   key=value           sets a key; null is nothing, lists are [1.0, 2.0], texts with blanks want quotes
@@ -28,6 +27,12 @@ Usage: python -m {door} [key=value ...] [--config-dir FOLDER] [--multirun]
   --cfg job           only prints the configuration
   --hydra-help        what else Hydra knows
 """
+_OFTEN = {
+    "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",
+}  # fmt: skip
+"""Keys below others that are often set; the rest is for experts."""
+
+_KINDS = {"str": "text", "int": "whole number", "float": "number", "bool": "true or false"}
 
 
 @dataclass(frozen=True)
@@ -39,29 +44,23 @@ class Key:
     default: str
     meaning: str
 
+    @property
+    def lines(self) -> list[str]:
+        """Its entry on the page."""
+        head = f"  {self.name} ({self.kind}{f', {self.default}' if self.default else ''})"
+        return [head, *textwrap.wrap(self.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)]
 
-def help_text(about: str, schema: type[Any], conf: Path) -> str:
-    """The page that ``--help`` prints.
 
-    Args:
-        about: the door's docstring, which names it.
-        schema: the dataclass of its configuration.
-        conf: the folder of the shipped configuration.
-    """
-    named = re.search(r"python -m ([\w.]+)", about)
-    parts = [about.split("\n\n")[0], "", _USAGE.format(door=named.group(1) if named else "...")]
-    names = {one.name for one in fields(schema)}
-    if "drive" in names:
-        parts += [
-            f"Shipped runs: {', '.join(sorted(path.stem for path in (conf / 'run').glob('*.yaml')))}",
-            "",
-        ]
-    parts.append("Keys, as key (type, default):")
-    for key in keys_of(schema):
-        default = f", {key.default}" if key.default else ""
-        parts.append(f"  {key.name} ({key.kind}{default})")
-        if key.meaning:
-            parts += textwrap.wrap(key.meaning, _WIDTH, initial_indent="      ", subsequent_indent="      ")
+def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
+    """The page that ``--help`` prints, of a command, a sentence about it, its dataclass and ``conf/``."""
+    parts = [_USAGE.format(command=command), says, ""]
+    if "drive" in {one.name for one in fields(schema)}:
+        runs = ", ".join(sorted(path.stem for path in (conf / "run").glob("*.yaml")))
+        parts += [f"Shipped runs: {runs}", ""]
+    keys = list(keys_of(schema))
+    often = [key for key in keys if key.name in _OFTEN or "." not in key.name]
+    parts += ["Keys, as key (type, default):", *(line for key in often for line in key.lines)]
+    parts += ["", "For experts:", *(line for key in keys if key not in often for line in key.lines)]
     return "\n".join(parts)
 
 
@@ -69,21 +68,18 @@ def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
     """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``."""
     hints = get_type_hints(schema)
     for one in fields(schema):
-        hint = hints[one.name]
+        hint, name = hints[one.name], f"{prefix}{one.name}"
         below = next((kind for kind in (hint, *get_args(hint)) if _is_schema(kind)), None)
-        name = f"{prefix}{one.name}"
-        if below is None:
-            yield Key(name, _kind(hint), _default(one), meaning_of(schema, one.name))
-            continue
-        entries = f"{name}.NAME." if hint is not below and dict in _origins(hint) else f"{name}."
-        if "NAME" in entries or hint is not below:
-            about = " ".join((inspect.getdoc(below) or "").split("\n\n")[0].split())
+        is_mapping = hint is not below and "dict" in str(hint)
+        if below is None or hint is not below:
+            about = "" if below is None else " ".join((inspect.getdoc(below) or "").split("\n\n")[0].split())
             yield Key(name, _kind(hint), _default(one), meaning_of(schema, one.name) or about)
-        yield from keys_of(below, entries)
+        if below is not None:
+            yield from keys_of(below, f"{name}.NAME." if is_mapping else f"{name}.")
 
 
 def meaning_of(schema: type[Any], name: str) -> str:
-    """What the docstring of a dataclass, or of what it extends, says about one of its keys."""
+    """The meaning of a key by the docstring of its dataclass, or of one that this extends."""
     for owner in schema.__mro__:
         text = inspect.cleandoc(owner.__doc__ or "") if "__doc__" in vars(owner) else ""
         prose, _, attributes = text.partition("Attributes:\n")
@@ -92,9 +88,9 @@ def meaning_of(schema: type[Any], name: str) -> str:
             if found and key == name:
                 return _plain(" ".join(meaning.split("\n\n")[0].split()))
         sentences = re.split(r"(?<=[.;:])\s+(?=[`A-Z])", " ".join(prose.split()))
-        told = [sentence for sentence in sentences if f"``{name}``" in sentence]
-        if told:
-            return _plain(" ".join(told))
+        naming = [sentence for sentence in sentences if f"``{name}``" in sentence]
+        if naming:
+            return _plain(" ".join(naming))
         for module, other in re.findall(r":class:`~?([\w.]+)\.(\w+)`", text):
             described = getattr(importlib.import_module(module), other)
             if _is_schema(described) and (meaning := meaning_of(described, name)):
@@ -112,22 +108,16 @@ def _is_schema(kind: Any) -> bool:
     return isinstance(kind, type) and is_dataclass(kind)
 
 
-def _origins(hint: Any) -> tuple[Any, ...]:
-    return (getattr(hint, "__origin__", None), *(getattr(one, "__origin__", None) for one in get_args(hint)))
-
-
 def _kind(hint: Any) -> str:
-    if isinstance(hint, type) and not get_args(hint):
-        if issubclass(hint, Enum):
-            return " or ".join(str(one.value) for one in hint)
-        plain = {"str": "text", "int": "whole number", "float": "number", "bool": "true or false"}
-        return plain.get(hint.__name__, "mapping" if is_dataclass(hint) else hint.__name__)
     parts = [one for one in get_args(hint) if one is not type(None)]
-    if dict in _origins(hint):
-        return "mapping"
-    if list in _origins(hint):
-        return "list"
-    return f"{_kind(parts[0])} or null" if parts else str(hint)
+    for word, kind in (("dict", "mapping"), ("list", "list")):
+        if word in str(hint):
+            return kind
+    if parts:
+        return f"{_kind(parts[0])} or null"
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return " or ".join(str(one.value) for one in hint)
+    return "mapping" if _is_schema(hint) else _KINDS.get(getattr(hint, "__name__", ""), "any")
 
 
 def _default(one: Field[Any]) -> str:
@@ -137,11 +127,8 @@ def _default(one: Field[Any]) -> str:
         value = one.default_factory()
     else:
         return "required"
-    if value is None:
-        return "null"
     if is_dataclass(value) or isinstance(value, dict):
         return ""
-    if isinstance(value, Enum):
-        return str(value.value)
-    text = str(value).lower() if isinstance(value, bool) else str(value)
+    text = str(value.value if isinstance(value, Enum) else value)
+    text = {"None": "null", "True": "true", "False": "false"}.get(text, text)
     return text if len(text) <= 40 else f"{text[:37]}..."

@@ -1,37 +1,31 @@
-"""The door to a drift alarm: ``python -m v2hdm.cli.calibration BEFORE AFTER`` says what has moved.
-
-Both are results of ``python -m v2hdm.map`` or ``v2hdm.cli.extrinsic``: a folder, or one calibration file. One
-line a camera on stdout. docs/calibration.md describes it.
-"""
+"""``v2hdm calibrate compare BEFORE AFTER``: one line per camera on stdout (docs/calibration.md)."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.door import EXIT_FAILED_VERDICT, ShowVersion, answer_signals, open_door
+from v2hdm.cli.main import parser_of
+from v2hdm.errors import EXIT_FAILED_VERDICT, MapFileError
 
 if TYPE_CHECKING:
     from v2hdm.calibration.compare import Movement
 
-
 _LEAST = 1e-12
-"""Smaller probabilities are not told apart."""
+"""Smaller probabilities are all the same."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; 0 where no camera has moved, 3 where one has, 2 with one line where none can tell."""
-    parsed = _parser().parse_args(arguments)
-    return open_door("v2hdm.cli.calibration", "map", "interrupted", lambda: _compare(parsed))
-
-
-def _compare(parsed: argparse.Namespace) -> int:
+def run(arguments: Sequence[str]) -> int:
+    """Compare two calibrations of each camera; 0 where none has moved, 3 where one has."""
+    parser = parser_of("calibrate compare")
+    parser.add_argument("before", type=Path, help="result folder or calibration file of the earlier drive")
+    parser.add_argument("after", type=Path, help="the same of the later drive")
+    parser.add_argument("--json", action="store_true", help="print one JSON list instead of lines")
+    parsed = parser.parse_args(arguments)
     from v2hdm.calibration.compare import compare_calibrations, turned_alike
-    from v2hdm.errors import MapFileError
     from v2hdm.io.calibration import trusted_calibrations
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
@@ -68,12 +62,12 @@ def _line(one: Movement) -> str:
         for axis, value, sigma in zip(("roll", "pitch", "yaw"), one.turn_rad, one.sigma[3:], strict=True)
     ]
     least_mm, least_deg = 1e3 * one.detectable[:3].max(), degrees(one.detectable[3:].max())
-    told = (
+    found = (
         f"MOVED (by chance in {max(one.probability, _LEAST):.1g} of such pairs at most)"
         if one.moved
         else f"not moved (a shift of {least_mm:.0f} mm or a turn of {least_deg:.2f} deg would have shown)"
     )
-    return f"{one.camera}: {told}: {', '.join(parts)}"
+    return f"{one.camera}: {found}: {', '.join(parts)}"
 
 
 def _as_json(one: Movement) -> dict[str, object]:
@@ -86,19 +80,3 @@ def _as_json(one: Movement) -> dict[str, object]:
         "covariance": one.covariance.tolist(),
         "detectable": one.detectable.tolist(),
     }
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m v2hdm.cli.calibration", description=__doc__.split("\n\n")[0]
-    )
-    parser.add_argument("--version", action=ShowVersion)
-    parser.add_argument("before", type=Path, help="result folder or calibration file of the earlier drive")
-    parser.add_argument("after", type=Path, help="the same of the later drive")
-    parser.add_argument("--json", action="store_true", help="print one JSON list instead of lines")
-    return parser
-
-
-if __name__ == "__main__":
-    answer_signals()
-    sys.exit(main())

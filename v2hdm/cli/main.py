@@ -1,0 +1,255 @@
+"""``v2hdm NAME``: find a command, run it, and make of a user's mistake or Ctrl-C one line and exit code 2.
+
+Nothing heavy is imported here, and commands import within their work, so that ``--help`` answers at once and
+Ctrl-C is one line while torch is still being loaded, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from v2hdm import __version__
+from v2hdm.errors import EXIT_USER_ERROR, V2hdmError, describe, one_line
+
+_NOTHING = "interrupted; nothing was written"
+_GO_ON = "the same command goes on from there"
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: its name as users type it, a sentence, the extra that it needs, and what Ctrl-C leaves."""
+
+    name: str
+    says: str
+    extra: str | None = "map"
+    interrupted: str = _NOTHING
+
+    def guard(self, work: Callable[[], int | None]) -> int:
+        """Do the work of the command, which imports what it needs; the exit code is that of the work.
+
+        It is 2, with one line on stderr, for what a user can mend.
+        """
+        # OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait
+        # for as soon as the machine is busy otherwise. Libraries read this when they are loaded.
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        try:
+            from v2hdm.store.inputs import protected_inputs
+
+            with protected_inputs():
+                return _to_the_end(work)
+        except BrokenPipeError:  # the reader of our output has had enough
+            _forget_stdout()
+            return 0
+        except (V2hdmError, MemoryError, OSError) as error:
+            line = describe(error)
+            if line is None:
+                raise
+            if not isinstance(error, V2hdmError):
+                _forget_full_stdout()
+            return _fail(line)
+        except ModuleNotFoundError as error:
+            if (error.name or "v2hdm").split(".")[0] in ("v2hdm", "models", "train", "export"):
+                raise
+            extra = f"[{self.extra}]" if self.extra else ""
+            install = f"install the {self.extra} extra, " if self.extra else ""
+            return _fail(f"{self.name} needs {error.name}: {install}pip install 'v2hdm{extra}'")
+        except KeyboardInterrupt:
+            return _fail(self.interrupted)
+
+
+_ALL = (
+    Command(
+        "v2hdm map",
+        "Turn a drive into a map, calibrations and a verdict.",
+        interrupted="interrupted; what was found so far is kept in the cache, no result was written",
+    ),
+    Command(
+        "v2hdm detect",
+        "Find markings and lanes in images, one JSON object per image.",
+        None,
+        "interrupted before the last image; no --output was written",
+    ),
+    Command("v2hdm check", "Say in seconds what is wrong with a drive."),
+    Command("v2hdm calibrate points", "Calibrate a camera from surveyed ground points and their pixels."),
+    Command("v2hdm calibrate ground", "Estimate each camera's mounting from bare ground, without markings."),
+    Command("v2hdm calibrate compare", "Say whether a camera has moved between two results."),
+    Command("v2hdm localize", "Find the vehicle's poses from the markings of a map."),
+    Command(
+        "v2hdm report",
+        "Make the report.html of a result again.",
+        interrupted="interrupted; the report is as it was",
+    ),
+    Command(
+        "v2hdm mosaic",
+        "Show the ground of a result from above, before and after the optimisation.",
+        interrupted="interrupted; files that stand in the result folder are whole",
+    ),
+    Command(
+        "v2hdm export",
+        "Convert a map or a calibration to other formats.",
+        None,
+        "interrupted; files that were named are whole",
+    ),
+    Command(
+        "v2hdm experiment",
+        "Compare all methods on both ports, as the paper does.",
+        interrupted=f"interrupted; finished drives and detections are kept, {_GO_ON}",
+    ),
+    Command(
+        "v2hdm cache",
+        "List, verify or prune the cache of runs.",
+        None,
+        "interrupted; what was removed so far is made anew when it is needed",
+    ),
+    Command(
+        "v2hdm fleet",
+        "Map many drives, each described by a run file, on Ray.",
+        "fleet",
+        f"interrupted; finished drives are kept, {_GO_ON}",
+    ),
+)
+COMMANDS = {one.name.removeprefix("v2hdm "): one for one in _ALL}
+"""``v2hdm/cli/<name>.py`` has ``run(arguments)`` of each."""
+
+_OLD = {"calibrate": "calibrate points", "extrinsic": "calibrate ground", "calibration": "calibrate compare"}
+"""Names of console scripts, ``v2hdm-NAME``, of commands that are called otherwise now."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Be the process of a command line; returns the exit code."""
+    answer_signals()
+    return run(sys.argv[1:] if arguments is None else arguments)
+
+
+def script() -> int:
+    """Be an old console script, such as ``v2hdm-map``."""
+    name = Path(sys.argv[0]).stem.removeprefix("v2hdm-")
+    return main([*_OLD.get(name, name).split(), *sys.argv[1:]])
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run a command line in this process; 0, 2 where a user must mend something, 3 for a verdict FAIL."""
+    words = list(arguments)
+    name = next((one for one in (" ".join(words[:2]), *words[:1]) if one in COMMANDS), "")
+    given = words[len(name.split()) :]
+    below = [one for one in COMMANDS if words and one.startswith(f"{words[0]} ")]
+    if name and "--version" not in given:
+        module = f"v2hdm.cli.{name.replace(' ', '_')}"
+        return COMMANDS[name].guard(lambda: importlib.import_module(module).run(given))
+    if "--version" in (given if name else words[:1]):
+        return _LIST.guard(lambda: print(version_line()))
+    if not words or words[0] in ("-h", "--help") or (below and words[1:2] in ([], ["-h"], ["--help"])):
+        return _LIST.guard(lambda: print(_list(below or list(COMMANDS))))
+    return _fail(f"v2hdm {' '.join(words[: 2 if below else 1])}: no such command; v2hdm --help lists them")
+
+
+_LIST = Command("v2hdm", "List the commands.", None, "interrupted")
+
+
+def _list(names: Sequence[str]) -> str:
+    width = max(map(len, names))
+    lines = [f"  {name:{width}}  {COMMANDS[name].says}" for name in names]
+    return "\n".join(["Usage: v2hdm COMMAND ...; v2hdm COMMAND --help explains one.", "", *lines])
+
+
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """The beginning of a command's parser of arguments."""
+    return argparse.ArgumentParser(prog=COMMANDS[name].name, description=COMMANDS[name].says)
+
+
+def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
+    """Add what commands that read a drive have in common; ``result`` ends the name of the default folder."""
+    parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
+    parser.add_argument(
+        "--camera", action="append", default=[], metavar="NAME", help="only this camera; may be repeated"
+    )
+    parser.add_argument("--format", default="auto", help="of the drive, as folder or kitti (default: auto)")
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help=f"folder of results (default: outputs/<drive>-{result})"
+    )
+    parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
+
+
+def _to_the_end(work: Callable[[], int | None]) -> int:
+    """Do the work and write all that it printed, while an error of writing can still be reported."""
+    try:
+        code = work() or 0
+    except SystemExit:  # argparse, after --help
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+    return code
+
+
+def _forget_full_stdout() -> None:
+    """Keep Python from failing once more at its end, where nothing can be printed."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        _forget_stdout()
+
+
+def _forget_stdout() -> None:
+    from v2hdm.store.files import forget_stdout
+
+    forget_stdout()
+
+
+def _fail(message: str) -> int:
+    print(f"error: {one_line(message)}", file=sys.stderr)
+    return EXIT_USER_ERROR
+
+
+_ONE_PRESS_S = 2.0
+
+
+def answer_signals() -> None:
+    """Take SIGTERM, a service manager's way to say Ctrl-C, for it, and several presses in a row for one.
+
+    Otherwise the second would interrupt the tidying up after the first.
+    """
+    pressed_s = -_ONE_PRESS_S
+
+    def interrupt(*_: object) -> None:
+        nonlocal pressed_s
+        before_s, pressed_s = pressed_s, time.monotonic()
+        if pressed_s - before_s > _ONE_PRESS_S:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)
+
+
+def version_line() -> str:
+    """The versions, in one line: of this package, the libraries that count, and the detector's weights.
+
+    Nothing of it is imported: it answers where an install is broken, too.
+    """
+    parts = [f"v2hdm {__version__}"]
+    for packages in (("torch",), ("onnxruntime", "onnxruntime-gpu"), ("numba",)):
+        found = []
+        for name in packages:
+            with suppress(metadata.PackageNotFoundError):
+                found.append(f"{name} {metadata.version(name)}")
+        parts += found or [f"no {packages[0]}"]
+    return ", ".join([*parts, _weights()])
+
+
+def _weights() -> str:
+    manifest = Path(__file__).parents[1] / "detection" / "weights" / "manifest.json"
+    try:
+        network = json.loads(manifest.read_text(encoding="utf-8"))["files"]["default.onnx"]["sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return "no weights"
+    return f"weights {network[:8]}"

@@ -1,0 +1,232 @@
+"""From a drive to a map, calibrations and a verdict: the stages of docs/design.md, one line each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch  # noqa: F401  # its absence is reported before that of what is built on it
+
+from v2hdm.detection.batch import detect_images
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.weights import unknown_network
+from v2hdm.errors import AdjustError, MappingError, V2hdmError
+from v2hdm.io.drive import ReadOptions, join_drives, read_drive
+from v2hdm.mapping.crew import ALONE
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.pipeline.base import changes_json, check_together, read_base
+from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
+from v2hdm.pipeline.config import check_choice
+from v2hdm.pipeline.context import Context
+from v2hdm.pipeline.detections import detect_in_pieces
+from v2hdm.pipeline.evaluate import evaluate
+from v2hdm.pipeline.inspect import Inspection, inspect_each, join
+from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.result import Result, describe_run
+from v2hdm.pipeline.survey import Survey, check_survey, take_survey
+from v2hdm.progress import Progress, silent
+from v2hdm.records import Drive, ImageDetections
+from v2hdm.site.changes import Base
+from v2hdm.verdict import Finding, Status, Verdict
+from v2hdm.verdict.results.solution import check_result
+from v2hdm.verdict.results.survey import check_known_sizes
+
+_log = logging.getLogger(__name__)
+
+Source = Drive | Path | str
+
+
+@dataclass(frozen=True)
+class Read:
+    """Drives as they were read, as one, and the digests of their images."""
+
+    drives: tuple[Drive, ...]
+    whole: Drive
+    contents: Contents
+
+
+def map_drive(
+    drive: Source | Iterable[Source],
+    *,
+    options: MappingOptions | None = None,
+    detector: Detector | DetectorOptions | None = None,
+    reading: ReadOptions | None = None,
+    base: Path | str | None = None,
+    name: str | None = None,
+    cache: Path | str | None = None,
+    progress: Progress = silent,
+    workers: int = 0,
+    context: Context | None = None,
+) -> Result:
+    """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
+
+    Args:
+        drive: the drive or its folder, or several.
+        options: settings of association, adjustment and lanes.
+        detector: the detector, or its settings.
+        reading: how folders are read.
+        base: the map.geojson of an earlier result, which the drive brings up to date.
+        name: of the result; None takes that of the drive.
+        cache: folder that keeps what each stage has found for the next call; None keeps nothing.
+        progress: shows how far the long steps are, ``progress(task, done, total)``.
+        workers: processes; 0 takes one per core.
+        context: takes the place of the last three.
+
+    Returns:
+        The map in the frame ``map`` (east, north, up; m), calibrations, trajectory and verdict. The verdict
+        is data: a FAIL raises nothing.
+
+    Raises:
+        DriveError: the drive cannot be read.
+        MapFileError: ``base`` cannot be used.
+        DetectorError: the detector cannot be used.
+        MappingError: there is nothing to map, although no check of the drive has failed.
+
+    >>> result = map_drive(port, workers=1)
+    >>> result.verdict.status.value
+    'PASS'
+    >>> {marking.kind for marking in result.map.markings} <= {"diamond", "lane_dash", "stop_line"}
+    True
+    >>> result.calibrations["front"].cam_from_vehicle.shape
+    (4, 4)
+    """
+    context = context or Context.of(cache, progress, workers)
+    options, reading = options or MappingOptions(), reading or ReadOptions()
+    settings = detector.options if isinstance(detector, Detector) else detector
+    settings = settings or DetectorOptions.for_mapping()
+    sources = [drive] if isinstance(drive, Source) else list(drive)
+    check_choice(options, len(sources), base is not None)
+    read = read_all(sources, reading, context)
+    earlier, survey = _given(read.whole, options, base)
+    checked = _check(read, reading, context)
+    about = describe_run(name or read.whole.name, read.whole, _paths(sources), reading)
+    unjudged = Result(
+        about, read.drives, read.contents, checked.drive_as_described, context.seconds, options.device
+    )
+    try:
+        with closing(context.viewer):
+            detections = _detect(checked.drive, read.contents, settings, context)
+            sets = _associate_and_adjust(checked.drive, read.contents, detections, survey, earlier, context)
+    except (MappingError, AdjustError) as failure:
+        if not checked.has_failed:
+            raise
+        return _without_map(unjudged, checked, failure)
+    return _judge(unjudged, checked, detections, sets, survey, context)
+
+
+def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
+    """Read several drives, each by the executor of ``context``, and join them.
+
+    Raises:
+        DriveError: one cannot be read, or they do not belong together.
+    """
+    executor = context.executor or ALONE
+    with context.timed("read"):
+        begun = [executor.begin(partial(_read_one, one, options)) for one in sources]
+        found = [wait() for wait in begun]
+    for drive, _ in found:
+        _log.info(
+            "drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras)
+        )
+    drives = tuple(drive for drive, _ in found)
+    digests = {path: digest for _, contents in found for path, digest in contents.digests.items()}
+    return Read(drives, join_drives(drives), Contents(digests))
+
+
+def _read_one(source: Source, options: ReadOptions) -> tuple[Drive, Contents]:
+    drive = source if isinstance(source, Drive) else read_drive(Path(source), options)
+    return drive, Contents.of([drive])
+
+
+def _paths(sources: Sequence[Source]) -> list[Path]:
+    return [one.root if isinstance(one, Drive) else Path(one) for one in sources]
+
+
+def _given(drive: Drive, options: MappingOptions, base: Path | str | None) -> tuple[Base | None, Survey]:
+    """The earlier map and the survey: what does not belong to the drive is refused before any long work."""
+    earlier = None if base is None else read_base(Path(base))
+    if earlier is not None:
+        check_together(earlier, drive, str(base))
+    return earlier, take_survey(drive, options)
+
+
+def _check(read: Read, reading: ReadOptions, context: Context) -> Inspection:
+    with context.timed("check"):
+        return join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+
+
+def _detect(
+    drive: Drive, contents: Contents, options: DetectorOptions, context: Context
+) -> list[ImageDetections]:
+    unknown = unknown_network(options.model) if options.model is not None else None
+    if unknown is not None:
+        _log.warning("%s", unknown)
+    with context.timed("detect"):
+        context.viewer.begun(context.folder, drive)
+        detections = detect_in_pieces(drive, contents, options, context, context.detect or detect_images)
+    markings = sum(len(found.markings) for found in detections)
+    lanes = sum(len(found.lanes) for found in detections)
+    _log.info(
+        "detected %d markings and %d pieces of lane paint in %d images", markings, lanes, len(detections)
+    )
+    return detections
+
+
+def _associate_and_adjust(
+    drive: Drive,
+    contents: Contents,
+    detections: Sequence[ImageDetections],
+    survey: Survey,
+    base: Base | None,
+    context: Context,
+) -> dict[str, MappedSet]:
+    with context.timed("map"):
+        return map_camera_sets(drive, contents.key(drive), detections, survey, base, context)
+
+
+def _judge(
+    result: Result,
+    checked: Inspection,
+    detections: Sequence[ImageDetections],
+    sets: dict[str, MappedSet],
+    survey: Survey,
+    context: Context,
+) -> Result:
+    methods = {name: one.methods for name, one in sets.items()}
+    best, compared = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
+    with context.timed("judge"):
+        found = check_result(checked.drive, methods, checked.ground)
+        unfit = check_known_sizes(survey.mapping.known_sizes, best)
+        verdict = Verdict.of([*checked.findings, *found, *unfit, *check_survey(survey, best, compared)])
+    with context.timed("evaluate"):
+        judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
+    figures = {
+        **judgement.metrics,
+        **({} if best.changes is None else {"changes": changes_json(best.changes)}),
+    }
+    figures["seconds"] = context.seconds
+    headlines = tuple(judgement.headlines)
+    if compared is not None:
+        figures["check_points"] = compared.figures()
+        headlines = (*headlines, compared.headline)
+    return replace(
+        result,
+        verdict=verdict,
+        figures=figures,
+        headlines=headlines,
+        detections=tuple(detections),
+        methods=methods,
+        judgement=judgement,
+        check_points=compared,
+    )
+
+
+def _without_map(result: Result, checked: Inspection, failure: V2hdmError) -> Result:
+    """The result of a drive whose checks failed and of which no map came."""
+    failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
+    return replace(result, verdict=Verdict.of([*checked.findings, failed]), figures={"results": {}})

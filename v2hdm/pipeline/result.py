@@ -1,0 +1,318 @@
+"""The result of a mapped drive, and its files."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm import __version__
+from v2hdm.detection.batch import read_image
+from v2hdm.errors import MapFileError, MappingError
+from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
+from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.trajectory import interpolate
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration, write_calibration_as
+from v2hdm.io.drive import ReadOptions
+from v2hdm.io.drive.of_result import told_of
+from v2hdm.io.maps.evidence import FILE as RESIDUALS
+from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions, write_residuals
+from v2hdm.io.maps.features import with_heights
+from v2hdm.io.maps.formats import write_map
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.trajectory import write_tum
+from v2hdm.mapping.results import AdjustedPoses, MethodResult
+from v2hdm.pipeline.base import write_changes
+from v2hdm.pipeline.camera_sets import BEST
+from v2hdm.pipeline.context import Context
+from v2hdm.pipeline.evaluate import CameraSets, Judgement
+from v2hdm.pipeline.keys import Contents
+from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory, Visit
+from v2hdm.report.check_points import CheckTable, write_check_points
+from v2hdm.report.figures import save_birdseye, save_growth
+from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.photos import save_overlay
+from v2hdm.store.cache import library_versions
+from v2hdm.store.files import replace_text
+from v2hdm.verdict import Verdict
+
+
+def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
+    """The beginning of ``metrics.json``: name, version, date (UTC), the drive at ``paths`` as it was read."""
+    return {
+        "name": name,
+        "version": __version__,
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "drive": _drive(drive, paths, options),
+        "versions": {"v2hdm": __version__, **library_versions()},
+    }
+
+
+def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
+    stamp_s = [image.stamp_s for image in drive.images]
+    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    return {
+        **told_of(drive, paths, options),
+        "duration_s": round(float(np.ptp(stamp_s)), 3),
+        "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
+        "position_sigma_m": drive.pose_noise.position_m,
+        "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
+    }
+
+
+_HEADER = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
+
+
+def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None:
+    """Write ``trajectory.tum`` and ``trajectory_sigma.csv``, a line for each time of an image.
+
+    Of joined drives each has its own, such as ``trajectory_monday.tum``.
+
+    The poses are in the frame of the recorded ones, whose road is not flat: each is the recorded pose of that
+    time, moved as the solve has moved the flat one. ``seen`` says whether a marking was seen then; where none
+    was, the pose is the recorded one and its sigmas those that the drive states.
+    """
+    for number, visit in enumerate(drive.visits):
+        own = poses.visit == number
+        stem = f"trajectory_{visit.name}" if drive.joined else "trajectory"
+        stamp_s, before = poses.stamp_s[own], poses.before[own]
+        moved = np.linalg.inv(before) @ poses.map_from_vehicle[own]
+        write_tum(Trajectory(stamp_s, _recorded(visit, stamp_s, before) @ moved), folder / f"{stem}.tum")
+        rows = [
+            f"{stamp:.9f},{int(seen)}," + ",".join(f"{value:.6g}" for value in sigma)
+            for stamp, seen, sigma in zip(stamp_s, poses.seen[own], poses.sigma[own], strict=True)
+        ]
+        replace_text(folder / f"{stem}_sigma.csv", "\n".join([_HEADER, *rows]) + "\n")
+
+
+def _recorded(visit: Visit, stamp_s: FloatArray, before: FloatArray) -> FloatArray:
+    """The poses (F, 4, 4) as recorded, those laid flat where the visit has no others."""
+    if visit.recorded is None:
+        return before
+    recorded, _ = interpolate(visit.recorded, stamp_s, float("inf"))
+    return recorded
+
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Result:
+    """The map of a drive, its calibrations, trajectory and verdict.
+
+    Attributes:
+        about: name, date, versions and the drive, as ``metrics.json`` begins.
+        drives: as they were read.
+        contents: digests of their images.
+        drive: what was mapped, several drives as one; its clocks are corrected.
+        seconds: how long each step took, s.
+        device: what torch computed on.
+        verdict: all findings, the worst first; ``verdict.status`` is PASS, WARN or FAIL.
+        figures: those of ``metrics.json`` beside what it begins with.
+        headlines: sentences for a reader.
+        detections: in each image of ``drive``.
+        methods: results by camera set, then by method; those of all cameras come last.
+        judgement: the figures of the evaluation; None where no map was made.
+        check_points: a survey's check points against the map; None without any.
+
+    >>> saved = result.save(folder / "port")
+    >>> sorted(path.name for path in saved.glob("*.geojson"))
+    ['excluded.geojson', 'map.geojson']
+    >>> result.trajectory.map_from_vehicle.shape[1:], result.trajectory.sigma.shape[1:]
+    ((4, 4), (6,))
+    """
+
+    about: Mapping[str, Any]
+    drives: tuple[Drive, ...]
+    contents: Contents
+    drive: Drive
+    seconds: dict[str, float]
+    device: str = "cpu"
+    verdict: Verdict = field(default_factory=lambda: Verdict(()))
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    headlines: Sequence[str] = ()
+    detections: Sequence[ImageDetections] = ()
+    methods: CameraSets = field(default_factory=dict)
+    judgement: Judgement | None = None
+    check_points: CheckTable | None = None
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The content of ``metrics.json``."""
+        return {**self.about, "verdict": self.verdict.as_json(), **self.figures}
+
+    @property
+    def best(self) -> MethodResult:
+        """The joint optimisation with all cameras.
+
+        Raises:
+            MappingError: no map came of the drive; the verdict says why.
+        """
+        if not self.methods:
+            raise MappingError(f"{self.about['name']}: no map came of this drive; its verdict says why")
+        return list(self.methods.values())[-1][BEST]
+
+    @property
+    def map(self) -> HdMap:
+        """The map, in the frame ``map``: m, its lane lines in the direction in which they were passed."""
+        return _along_route(with_heights(self.best.hd_map, self.drive.road), self.drive)
+
+    @property
+    def calibrations(self) -> Mapping[str, Calibration]:
+        """By camera ``cam_from_vehicle`` (4, 4) and the covariance (6, 6) of its tangent."""
+        return self.best.calibrations
+
+    @property
+    def trajectory(self) -> AdjustedPoses:
+        """``map_from_vehicle`` (F, 4, 4) at the images' times, on the flat road; sigmas (F, 6): m, rad."""
+        poses = self.best.poses
+        assert poses is not None  # of the joint optimisation they always are
+        return poses
+
+    def save(
+        self,
+        folder: Path | str,
+        formats: Sequence[str] = ("geojson",),
+        all_maps: bool = False,
+        mosaic: bool = False,
+    ) -> Path:
+        """Write all that ``v2hdm map`` writes into ``folder``, whole or not at all; returns the folder.
+
+        Args:
+            folder: is made, or has an earlier result, which is replaced; nobody else's file is.
+            formats: of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``.
+            all_maps: whether the map of every method and camera set is written, into ``maps/``.
+            mosaic: whether the ground is shown from above, too.
+
+        Raises:
+            ConfigError: there is something else in the folder, or a format cannot be written.
+        """
+        with result_folder(Path(folder), "folder") as partial:
+            self.write(partial, formats, all_maps, mosaic, Context(seconds=self.seconds))
+        return Path(folder)
+
+    def write(
+        self, folder: Path, formats: Sequence[str], all_maps: bool, mosaic: bool, context: Context
+    ) -> None:
+        """Write what :meth:`save` does into a folder that is still unfinished."""
+        from v2hdm.mosaic.result import write_mosaic
+        from v2hdm.report.page.document import write_page
+
+        if self.judgement is not None:
+            _write_map(folder, self, formats, self.judgement)
+            if all_maps:
+                _write_maps(folder / "maps", self.drive, self.methods)
+        write_json(folder / "metrics.json", self.metrics)
+        if mosaic and self.methods:
+            with context.timed("mosaic"):
+                write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
+        with context.timed("report"):
+            write_page(folder, self.drive)
+
+
+def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: Judgement) -> None:
+    """Write map, calibrations, trajectory and pictures."""
+    drive, best, verdict = result.drive, result.best, result.verdict.as_json()
+    write_map(result.map, folder, "map", formats, verdict)
+    about = Provenance.today(drive.name, verdict)
+    for name, calibration in best.calibrations.items():
+        clock = None if drive.joined else best.clocks[0].get(name)
+        clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
+        path = folder / f"calibration_{name}.yaml"
+        write_calibration(calibration, path, clock_s=clock_s, verdict=verdict, about=about)
+        _write_calibration_forms(calibration, about, path)
+    write_trajectories(result.trajectory, drive, folder)
+    if best.residuals is not None:
+        write_residuals(best.residuals, folder / RESIDUALS)
+    if best.changes is not None:
+        write_changes(best.changes, best.hd_map, folder, _route(drive))
+    if result.check_points is not None:
+        write_check_points(result.check_points, folder / "check_points.csv")
+    _write_exclusions(folder / "excluded.geojson", drive, result.methods)
+    maps = {name: one.hd_map for name, one in list(result.methods.values())[-1].items()}
+    save_birdseye(folder / "birdseye.png", maps, BEST, _route(drive), judgement.truth)
+    if any(judgement.growth.values()):
+        save_growth(folder / "growth.png", judgement.growth)
+    for name in best.calibrations:
+        image = _fullest_image(drive, name, result.detections)
+        _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
+
+
+def _route(drive: Drive) -> FloatArray:
+    """Positions (N, 2) of the vehicle, with a nan between one visit and the next."""
+    images = drive.images
+    places = np.array([image.map_from_vehicle[:2, 3] for image in images])
+    ends = np.flatnonzero(np.diff([image.visit for image in images])) + 1
+    return np.insert(places, ends, np.nan, axis=0)
+
+
+def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
+    """The map with every lane line in the direction in which the drive passed it: that of its lanelets."""
+    route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    ahead = np.array([image.map_from_vehicle[:2, 0] for image in drive.images])
+    lanes = []
+    for lane in hd_map.lanes:
+        offset = lane.points_map[:, None] - route_map
+        passed = ahead[np.argmin((offset**2).sum(axis=2), axis=1)]
+        if (passed * np.gradient(lane.points_map, axis=0)).sum() < 0:
+            heights = None if lane.heights_m is None else lane.heights_m[::-1]
+            lane = replace(lane, points_map=lane.points_map[::-1], heights_m=heights)
+        lanes.append(lane)
+    return replace(hd_map, lanes=tuple(lanes))
+
+
+def _write_calibration_forms(calibration: Calibration, about: Provenance, path: Path) -> None:
+    """The calibration in the forms of other tools, into a folder named like ``path``."""
+    for name in CALIBRATION_FORMATS:
+        try:
+            write_calibration_as(name, calibration, about, path.with_suffix(""), calibration.info.name)
+        except MapFileError as error:
+            _log.info("no %s calibration is written: %s", name, error)
+
+
+def _write_exclusions(path: Path, drive: Drive, sets: CameraSets) -> None:
+    """Write the candidates that the best method left out, of every camera set."""
+    excluded = [
+        ExcludedMarking(one.kind, one.position_map, one.sightings, one.reason, name)
+        for name, methods in sets.items()
+        for one in methods[BEST].excluded
+    ]
+    write_exclusions(excluded, path, drive.origin, drive.road)
+
+
+def _write_maps(folder: Path, drive: Drive, sets: CameraSets) -> None:
+    folder.mkdir()
+    for name, methods in sets.items():
+        for method, result in methods.items():
+            write_geojson(with_heights(result.hd_map, drive.road), folder / f"{name}_{method}.geojson")
+
+
+def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) -> None:
+    """The map in an image: by the initial IPM and the recorded pose, and by what the solve has adjusted."""
+    camera = drive.cameras[image.camera]
+    adjusted = image.map_from_vehicle if best.poses is None else best.poses.of_image(image)
+    initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
+    cam_from_map = best.calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(adjusted)
+    ipm = facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
+    views = {
+        initial: np.linalg.inv(ipm) @ flat_motion(inverse(image.map_from_vehicle)),
+        BEST: pinhole_px_from_ground(camera.info.intrinsic, cam_from_map),
+    }
+    position_map = adjusted[:2, 3]
+    save_overlay(path, read_image(image, camera), camera.info, best.hd_map, position_map, views)
+
+
+def _fullest_image(drive: Drive, name: str, detections: Sequence[ImageDetections]) -> Image:
+    """The image of a camera in which most corners were found; its first one where there are none."""
+    images = [index for index, image in enumerate(drive.images) if image.camera == name]
+    corners = dict.fromkeys(images, 0)
+    for found in detections:
+        if found.image in corners:
+            corners[found.image] = sum(int(marking.corner_valid.sum()) for marking in found.markings)
+    return drive.images[max(images, key=corners.__getitem__)]
