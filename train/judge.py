@@ -46,8 +46,8 @@ class JudgeConfig:
     """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019).
 
     What it is shown is varied, as other cameras and roads would: each channel of a view by a factor whose
-    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In ``claimed_share``
-    of the cases the paint network claims what it claims of markings on average, so that the image has a say
+    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In a
+    ``claimed_share`` of the cases the paint network claims what it claims of markings on average, so that the image has a say
     of its own where that network is sure and wrong. ``side_weight`` is that of the sides' errors in the loss.
     """
 

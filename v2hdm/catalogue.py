@@ -29,7 +29,7 @@ _TINY_M = 1e-3
 """Least size that is told from nothing, m."""
 
 NOT_PAINT = "none"
-"""What a label means that is no marking: no class may be called so."""
+"""The label of everything that is no marking; no class may have this name."""
 
 _NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
 """Names of classes stand in file formats, log lines and label files."""
@@ -214,7 +214,7 @@ SHIPPED = Catalogue(
 """The shipped classes."""
 
 PAINT_CLASSES = SHIPPED.names
-"""What the shipped detector tells apart, in the order of its class channels. Chevrons are the bars and angles
+"""The classes of the shipped detector, in the order of its class channels. Chevrons are the bars and angles
 that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
 
 CORNERED_CLASSES = SHIPPED.cornered

@@ -146,7 +146,7 @@ DRIFTS: Mapping[str, str] = {
     "heading_rad": "heading_drift_rad",
     "roll_pitch_rad": "roll_pitch_drift_rad",
 }
-"""Of each standard deviation of :class:`PoseNoise`, its drift."""
+"""The drift that belongs to each standard deviation of :class:`PoseNoise`."""
 
 _USUAL_DRIFT_SHARE = 0.5
 """Share of a variance that drifts where nobody says otherwise: RTK's errors are about half multipath and
@@ -288,7 +288,7 @@ class LaneDetection:
 
 @dataclass(frozen=True)
 class ImageDetections:
-    """What the detector found in image ``i`` of a drive (an index into ``Drive.images``)."""
+    """The detections in image ``i`` of a drive (an index into ``Drive.images``)."""
 
     image: int
     markings: tuple[MarkingDetection, ...]
@@ -413,7 +413,7 @@ _POINTS = {Marking: "corners_map", Lane: "points_map", Symbol: "outline_map"}
 
 
 class Fate(Enum):
-    """What became of a marking between an earlier map and a new drive."""
+    """The fate of a marking between an earlier map and a new drive."""
 
     MOVED = "moved"
     VANISHED = "vanished"
@@ -460,7 +460,7 @@ class Changes:
     shift_m: FloatArray
 
     def of(self, fate: Fate) -> tuple[Change, ...]:
-        """Those of one fate."""
+        """The changes of one fate."""
         return tuple(one for one in self.changes if one.fate is fate)
 
 

@@ -28,11 +28,11 @@ from v2hdm.adjust.engines.numba import engine
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.fleet.cluster import LOCAL, cluster
-from v2hdm.fleet.crew import RayCrew
+from v2hdm.fleet.executor import RayExecutor
 from v2hdm.fleet.workers import DetectorActor, detect_by
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.inspect import inspect_each
@@ -116,10 +116,10 @@ def visits(folders: Sequence[Path], repeats: int) -> None:
     wall: dict[str, list[float]] = {"here": [], "by tasks": []}
     found = {}
     for _ in range(repeats):
-        crews: dict[str, Crew] = {"here": ALONE, "by tasks": RayCrew(2, str(Path.cwd()))}
-        for who, crew in crews.items():
+        executors: dict[str, Executor] = {"here": IN_PROCESS, "by tasks": RayExecutor(2, str(Path.cwd()))}
+        for who, executor in executors.items():
             began = time.perf_counter()
-            context = Context(workers=1, executor=crew)
+            context = Context(workers=1, executor=executor)
             read = read_all(config.drive.paths, config.drive, context)
             found[who] = inspect_each(read.drives, read.contents, config.drive.max_gap_s, context)
             wall[who].append(time.perf_counter() - began)

@@ -45,7 +45,7 @@ def written(columns: str, rows: FloatArray) -> str:
 
 def test_local_points_keep_their_metres_names_roles_and_sigmas(tmp_path: Path) -> None:
     text = (
-        "\ufeffPoint;X;Y;Z;sigma_m;sigma_north_m;Role;Description;Crew\n"
+        "\ufeffPoint;X;Y;Z;sigma_m;sigma_north_m;Role;Description;Executor\n"
         "A1;3.21;4.05;0.30;;;;corner of the stop line, north;Kim\n"
         "# re-measured\n"
         "A2;61.7;12.33;;0.005;0.02;CHECK;;Kim\n"

@@ -17,7 +17,7 @@ pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 from tests.fleet.test_fleet import written
 from v2hdm.errors import DriveError, WorkerError
-from v2hdm.fleet.crew import RayCrew
+from v2hdm.fleet.executor import RayExecutor
 from v2hdm.fleet.plan import Row, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.workers import map_drive
@@ -50,9 +50,9 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
     died = tmp_path / "died"
 
     def mapping(*arguments: Any) -> Any:
-        import v2hdm.fleet.crew as crew
+        import v2hdm.fleet.executor as executor
 
-        done = crew._done
+        done = executor._done
 
         def dies_once(*work: Any) -> Any:
             if not died.exists():
@@ -60,11 +60,11 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
                 os.kill(os.getpid(), signal.SIGKILL)
             return done(*work)
 
-        crew._done = dies_once
+        executor._done = dies_once
         try:
             return map_drive(*arguments)
         finally:
-            crew._done = done
+            executor._done = done
 
     monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
     monkeypatch.setattr("v2hdm.fleet.workers.map_drive", mapping)
@@ -116,9 +116,9 @@ def test_what_is_wrong_in_a_task_is_told_as_by_one_process(
     def dies() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
-    monkeypatch.setattr("v2hdm.fleet.crew.RETRIES", 0)
-    crew = RayCrew(2, str(tmp_path))
-    waits = [crew.begin(work) for work in (refuses, dies)]
+    monkeypatch.setattr("v2hdm.fleet.executor.RETRIES", 0)
+    executor = RayExecutor(2, str(tmp_path))
+    waits = [executor.begin(work) for work in (refuses, dies)]
     with pytest.raises(DriveError, match="cannot be read"):
         waits[0]()
     with pytest.raises(WorkerError, match="died again and again"):

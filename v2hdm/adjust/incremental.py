@@ -366,7 +366,7 @@ _Known = TypeVar("_Known", ControlPoints, KnownLengths)
 
 
 def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:
-    """What is known of several markings' corners, which begin at ``starts`` among those of all."""
+    """Prior knowledge of several markings' corners, which begin at ``starts`` among those of all."""
     given = [(one, start) for one, start in zip(parts, starts, strict=False) if one is not None]
     if not given:
         return None

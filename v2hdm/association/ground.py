@@ -62,7 +62,7 @@ class Located:
         return np.asarray(self.height_m[:, None] / np.hypot(self.range_m, self.height_m[:, None]))
 
     def direction_covariance_m2(self, sigma_rad: float) -> FloatArray:
-        """What an uncertain viewing direction adds to ``covariance_m2``: (S, 4, 2, 2)."""
+        """The part (S, 4, 2, 2) of ``covariance_m2`` due to an uncertain viewing direction."""
         return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)
 
 

@@ -18,9 +18,9 @@ from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Sightings
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _REFUSED = 1e9
@@ -65,18 +65,18 @@ def build_tracks(
     rig: Rig,
     uncertainty: Uncertainty,
     options: AssociationOptions,
-    crew: Crew = ALONE,
+    executor: Executor = IN_PROCESS,
 ) -> Association:
     """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
 
     A sighting continues at most one track and a track takes at most one sighting of an image. A
     sighting that continues none starts its own. Sightings with fewer than two valid corners on the
-    ground belong to no track. No track outlives its visit: each visit is linked by itself, by ``crew``.
+    ground belong to no track. No track outlives its visit: each visit is linked by itself, by ``executor``.
     """
     visit = sightings.visit[sightings.frame]
     rows = [np.flatnonzero(visit == own) for own in np.unique(visit)]
     begun = [
-        crew.begin(partial(_link, *_of_visit(sightings, located, rig, own), uncertainty, options))
+        executor.begin(partial(_link, *_of_visit(sightings, located, rig, own), uncertainty, options))
         for own in rows
     ]
     linked = [wait() for wait in begun]
@@ -224,7 +224,7 @@ class _Linker:
         return np.asarray(np.sum(offset * solved, axis=-1))
 
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
-        """What a wrong extrinsic adds between the images of two sightings (P, 2, 2).
+        """The covariance that a wrong extrinsic adds between the images of two sightings (P, 2, 2).
 
         The error along the ray is r^2 / h * d and one across it r * d; between the images both
         change by their derivative times the motion, and the turn of the vehicle swings the first.

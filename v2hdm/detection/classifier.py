@@ -62,7 +62,7 @@ _MOST = 3.0
 """More company than this adds nothing."""
 
 _APART_M = 0.3
-"""What is nearer is another reading of the same paint."""
+"""Nearer quadrilaterals are readings of the same paint."""
 
 _LEAST_GAP = 0.5
 _LONGEST_GAP_M = 15.0

@@ -1,4 +1,4 @@
-"""What the classifier is given: numbers about a fitted quadrilateral, and a picture of it in its own frame.
+"""The inputs of the classifier: numbers about a fitted quadrilateral, and a picture of it in its own frame.
 
 A homography takes the four corners to those of a rectangle, so that every marking of a class looks the same
 wherever it lies in the image (Faster R-CNN's region of interest, Ren et al., NeurIPS 2015, along the

@@ -1,4 +1,4 @@
-"""What a user may set of the detector."""
+"""The settings of the detector."""
 
 from __future__ import annotations
 

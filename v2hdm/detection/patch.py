@@ -208,7 +208,7 @@ class ImageQuads(Quad):
 
     @classmethod
     def of(cls, camera: RoadCamera, corners_px: FloatArray) -> ImageQuads:
-        """Those with recorded corners (M, 4, 2)."""
+        """The patches with recorded corners (M, 4, 2)."""
         if not camera.distorted:
             return cls(corners_px, np.zeros(len(corners_px), dtype=np.bool_), None)
         frames = LensFrames.about(camera, corners_px)

@@ -192,8 +192,8 @@ def _mapped(
     job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, cache: StageCache
 ) -> RunResult:
     # It loads torch, which a finished result does not need.
-    from v2hdm.fleet.crew import RayCrew
+    from v2hdm.fleet.executor import RayExecutor
 
-    crew = RayCrew(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
-    context = Context(progress=report, detect=partial(detect_by, detectors), executor=crew)
+    executor = RayExecutor(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
+    context = Context(progress=report, detect=partial(detect_by, detectors), executor=executor)
     return map_and_save(config, cache, job.config_yaml, context)

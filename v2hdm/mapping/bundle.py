@@ -72,7 +72,7 @@ VARIANCE_FACTORS = (0.05, 20.0)
 
 @dataclass(frozen=True)
 class Model:
-    """What a solve estimates, and its noise beyond that of the corners.
+    """The unknowns of a solve, and its noise beyond that of the corners.
 
     ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``.
     ``sizes`` and ``survey`` are stated by the user; ``clock_sigma_s`` is the prior of clock offsets,

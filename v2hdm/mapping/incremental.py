@@ -50,7 +50,7 @@ _LEAST_CORNERS = 3
 
 @dataclass(frozen=True)
 class Grown:
-    """What the drive has left behind: the map's markings as groups of sightings, of usable corners (S, 4).
+    """The map so far: its markings as groups of sightings, of usable corners (S, 4).
 
     ``rig`` holds the extrinsics, and the poses as they were last solved for.
     """
@@ -245,7 +245,7 @@ class IncrementalMapper:
         return out
 
     def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
-        """What ``rows`` saw of corners that they saw twice; None where that fixes no marking."""
+        """The observations in ``rows`` of corners seen twice; None where they determine no marking."""
         order = tracks.corner_order()[rows]
         which, corner = np.nonzero(np.take_along_axis(usable[rows], order, axis=1))
         twice = np.bincount(corner, minlength=4) >= 2

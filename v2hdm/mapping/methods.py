@@ -19,11 +19,11 @@ from v2hdm.adjust import Fault, Status, observability
 from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.errors import ConfigError
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
-from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
@@ -61,7 +61,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
 
 
 def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
-    """Of each visit each camera's clock offset: what its images were moved by, and the solve's beyond."""
+    """The clock offset of each camera by session: the shift of its images plus the solve's estimate, s."""
     evidence, drive = outcome.evidence, outcome.inputs.drive
     applied_s = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
     suspects = [one for one in evidence.suspects if one.fault is Fault.CLOCK]
@@ -132,7 +132,7 @@ def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corn
 
 
 def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
-    """Those of the observations that the solve accepted, of markings and of candidates left out."""
+    """The residuals of accepted observations, of markings and of rejected candidates."""
     drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, optimised.bundle
     seen, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
     marking = np.zeros(bundle.association.count, dtype=np.int64)
@@ -174,7 +174,7 @@ def run_methods(
     progress: Progress = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
-    crew: Crew = ALONE,
+    executor: Executor = IN_PROCESS,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -186,7 +186,7 @@ def run_methods(
         progress: gets the name of each step as it begins.
         base: an earlier map that ``Opt`` brings up to date.
         grey: reads the grey values (H, W) of an image, to look where ``base`` has paint.
-        crew: does what belongs to one visit of several.
+        executor: does what belongs to one visit of several.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -200,7 +200,7 @@ def run_methods(
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
     progress("linking sightings")
-    given = Inputs(drive, detections, cameras, options, crew)
+    given = Inputs(drive, detections, cameras, options, executor)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
         progress(name)

@@ -21,6 +21,7 @@ from v2hdm.association.groups import Association, attach, fuse_groups, in_view, 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.errors import AdjustError, MappingError
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.tensors import extrinsic_from_ipm
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
@@ -31,7 +32,6 @@ from v2hdm.mapping.bundle import (
     solve_bundle,
 )
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
-from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.options import AUTO, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, largest_noise
@@ -62,10 +62,10 @@ class Optimiser:
         cameras: Mapping[str, Camera],
         pose_noise: PoseNoise | Sequence[PoseNoise],
         options: MappingOptions,
-        crew: Crew = ALONE,
+        executor: Executor = IN_PROCESS,
     ) -> None:
         """``pose_noise`` is that of all visits, or of each; gates take the largest of each kind."""
-        self._crew = crew
+        self._executor = executor
         self._sightings = sightings
         self._views = views
         self._cameras = {name: cameras[name] for name in sightings.cameras}
@@ -84,7 +84,7 @@ class Optimiser:
 
     @property
     def pose_model(self) -> str:
-        """What is estimated of the poses, of :data:`v2hdm.adjust.MODELS`."""
+        """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         return self._pose_model
 
     def initial_tracks(self) -> Association:
@@ -186,7 +186,9 @@ class Optimiser:
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         noise = self._pose_noise
         uncertainty = Uncertainty(direction_rad, noise.roll_pitch_rad, noise.position_m)
-        return build_tracks(self._sightings, located, rig, uncertainty, self._options.association, self._crew)
+        return build_tracks(
+            self._sightings, located, rig, uncertainty, self._options.association, self._executor
+        )
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""

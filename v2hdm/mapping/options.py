@@ -1,4 +1,4 @@
-"""What a user may set about the mapping; every default suits a port and a city street alike."""
+"""The settings of the mapping; every default suits a port and a city street alike."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ BATCH = "batch"
 INCREMENTAL = "incremental"
 AUTO = "auto"
 MODES = (BATCH, INCREMENTAL)
-"""What ``mapping.mode`` may be."""
+"""Values of ``mapping.mode``."""
 
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
-"""What ``mapping.pose_model`` may be: those of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
+"""Values of ``mapping.pose_model``: the models of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
 _RANGES = dict.fromkeys(
     (

@@ -18,11 +18,11 @@ from v2hdm.adjust import Fault, ScoreTest, pose_innovations, score_faults
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Sightings, collect_sightings
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
-from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.fit import (
     along_route,
     camera_fits,
@@ -79,13 +79,13 @@ MOST_CORRECTIONS = 4
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a camera set is mapped from: as given, or after corrections."""
+    """The inputs of a camera set: as given, or after corrections."""
 
     drive: Drive
     detections: Sequence[ImageDetections]
     cameras: Sequence[str]
     options: MappingOptions
-    crew: Crew = ALONE
+    executor: Executor = IN_PROCESS
 
     @cached_property
     def sightings(self) -> Sightings:
@@ -97,7 +97,7 @@ class Inputs:
         """Of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, self.crew)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, self.executor)
 
     @cached_property
     def tracks(self) -> Association:
@@ -107,7 +107,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was optimised from which inputs, and the evidence for the checks.
+    """An optimised camera set with its inputs and the evidence for the checks.
 
     ``bundle`` holds the adjusted poses.
     """

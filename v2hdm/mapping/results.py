@@ -1,7 +1,4 @@
-"""What a solve says of its own inputs: how well everything fits, and which input would have to be wrong.
-
-What a mapping method hands back.
-"""
+"""The results of a mapping method, and the evidence of its solve about its inputs."""
 
 from __future__ import annotations
 
@@ -92,7 +89,7 @@ class SolveEvidence:
 
     @property
     def held_out_loss(self) -> float | None:
-        """That of the chosen model, None where too little was seen to hold any of it out."""
+        """The held-out loss of the chosen model, None where too little was seen to hold any of it out."""
         return self.held_out.get(self.pose_model)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from v2hdm.mapping.crew import ALONE, Crew
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
@@ -65,7 +65,7 @@ def map_camera_sets(
         MappingError: no map can be made.
         AdjustError: the adjustment fails.
     """
-    sets, cache, executor = camera_sets(drive), context.cache, context.executor or ALONE
+    sets, cache, executor = camera_sets(drive), context.cache, context.executor or IN_PROCESS
     begun = cache.key(drive_key, list(detections), survey.mapping)
     jobs = []
     for number, (name, cameras) in enumerate(sets.items()):
@@ -76,7 +76,7 @@ def map_camera_sets(
         )
         # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
         shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
-        begin = partial(executor.begin if shared_out else ALONE.begin, work)
+        begin = partial(executor.begin if shared_out else IN_PROCESS.begin, work)
         jobs.append((cache.key(begun, name, cameras, of_last), begin))
     context.progress("map", 0, len(sets))
     found = {}
@@ -95,7 +95,7 @@ def _map_set(
     survey: Survey,
     base: Base | None,
     last: bool,
-    executor: Crew,
+    executor: Executor,
 ) -> MappedSet:
     log_step, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
     methods = run_methods(

@@ -18,7 +18,7 @@ from v2hdm.store.cache import StageCache
 
 if TYPE_CHECKING:  # loads torch, which a finished run does without
     from v2hdm.detection.batch import Detect
-    from v2hdm.mapping.crew import Crew
+    from v2hdm.executor import Executor
     from v2hdm.mapping.results import MethodResult
 
 _log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ class Context:
     progress: Progress = silent
     viewer: Viewer = field(default_factory=Unwatched)
     detect: Detect | None = None
-    executor: Crew | None = None
+    executor: Executor | None = None
     workers: int = 0
     folder: Path = Path()
     seconds: dict[str, float] = field(default_factory=dict)

@@ -9,10 +9,10 @@ from functools import partial
 
 from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
+from v2hdm.executor import IN_PROCESS
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
-from v2hdm.mapping.crew import ALONE
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
@@ -80,7 +80,7 @@ def inspect_each(
         max_gap_s: as there.
         context: keeps what is found, inspects, and shows how far the checks of each drive are.
     """
-    jobs, executor, cache = [], context.executor or ALONE, context.cache
+    jobs, executor, cache = [], context.executor or IN_PROCESS, context.cache
     for drive in drives:
         steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
         work = partial(inspect, drive, max_gap_s, context.processes, steps)

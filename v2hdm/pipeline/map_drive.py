@@ -16,8 +16,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, MappingError, V2hdmError
+from v2hdm.executor import IN_PROCESS
 from v2hdm.io.drive import ReadOptions, join_drives, read_drive
-from v2hdm.mapping.crew import ALONE
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
@@ -125,7 +125,7 @@ def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) 
     Raises:
         DriveError: one cannot be read, or they do not belong together.
     """
-    executor = context.executor or ALONE
+    executor = context.executor or IN_PROCESS
     with context.timed("read"):
         begun = [executor.begin(partial(_read_one, one, options)) for one in sources]
         found = [wait() for wait in begun]

@@ -77,7 +77,7 @@ class Counts:
     as_symbol: IntArray
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
-        """Those of the candidates at ``rows``."""
+        """The candidates at ``rows``."""
         return Counts(*(values[rows] for values in vars(self).values()))
 
 

@@ -128,7 +128,7 @@ class Base:
 
 @dataclass(frozen=True)
 class Names:
-    """What an updated map calls the M markings of the drive's own map.
+    """The ids in an updated map of the M markings of the drive's own map.
 
     ``id`` (M,) is 0 for one that it does not have, ``corner`` (M, 4) where each corner stands in its order.
     """

@@ -84,7 +84,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of the markings.
+    """The fates of the markings.
 
     ``pairs`` were seen again; ``gone`` are the probabilities by old marking that was not, ``fresh`` those by
     new marking that has no partner, that it is new paint. ``shift`` is how the maps lie to each other.

@@ -282,7 +282,7 @@ def _neighbours(points: FloatArray, cloud: LaneCloud, options: LaneOptions) -> t
 def _coordinates(
     points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of each pair: position of the point along and across the seed's line, cosine of directions."""
+    """For each pair: position of the point along and across the seed's line, cosine of directions."""
     seed, point = pairs
     offset = cloud.points_map[point] - points[seed]
     along = np.einsum("pi,pi->p", offset, tangent[seed])

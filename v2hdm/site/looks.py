@@ -216,7 +216,7 @@ class Looks:
     found: IntArray
 
     def watched(self, rate: FloatArray) -> Watched:
-        """What that says, where markings of each place's class are found at a ``rate`` (N,)."""
+        """The log odds of that, where markings of the class are found at a ``rate`` (N,)."""
         return Watched(
             there=np.array(
                 [log_found(k, n, r) for k, n, r in zip(self.found, self.views, rate, strict=True)]
@@ -227,7 +227,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Observer:
-    """What a drive has seen and from where: its ``sightings``, images and cameras, under a ``rig``.
+    """The observations of a drive: its ``sightings``, images and cameras, under a ``rig``.
 
     ``jitter_rad`` is how far the attitude of a pose is off. ``grey`` gives its images, None where they are
     not to be had.
@@ -297,7 +297,7 @@ def find_rates(observer: Observer, markings: Sequence[Marking]) -> Mapping[str, 
 def with_paint(
     watched: Watched, observer: Observer, old: Sequence[Marking], new: Sequence[Marking]
 ) -> Watched:
-    """What was ``watched`` of ``old`` markings, and what images show where no ``new`` one of a class lies."""
+    """How ``old`` markings were ``watched``, and what images show where no ``new`` one of a class lies."""
     pictures = observer.pictures
     if pictures is None or not old or not new:
         return watched

@@ -30,7 +30,7 @@ CLUTTER_BY = (
     "found in too few of its images",
     "its sightings contradict each other",
 )
-"""What speaks most for clutter, in the order of :attr:`Posterior.evidence`."""
+"""Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
 
 _MAX_OVERLAP = 0.2
 """Share of the smaller marking's area that may lie on another marking: paint does not overlap."""
@@ -107,7 +107,7 @@ class Classified:
         )
 
     def exclusions(self) -> tuple[Exclusion, ...]:
-        """What was refused and why; candidates without a single solved corner were never candidates."""
+        """The rejected candidates and the reasons; a group without a solved corner was no candidate."""
         return tuple(
             Exclusion(
                 kind=self.kind[group],
@@ -151,7 +151,7 @@ def _reason(found: Posterior, group: int) -> str:
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:
-    """Those of the candidates ``standing`` that overlap another one of better odds."""
+    """The candidates among ``standing`` that overlap another one of better odds."""
     if len(standing) < 2:
         return np.zeros(0, dtype=np.int64)
     corners, odds = found.candidates.corners_map, found.log_odds
@@ -177,7 +177,7 @@ def _pair_keys(pairs: IntArray) -> IntArray:
 
 
 def _no_marking_message(excluded: tuple[Exclusion, ...]) -> str:
-    """What to say where no candidate was accepted."""
+    """The error message where no candidate was accepted."""
     reasons = [exclusion.reason for exclusion in excluded]
     commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
     return (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(kw_only=True)
 class AcceptanceOptions:
-    """What a place must show to enter the map.
+    """The conditions for a candidate to enter the map.
 
     ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not; and
     a worst corner less certain than the best one of the map by at most ``max_sigma_m``.

@@ -33,7 +33,7 @@ from v2hdm.site.shapes import (
 )
 
 OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
-"""What a candidate may be: the first five are markings."""
+"""Hypotheses about a candidate; the first five are markings."""
 
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
@@ -108,7 +108,7 @@ class Posterior:
 
 
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
-    """What G candidates of classes ``kind`` (G,) are, given where and how often they were seen."""
+    """The posterior of G candidates of classes ``kind`` (G,), given where and how often they were seen."""
     total = len(candidates)
     probability, log_odds, evidence = np.zeros((total, 7)), np.zeros(total), np.zeros((total, 4))
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
@@ -343,7 +343,7 @@ def _outer(vectors: FloatArray) -> FloatArray:
 
 
 def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: BoolArray) -> PaintError:
-    """What the deviations of ``whole`` candidates (N,) from the shapes of their class say about the paint."""
+    """The paint error estimated from how ``whole`` candidates (N,) deviate from their class's shapes."""
     members = [
         (one.residual[k], one.formal[k])
         for one, probability in zip(hypotheses, each, strict=True)

@@ -39,8 +39,8 @@ class LaneImage:
 
     ``rows`` are its row anchors, near to far, ``row_step_px`` apart, twice as far where half the resolution
     is looked at; ``paint`` are the centre lines of its lane paint, points ``paint_step_m`` apart;
-    ``output`` is the network's, if it is known; ``score`` are the weights and biases that lines are scored by, if
-    not the shipped ones.
+    ``output`` is the network's, if it is known; ``score`` are the weights and biases that lines are scored
+    by, if not the shipped ones.
     """
 
     camera: RoadCamera
@@ -76,7 +76,7 @@ class Prior:
 
     @cached_property
     def log_determinant(self) -> FloatArray:
-        """That of the information: (), of several (P, 1)."""
+        """The log determinant of the information: (), of several (P, 1)."""
         return np.asarray(np.linalg.slogdet(self.information)[1])
 
 
@@ -373,7 +373,7 @@ class Road:
         return np.logaddexp(along + np.log(_SHARE), free + np.log1p(-_SHARE)), along - free
 
     def drawn_by(self, log_ratio: float) -> Prior:
-        """What helps to draw a line of such a log ratio of :meth:`weigh`."""
+        """The gain of drawing a line with such a log ratio of :meth:`weigh`."""
         keeps = log_ratio + np.log(_SHARE) > np.log1p(-_SHARE)
         prior, kept = (self.along, _ALONG_KEPT) if keeps else (self.free, _FREE_KEPT)
         return Prior(prior.mean, prior.information * kept)

@@ -101,7 +101,7 @@ def digest(path: Path) -> str:
 
 @cache
 def _problem(folder: Path) -> str | None:
-    """What is wrong with the files of a folder, in one line; None if they belong together."""
+    """The defect of a folder's files, in one line; None if they belong together."""
     files = read_manifest(folder)["files"]
     network = files[NETWORK_FILE.name]["sha256"]
     for name, command in COMMANDS.items():

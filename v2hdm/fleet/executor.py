@@ -1,4 +1,4 @@
-"""A site's crew on Ray: what belongs to one visit, or one set of cameras, is done by a task of its own."""
+"""The executor of a site on Ray: one task per session of a drive, and per set of cameras."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _CORES_EACH = 0.5
 """Booked for a task: the other half of its core is an actor's that detects, which then has nothing to do."""
 
 
-class RayCrew:
-    """A :class:`v2hdm.mapping.crew.Crew` of a cluster's cores."""
+class RayExecutor:
+    """A :class:`v2hdm.executor.Executor` of a cluster's cores."""
 
     def __init__(self, cores: int, folder: str) -> None:
         """``cores`` are those of the cluster; ``folder`` is where relative paths begin."""
@@ -41,7 +41,7 @@ class RayCrew:
 
 
 def _done(work: Callable[[], _Result], level: int, folder: str) -> tuple[_Result, list[Line]]:
-    """What comes of ``work`` in the process of a task, and what it logged."""
+    """The result of ``work`` in the process of a task, and its log lines."""
     os.chdir(folder)
     logging.getLogger("v2hdm").setLevel(level)
     with recorded() as lines:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.mapping.scene import SceneOptions, make_scene
+from v2hdm.executor import InProcess
 from v2hdm.io.drive import join_drives
-from v2hdm.mapping.crew import Alone
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
@@ -22,8 +22,8 @@ from v2hdm.records import Drive, FloatArray, ImageDetections
 _Result = TypeVar("_Result")
 
 
-class ByPost(Alone):
-    """A crew to which all work is posted, as to another process; notes what it was."""
+class ByPost(InProcess):
+    """A executor to which all work is posted, as to another process; notes what it was."""
 
     def __init__(self) -> None:
         self.begun: list[str] = []
@@ -62,12 +62,12 @@ def together(visits: tuple[Drive, list[ImageDetections]]) -> dict[str, MethodRes
     return mapped(visits)
 
 
-def test_a_crew_links_each_visit_by_itself_and_the_map_is_the_same_to_the_last_bit(
+def test_an_executor_links_each_visit_by_itself_and_the_map_is_the_same_to_the_last_bit(
     visits: tuple[Drive, list[ImageDetections]], together: dict[str, MethodResult]
 ) -> None:
-    crew = ByPost()
-    methods = mapped(visits, crew=crew)
-    assert crew.begun.count("_link") >= 2 * 2
+    executor = ByPost()
+    methods = mapped(visits, executor=executor)
+    assert executor.begun.count("_link") >= 2 * 2
     for name, one in methods.items():
         assert repr(one.hd_map) == repr(together[name].hd_map), name
     assert (corners(methods) == corners(together)).all()
