@@ -43,12 +43,12 @@ class Quadrilaterals:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeConfig:
-    """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019).
+    """How the classifier learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019).
 
-    What it is shown is varied, as other cameras and roads would: each channel of a view by a factor whose
-    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In a
-    ``claimed_share`` of the cases the paint network claims what it claims of markings on average, so that the image has a say
-    of its own where that network is sure and wrong. ``side_weight`` is that of the sides' errors in the loss.
+    Its inputs are varied, as by other cameras and roads: each channel of a view by a factor whose logarithm
+    has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In a ``claimed_share`` of
+    the cases the network's output is its mean output on markings, so that the image decides where the network
+    is confident and wrong. ``side_weight`` is that of the sides' errors in the loss.
     """
 
     epochs: int = 18

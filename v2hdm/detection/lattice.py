@@ -24,8 +24,7 @@ _MOST_PIXELS = 600
 _MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
-"""A quadrilateral whose ends make up no more than this share of its length is slim; an end reaches so far past
-its corners."""
+"""Ends of at most this share of the length make a quadrilateral slim; they reach that far past corners."""
 
 _SEARCH_ALONG, _SEARCH_ACROSS = 40, 12
 """Rows and columns of the coarse grid on which a fit begins."""

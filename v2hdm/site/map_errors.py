@@ -45,7 +45,7 @@ class Errors:
 
     @classmethod
     def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
-        """The errors that ``markings`` state: the covariance is the whole, the relative sigma its own part."""
+        """The errors that ``markings`` state: covariance in all, relative sigma alone."""
         centres = np.array([one.corners_map.mean(axis=0) for one in markings]).reshape(-1, 2)
         stated = [
             np.eye(8) * UNKNOWN_SIGMA_M**2 if one.covariance_m2 is None else one.covariance_m2

@@ -1,8 +1,9 @@
 """After the solve: contradicted inputs, how well everything fits, and whether results agree.
 
 The inputs are tested one at a time (:mod:`v2hdm.adjust.score_tests`); a contradicted input that could be done
-without has been dropped (:mod:`v2hdm.mapping.recovery`) and is reported here. Every other sign of a wrong input is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has the
-figures of clean and spoilt drives.
+without has been dropped (:mod:`v2hdm.mapping.recovery`) and is reported here. Every other sign of a wrong
+input is measured as well, so that an unforeseen fault is not silent. docs/verdict.md has the figures of clean
+and spoilt drives.
 """
 
 from __future__ import annotations
