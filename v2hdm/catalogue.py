@@ -26,7 +26,7 @@ _SOFTNESS = 0.25
 """Standard deviation of a log size about its range, where the catalogue gives none."""
 
 _TINY_M = 1e-3
-"""Least size that is told from nothing, m."""
+"""Least size that differs from nothing, m."""
 
 NOT_PAINT = "none"
 """The label of everything that is no marking; no class may have this name."""

@@ -215,7 +215,7 @@ class Visit:
 class Drive:
     """Everything the mapper may know of a drive; images are sorted by visit, time, then camera.
 
-    ``truth_dir`` only tells the report where ground truth lies. ``trajectory`` holds the poses at the
+    ``truth_dir`` only shows the report where ground truth lies. ``trajectory`` holds the poses at the
     receiver's rate that those of the images were interpolated from, with the road laid flat; ``recorded`` the
     same as recorded. ``road`` is the recorded ground, None for the plane z = 0. ``unposed`` counts, by
     camera, the images left out for want of a pose. ``joined`` are the drives that it was made of

@@ -58,7 +58,7 @@ def test_both_modes_say_the_same_of_themselves() -> None:
     assert grown.evidence is not None
     assert grown.evidence.held_out_loss is not None
     assert grown.evidence.held_out_loss < 3.0
-    assert len(grown.evidence.suspects) == len(batch.evidence.suspects)
+    assert len(grown.evidence.score_tests) == len(batch.evidence.score_tests)
     assert grown.poses is not None
     assert grown.clocks[0].keys() == batch.clocks[0].keys()
     assert not batch.growth

@@ -50,7 +50,7 @@ def test_right_inputs_are_kept(scene: Scene) -> None:
     result = mapped(scene, scene.drive)
     assert faults(result) == []
     assert result.evidence is not None
-    assert max(one.sigmas for one in result.evidence.suspects) < 5
+    assert max(one.sigmas for one in result.evidence.score_tests) < 5
 
 
 def test_a_survey_half_a_metre_too_high_is_dropped_and_told(scene: Scene) -> None:

@@ -155,7 +155,7 @@ def estimate(name: str = "front", **values: float) -> GroundEstimate:
         guess_cam_from_vehicle=guess,
         parameters=parameters,
         median_residual=0.35,
-        pulls={"heading": 1.2, "position": 1.0},
+        innovations={"heading": 1.2, "position": 1.0},
         patches=None,
         seconds=3.0,
     )

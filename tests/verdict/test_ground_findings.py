@@ -136,7 +136,7 @@ def test_residuals_without_another_cause_point_to_the_lens() -> None:
 
 
 def test_poses_that_pull_are_told_where_nothing_else_is() -> None:
-    pulled = replace(estimate(), pulls={"heading": 4.0, "position": 1.0})
+    pulled = replace(estimate(), innovations={"heading": 4.0, "position": 1.0})
     assert "their heading is 4 times pose_noise off" in told(pulled)["poses against ground"]
     assert list(told(replace(pulled, parameters=estimate(clock_s=0.06).parameters))) == ["clock"]
 

@@ -20,7 +20,7 @@ FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02, bi
 CLOCK = Contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
 LEVER = Contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
 FINE = SolveEvidence(
-    suspects=(CLOCK, LEVER),
+    score_tests=(CLOCK, LEVER),
     corrected=(),
     pose_model="heave",
     held_out={"heave": 1.95},
@@ -28,9 +28,9 @@ FINE = SolveEvidence(
     variance_factor=0.15,
     along_route=np.array([0.15, 0.2, 0.15]),
     window_s=np.array([0.0, 5.0, 10.0]),
-    pose_pulls={"x": 0.7, "heading": 0.8},
-    worst_pull=3.0,
-    worst_pull_s=4.0,
+    pose_innovations={"x": 0.7, "heading": 0.8},
+    worst_innovation=3.0,
+    worst_innovation_s=4.0,
 )
 
 
@@ -68,7 +68,7 @@ def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive: Drive) -> N
 def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive: Drive) -> None:
     focal = Contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
     late = replace(CLOCK, value=0.2, sigmas=20.0)
-    evidence = replace(FINE, suspects=(focal, late, LEVER), held_out={"heave": 9.0})
+    evidence = replace(FINE, score_tests=(focal, late, LEVER), held_out={"heave": 9.0})
     found = raised(result(evidence), drive)
     assert set(found) == {"focal length", "held out"}, "the clock explains less of the same residuals"
     assert found["focal length"].status is Status.FAIL
@@ -79,18 +79,18 @@ def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(driv
 def test_a_rival_that_explains_as_much_is_named_as_well() -> None:
     one = Contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 41.0)
     other = Contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 39.0)
-    finding = check_inputs(replace(FINE, suspects=(one, other)))[0]
+    finding = check_inputs(replace(FINE, score_tests=(one, other)))[0]
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
 def test_a_small_contradiction_is_none_however_sure_it_is() -> None:
     tiny = replace(CLOCK, value=0.0008, sigma=0.0001, sigmas=8.0)
-    assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, suspects=(tiny,))))
+    assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, score_tests=(tiny,))))
 
 
 def test_a_straight_drive_says_what_it_cannot_tell() -> None:
     unsure = (replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf")))
-    untold = [f for f in check_inputs(replace(FINE, suspects=unsure)) if f.is_unobservable]
+    untold = [f for f in check_inputs(replace(FINE, score_tests=unsure)) if f.is_unobservable]
     assert {f.check for f in untold} == {"clock", "survey"}
     assert all("drive a turn" in f.says for f in untold)
 
@@ -102,8 +102,8 @@ def test_a_straight_drive_says_what_it_cannot_tell() -> None:
         ("fit along the route", {"along_route": np.array([0.15, 3.0, 0.15])}),
         ("rejected", {"fits": {"front": replace(FIT, rejected_share=0.14)}}),
         ("held out", {"held_out": {"heave": 6.5}}),
-        ("pose noise", {"pose_pulls": {"heading": 4.0}}),
-        ("pose jump", {"worst_pull": 20.0}),
+        ("pose noise", {"pose_innovations": {"heading": 4.0}}),
+        ("pose jump", {"worst_innovation": 20.0}),
     ],
 )
 def test_a_bad_fit_is_raised_by_its_own_check(check: str, change: dict[str, object], drive: Drive) -> None:

@@ -160,7 +160,7 @@ def descend(
                 objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, math.inf if slow else renewal
             )
             gap = predicted_gap(reached, gradient)
-            # A whitening under which the gap shrank this fast tells it well enough.
+            # A whitening under which the gap shrank this fast determines it well enough.
             ended = final and not slow and gap <= tolerance
         point, used = objective.point(whitened), whitening.robust
         evaluations += objective.evaluations

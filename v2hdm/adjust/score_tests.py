@@ -234,7 +234,7 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     found += _control_points(problem, solution)
     factor = max(1.0, solution.chi2_per_dof)
     inflated = [replace(one, sigma=one.sigma * factor**0.5, gain=one.gain / factor) for one in found]
-    return tuple(sorted(inflated, key=lambda suspect: -suspect.gain))
+    return tuple(sorted(inflated, key=lambda test: -test.gain))
 
 
 def _test(hypothesis: _Hypothesis, bench: _Bench) -> ScoreTest:

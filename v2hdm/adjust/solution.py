@@ -44,7 +44,7 @@ _ADVICE = {
 }
 
 
-# Noise that is off by less than this factor cannot be told from what a drive's geometry does to it.
+# Noise that is off by less than this factor cannot be distinguished from the effect of a drive's geometry.
 _NOISE_FACTOR = 1.25
 
 

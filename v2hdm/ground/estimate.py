@@ -54,7 +54,7 @@ _STRETCHES = 8  # enough to estimate a spread, few enough that each has several 
 _WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two are mostly the survey's
 # Distance between the images of a pair that shows the clock: motion changes within it.
 _CLOCK_APART_M = (0.8, 4.0)
-_CLOCK_LOOSENED = 2.0  # factor on the stated noise of headings up to which a clock is told apart from them
+_CLOCK_LOOSENED = 2.0  # factor on the stated noise of headings up to which a clock is separable from them
 _LEAST_MATCHES = 60  # ten for each of the six quantities of a mounting
 # How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge, as EN
 # 13036-7 measures it.
@@ -159,7 +159,7 @@ def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> 
         calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
         parameters=_free_parameters(options.free, seen, solved, factor),
         median_residual=float(np.median(adjusted.residual)),
-        pulls=_pulls(adjusted, solved.stated.drive.pose_noise),
+        innovations=_innovations(adjusted, solved.stated.drive.pose_noise),
         patches=MatchedGround(
             solved.stated.motion.image[solved.pairs],
             solved.poses[solved.pairs],
@@ -182,7 +182,7 @@ def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
         guess_cam_from_vehicle=stated.guess.cam_from_vehicle,
         parameters={},
         median_residual=float("nan"),
-        pulls={},
+        innovations={},
         patches=None,
         seconds=0.0,
     )
@@ -195,7 +195,7 @@ def _flatness(options: GroundOptions) -> FloatArray:
     return np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
 
 
-def _pulls(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:
+def _innovations(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:
     rms = np.sqrt(np.mean((adjusted.pose_errors / state_sigmas(noise)) ** 2, axis=0))
     return {
         "heading": float(rms[2]),

@@ -111,7 +111,7 @@ class GroundEstimate:
     ``shares``: of the patches, how many find a partner under each reading of the poses; ``reading`` is the
     best one. ``calibration`` has ``cam_from_vehicle`` with its covariance, None unless ``status`` is FOUND.
     ``median_residual`` is in units of :data:`v2hdm.ground.adjust.PIXEL_SIGMA`: .3 to .5 on a clean drive.
-    ``pulls`` are the root mean squares of the poses' estimated errors in their stated sigmas.
+    ``innovations`` are the root mean squares of the poses' estimated errors in their stated sigmas.
     """
 
     camera: str
@@ -122,7 +122,7 @@ class GroundEstimate:
     guess_cam_from_vehicle: FloatArray
     parameters: Mapping[str, Parameter]
     median_residual: float
-    pulls: Mapping[str, float]
+    innovations: Mapping[str, float]
     patches: MatchedGround | None
     seconds: float
 

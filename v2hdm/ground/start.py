@@ -26,7 +26,7 @@ _LEAST_SHARE = 0.15  # share of patches that must find a partner; a fifth do on 
 _TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)  # pitches that are tried in turn
 _FARTHEST_DEG = 20.0  # a start further off its guess is none
 _LEAST_MATCHES = 30  # ten for each angle of the mounting
-# Distance between the images of a pair that tells readings apart: poses read wrongly move the ground further
+# Distance between the images of a pair that separates readings: poses read wrongly move the ground further
 # than the search.
 _APART_M = (1.2, 2.8)
 _TURN_RAD = np.deg2rad(2)  # a turn between the images of a pair that is no noise of the path

@@ -45,13 +45,13 @@ def sizes_of(bundle: Bundle, length_m: float) -> list[str]:
 
 
 def length_of(bundle: Bundle, item: int) -> float:
-    """The known length, m, that a suspect's ``item`` is."""
+    """The known length, m, that a test's ``item`` is."""
     lengths = bundle.problem.lengths
     return float(np.unique(lengths.length_m)[item]) if lengths is not None else float("nan")
 
 
 def point_of(bundle: Bundle, item: int) -> str:
-    """The name of the surveyed point that a suspect's ``item`` is."""
+    """The name of the surveyed point that a test's ``item`` is."""
     control = bundle.problem.control
     assert control is not None
     return name_of(bundle.model.survey, control.points_map[item])
@@ -108,12 +108,12 @@ def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
     return max(biases, default=0.0)
 
 
-def _about(bundle: Bundle, suspect: ScoreTest, visits: Sequence[str]) -> str:
-    if suspect.fault is Fault.CLOCK and suspect.item >= 0 and visits:
-        return f"in {visits[suspect.item]}"
-    if suspect.fault is Fault.SIZE:
-        length_m = length_of(bundle, suspect.item)
+def _about(bundle: Bundle, test: ScoreTest, visits: Sequence[str]) -> str:
+    if test.fault is Fault.CLOCK and test.item >= 0 and visits:
+        return f"in {visits[test.item]}"
+    if test.fault is Fault.SIZE:
+        length_m = length_of(bundle, test.item)
         return f"{', '.join(sizes_of(bundle, length_m))} {length_m:.2f} m"
-    if suspect.fault is Fault.CONTROL:
-        return point_of(bundle, suspect.item)
+    if test.fault is Fault.CONTROL:
+        return point_of(bundle, test.item)
     return ""

@@ -64,7 +64,7 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     """The clock offset of each camera by session: the shift of its images plus the solve's estimate, s."""
     evidence, drive = outcome.evidence, outcome.inputs.drive
     applied_s = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
-    suspects = [one for one in evidence.suspects if one.fault is Fault.CLOCK]
+    score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
     out = []
     for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
         clocks = {}
@@ -76,7 +76,7 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
                 # Of each camera, and of all of them together: a clock of its own may differ by both.
                 tested = [
                     one.sigma**2
-                    for one in suspects
+                    for one in score_tests
                     if name in one.cameras and one.about in ("", f"in {place.name}")
                 ]
                 sigma_s = float(np.sqrt(sum(tested))) if tested else float("inf")

@@ -141,7 +141,7 @@ class Optimiser:
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
 
-        ``progress`` is told how large the map is. In place of :meth:`settle`.
+        ``progress`` is called with the size of the map. In place of :meth:`settle`.
         """
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:

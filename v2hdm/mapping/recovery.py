@@ -65,7 +65,7 @@ LOOSE_CENTRE_SIGMA_M = 10.0
 
 AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
-speed tells the distance of two centres, or the difference of two clocks, alone."""
+speed determines the distance of two centres, or the difference of two clocks, alone."""
 
 CLOCK_OBSERVABLE_S = 0.004
 """Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
@@ -134,7 +134,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             settled = optimiser.settle(inputs.tracks, progress)
         # 2. Test the inputs against what everything else says.
         progress("tests of the inputs")
-        found = _suspects(settled, drive)
+        found = _score_tests(settled, drive)
         worst = next((one for one in found if is_contradicted(one)), None)
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
         left = None
@@ -167,7 +167,7 @@ def visit_names(drive: Drive) -> tuple[str, ...]:
     return tuple(visit.name for visit in drive.joined)
 
 
-def _suspects(bundle: Bundle, drive: Drive) -> tuple[ScoreTest, ...]:
+def _score_tests(bundle: Bundle, drive: Drive) -> tuple[ScoreTest, ...]:
     """The inputs that can be tested and were stated at all, the most contradicted first."""
     found = score_faults(bundle.problem, bundle.solution)
     return tuple(one for one in found if _is_stated(one, bundle, drive))
@@ -216,7 +216,7 @@ def _evidence(
     largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
     frames_s = sightings.stamp_s[np.unique(sightings.frame[settled.row])]
     return SolveEvidence(
-        suspects=found,
+        score_tests=found,
         corrected=tuple(corrected),
         pose_model=optimiser.pose_model,
         held_out=optimiser.held_out,
@@ -224,9 +224,9 @@ def _evidence(
         variance_factor=overall_factor(settled),
         along_route=factors,
         window_s=window_s,
-        pose_pulls=innovations.rms(),
-        worst_pull=float(largest.max()),
-        worst_pull_s=float(frames_s[int(largest.argmax())]),
+        pose_innovations=innovations.rms(),
+        worst_innovation=float(largest.max()),
+        worst_innovation_s=float(frames_s[int(largest.argmax())]),
         clock_s=_clocks(final),
     )
 

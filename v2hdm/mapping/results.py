@@ -60,7 +60,7 @@ class SolveEvidence:
     """The evidence that the joint optimisation of one set of cameras leaves for the checks.
 
     Attributes:
-        suspects: every input that was tested, as it stands in the result, the largest contradiction first.
+        score_tests: every input that was tested, as it stands in the result, the largest contradiction first.
         corrected: inputs that were contradicted, and dropped or corrected before the result was solved.
         pose_model: what was estimated of the poses, of :data:`v2hdm.adjust.MODELS`.
         held_out: mean robust loss of held-out observations by pose model; a little below 2 without errors.
@@ -68,13 +68,13 @@ class SolveEvidence:
         variance_factor: as in :class:`CameraFit`, of all cameras.
         along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
         window_s: (W,) when each window begins, s.
-        pose_pulls: root mean square normalised innovation by state of a pose; at most 1 for right sigmas.
-        worst_pull: the largest of them all, in sigmas.
-        worst_pull_s: when, s.
+        pose_innovations: RMS normalised innovation by state of a pose; at most 1 for right sigmas.
+        worst_innovation: the largest of them all, in sigmas.
+        worst_innovation_s: when, s.
         clock_s: by visit and camera the estimated clock offset and sigma, where the pose model has one.
     """
 
-    suspects: tuple[Contradiction, ...]
+    score_tests: tuple[Contradiction, ...]
     corrected: tuple[Contradiction, ...]
     pose_model: str
     held_out: Mapping[str, float]
@@ -82,9 +82,9 @@ class SolveEvidence:
     variance_factor: float
     along_route: FloatArray
     window_s: FloatArray
-    pose_pulls: Mapping[str, float]
-    worst_pull: float
-    worst_pull_s: float
+    pose_innovations: Mapping[str, float]
+    worst_innovation: float
+    worst_innovation_s: float
     clock_s: Sequence[Mapping[str, tuple[float, float]]] = ({},)
 
     @property

@@ -14,7 +14,7 @@ from v2hdm.records import DIAMOND, FloatArray, IntArray
 
 _DIAGONALS = (((0, 2),), ((1, 3),))
 _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
-"""Pairs of corners that are as far apart as a marking is long, or wide: which of the two, the map tells."""
+"""Pairs of corners that are as far apart as a marking is long, or wide; the map decides which."""
 
 
 def known_lengths(

@@ -75,9 +75,9 @@ class RunConfig:
         resume: whether what an earlier run has found is taken from the cache where nothing has changed
             that it was made from; false makes all anew.
         workers: processes for rendering and detection; 0 takes one per core.
-        device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
+        device: the value that ``conf/map.yaml`` passes on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
-        mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
+        mode: the value that it passes on as ``mapping.mode``, ``batch`` or ``incremental``.
         mosaic: whether the ground is shown from above, too (docs/mosaic.md).
         viewer: ``rerun`` shows and records the run while it goes on (docs/live-view.md), ``none`` does not.
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).

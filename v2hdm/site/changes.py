@@ -104,7 +104,7 @@ DRIFT_OVER_M = 30.0
 """Distance over which the error that a map's markings share fades, m, where the map does not say."""
 
 LIKELY = 0.5
-"""Probability from which a marking is told as moved, gone or new paint: the likelier of the two."""
+"""Probability from which a marking is reported as moved, gone or new paint: the likelier of the two."""
 
 _LEAST_PAIRED = 0.3
 """Share of the markings that a drive looked at which it finds again at least, if the site is the same."""

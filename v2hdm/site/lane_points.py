@@ -223,7 +223,7 @@ _SEED_CELL_M = 0.25
 """Side of the cells that each give a seed, m."""
 
 _DIRECTION_BINS = 8
-"""Directions told apart within a cell, of half a circle."""
+"""Number of directions distinguished within a cell, over half a circle."""
 
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))
 """Cosine from which points are of one line: a crossing one is not."""

@@ -29,7 +29,7 @@ _CELL_M = 0.01
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
 
 _COARSE_M = 0.05
-"""Cells, m, by which overlaps are told."""
+"""Cells, m, of the raster that overlaps are measured on."""
 
 _COMMON = 0.5
 """Outlines are of one symbol if they share this part of the smaller one's area."""

@@ -139,7 +139,7 @@ def library_versions() -> dict[str, str]:
 class StageCache:
     """The entries of a cache folder, and of the store ``behind`` it, of which it holds copies then.
 
-    What a stage hands on has always been through the codec, and what was logged while it was made is logged
+    The results of a stage have always been through the codec, and the log lines of their making are logged
     again: a run that goes on with entries cannot tell them from results of its own.
 
     Args:

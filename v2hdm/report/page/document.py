@@ -22,8 +22,7 @@ from v2hdm.store.files import replace_text
 
 _SAYS = {
     "PASS": "Every check is within its limit. Map and calibrations can be relied on as stated below.",
-    "WARN": "The map holds, or was corrected for what is told below. Read the findings before you rely "
-    "on it.",
+    "WARN": "The map holds, or was corrected as reported below. Read the findings before you rely on it.",
     "FAIL": "The map is wrong or cannot be relied on, whatever the figures below say. Each finding names a "
     "cause and a remedy.",
 }

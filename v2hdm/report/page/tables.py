@@ -218,7 +218,7 @@ def check_point_table(facts: Facts) -> Table | None:
     if not shown:
         return None
     return Table(
-        "Surveyed corners that the adjustment was not told of: the map minus the survey.",
+        "Surveyed corners withheld from the adjustment: the map minus the survey.",
         tuple(_CHECK_COLUMNS[name][0] for name in shown),
         tuple(tuple(_check_cell(name, row.get(name, "")) for name in shown) for row in rows),
         tuple(_CHECK_COLUMNS[name][1] is not None for name in shown),

@@ -150,7 +150,7 @@ def _is_bent(estimate: GroundEstimate) -> bool:
     return (
         _is_off(estimate.parameters.get("clock_s"))
         or (focal is not None and focal.observable and abs(focal.value) > _FOCAL)
-        or max(estimate.pulls.values(), default=0.0) > _PULL
+        or max(estimate.innovations.values(), default=0.0) > _PULL
     )
 
 
@@ -251,13 +251,13 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Fi
         "length in camera_info is wrong, or the road in the ROI is no plane",
     )  # fmt: skip
     raised = any(finding.status is not Status.PASS for finding in own)
-    pulls = {part: pull for part, pull in estimate.pulls.items() if np.isfinite(pull)}
-    if pulls and not raised and not _is_off(estimate.parameters.get("clock_s")):
-        part = max(pulls, key=lambda key: pulls[key])
+    innovations = {part: pull for part, pull in estimate.innovations.items() if np.isfinite(pull)}
+    if innovations and not raised and not _is_off(estimate.parameters.get("clock_s")):
+        part = max(innovations, key=lambda key: innovations[key])
         yield judge(
-            "poses against ground", name, pulls[part], _PULL, "",
+            "poses against ground", name, innovations[part], _PULL, "",
             fine="the images move as the poses do, within pose_noise",
-            wrong=f"the images move otherwise than the poses: their {part} is {pulls[part]:.0f} times "
+            wrong=f"the images move otherwise than the poses: their {part} is {innovations[part]:.0f} times "
             "pose_noise off; state the noise as it is, or check the clock",
             status=Status.WARN,
         )  # fmt: skip

@@ -133,13 +133,13 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     """Inputs that were dropped, inputs that are contradicted still, and what is not observable."""
     findings = [_corrected(one) for one in evidence.corrected]
     raised = {finding.check for finding in findings}
-    still = [one for one in evidence.suspects if is_contradicted(one)]
+    still = [one for one in evidence.score_tests if is_contradicted(one)]
     if still:
         # Other inputs would explain part of the same residuals: the one that explains most is named.
         findings.append(_contradicted(still[0], still[1:]))
         raised.add(findings[-1].check)
     by_check: dict[str, list[Contradiction]] = {}
-    for one in evidence.suspects:
+    for one in evidence.score_tests:
         by_check.setdefault(_CHECKS[one.fault][0], []).append(one)
     unobservable = list(_unobservable(evidence, raised))
     said = raised | {one.check for one in unobservable if not _observable(by_check[one.check])}
@@ -207,8 +207,8 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
 
 def _of_all(evidence: SolveEvidence, shared: Fault, single: Fault) -> list[Contradiction]:
     """The tests of all cameras together, those of the only one where there are no others."""
-    together = [one for one in evidence.suspects if one.fault is shared and len(one.cameras) > 1]
-    return together or [one for one in evidence.suspects if one.fault is single]
+    together = [one for one in evidence.score_tests if one.fault is shared and len(one.cameras) > 1]
+    return together or [one for one in evidence.score_tests if one.fault is single]
 
 
 def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
@@ -244,13 +244,13 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
             wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
             "left",
         )  # fmt: skip
-    if evidence.pose_pulls:
+    if evidence.pose_innovations:
         yield from _poses(evidence)
 
 
 def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
-    state = max(evidence.pose_pulls, key=lambda name: evidence.pose_pulls[name])
-    pull = evidence.pose_pulls[state]
+    state = max(evidence.pose_innovations, key=lambda name: evidence.pose_innovations[name])
+    pull = evidence.pose_innovations[state]
     yield judge(
         "pose noise", "poses", pull, _POSE_PULL_LIMIT, "sigmas",
         fine="the poses are as good as pose_noise says, or better",
@@ -259,10 +259,10 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
         status=Status.WARN,
     )  # fmt: skip
     yield judge(
-        "pose jump", "poses", evidence.worst_pull, _JUMP_LIMIT, "sigmas",
+        "pose jump", "poses", evidence.worst_innovation, _JUMP_LIMIT, "sigmas",
         fine="no pose stands out from the others",
-        wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from where the "
-        "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
+        wrong=f"at {evidence.worst_innovation_s:.1f} s the pose is {evidence.worst_innovation:.0f} sigmas from "
+        "where the markings put it: the position jumps, or the fix was lost; check the receiver's log there",
         status=Status.WARN,
     )  # fmt: skip
 
