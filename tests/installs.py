@@ -42,7 +42,7 @@ PROMISES = {
     "docs/mosaic.md": ("mosaic",),
     "docs/bags.md": ("--list-topics", "check site"),
 }
-"""Of which documents which commands are run: each line of a block that has one of the words."""
+"""Words by document: each line of a block with one of them is run."""
 
 MORE = {
     "": (

@@ -261,8 +261,9 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
     yield judge(
         "pose jump", "poses", evidence.worst_innovation, _JUMP_LIMIT, "sigmas",
         fine="no pose stands out from the others",
-        wrong=f"at {evidence.worst_innovation_s:.1f} s the pose is {evidence.worst_innovation:.0f} sigmas from "
-        "where the markings put it: the position jumps, or the fix was lost; check the receiver's log there",
+        wrong=f"at {evidence.worst_innovation_s:.1f} s the pose is {evidence.worst_innovation:.0f} sigmas "
+        "from where the markings put it: the position jumps, or the fix was lost; "
+        "check the receiver's log there",
         status=Status.WARN,
     )  # fmt: skip
 
