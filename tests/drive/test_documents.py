@@ -15,7 +15,7 @@ import yaml
 from tests.docs.blocks import blocks, document
 from tests.drive.bags import messages_of, write_ros2
 from tests.drive.example import make_drive
-from v2hdm.cli import check
+from v2hdm.cli.main import run
 from v2hdm.io.calibration import read_camera_info
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES
@@ -61,7 +61,7 @@ def test_the_documented_listing_ends_in_a_description_that_is_read(
     site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(site.parent)
-    assert check.main(["site", "--list-topics"]) == 0
+    assert run(["check", "site", "--list-topics"]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"/odom +21  nav_msgs/msg/Odometry", printed)
     Path("drive.yaml").write_text(printed.split("# drive.yaml\n")[1])

@@ -82,8 +82,8 @@ def test_what_cannot_be_mapped_is_named(changes: dict[str, object], named: str) 
         jobs(experiment("out", **changes))
 
 
-def test_a_typo_at_the_door_is_one_line_that_names_the_key(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "v2hdm.experiment", "sedes=[1]"]
+def test_a_typo_on_the_command_line_is_one_line_that_names_the_key(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "v2hdm", "experiment", "sedes=[1]"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1

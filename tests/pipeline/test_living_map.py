@@ -63,7 +63,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         # Grey images say nothing: neither to the detector nor to the checks of images and ground.
         patch.setattr(work, "detect_in_pieces", detected)
-        patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "check_drive", lambda *_: [])
+        patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "input_findings", lambda *_: [])
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
         patch.chdir(folder)
         for command in ("v2hdm map drive.path=drives/monday name=monday", BOTH, LATER):

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from v2hdm.cli import cache as command
 from v2hdm.cli.main import run
 from v2hdm.store.cache import StageCache, entry_name
 from v2hdm.store.folders import LIST, note_use
@@ -183,11 +182,11 @@ def test_the_command_lists_verifies_and_prunes_a_store(
     StageCache(tmp_path, memory).put("map", KEYS[0], bytes, bytes(1000))
     memory.write("stages/detect/notes", b"mine")
     memory.write("notes", b"mine")
-    assert command.main(["list", "--cache", str(memory)]) == 0
+    assert run(["cache", "list", "--cache", str(memory)]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in printed[1:]] == [["detect", "3"], ["map", "1"], ["all", "4"]]
-    assert command.main(["verify", "--cache", str(memory)]) == 0
+    assert run(["cache", "verify", "--cache", str(memory)]) == 0
     assert "read 4 entries, 3 of them damaged" in capsys.readouterr().out
-    assert command.main(["prune", "--cache", str(memory), "--gb", "0"]) == 0
+    assert run(["cache", "prune", "--cache", str(memory), "--gb", "0"]) == 0
     assert "removed 1 entries" in capsys.readouterr().out
     assert set(memory.listed()) == {"stages/detect/notes", "notes"}

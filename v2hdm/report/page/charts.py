@@ -158,16 +158,17 @@ def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]
         for number, (axes, name) in enumerate(zip(panels, names, strict=False)):
             width_px, height_px = sizes[name]
             places, mean = fields[number]
-            # The longest arrow spans one and a half cells.
-            scale = longest / (1.5 * width_px / CELLS[1])
-            arrows = axes.quiver(
-                *places.T, *mean.T, angles="xy", scale_units="xy", scale=scale,
-                color=OKABE_ITO[_ORDER[number % len(_ORDER)]], width=0.005, headwidth=3.6,
-            )  # fmt: skip
-            axes.quiverkey(
-                arrows, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", coordinates="axes",
-                labelcolor=INK, color=INK, fontproperties={"size": 8.5},
-            )  # fmt: skip
+            if len(places):  # matplotlib cannot draw the key of no arrows
+                # The longest arrow spans one and a half cells.
+                scale = longest / (1.5 * width_px / CELLS[1])
+                arrows = axes.quiver(
+                    *places.T, *mean.T, angles="xy", scale_units="xy", scale=scale,
+                    color=OKABE_ITO[_ORDER[number % len(_ORDER)]], width=0.005, headwidth=3.6,
+                )  # fmt: skip
+                axes.quiverkey(
+                    arrows, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", coordinates="axes",
+                    labelcolor=INK, color=INK, fontproperties={"size": 8.5},
+                )  # fmt: skip
             set_image_axes(axes, 0, width_px, height_px, 0)
             axes.set(aspect="equal", title=name)
             for side in ("top", "right"):
