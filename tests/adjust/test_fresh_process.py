@@ -66,6 +66,7 @@ print(on_line(np.eye(2)[None], 5.0))
 """
 
 
+@pytest.mark.slow
 def test_kernels_are_kept_and_where_they_cannot_be_they_are_compiled(tmp_path):
     """In a folder that is a file, or from damaged files, a process compiles for itself and says nothing."""
     blocked, kept = tmp_path / "file", tmp_path / "kept"

@@ -114,6 +114,7 @@ def folder_of(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Call
     return folder
 
 
+@pytest.mark.slow
 def test_the_first_block_of_the_readme_makes_a_map_and_a_report(furnished: Path) -> None:
     assert "make map" in RUN[0].text
     assert (furnished / "outputs/port2/report.html").stat().st_size > 100_000

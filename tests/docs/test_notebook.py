@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.docs.blocks import ROOT
 
 CELLS = json.loads((ROOT / "docs" / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
@@ -19,6 +21,7 @@ def test_the_notebook_is_kept_without_outputs() -> None:
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code)
 
 
+@pytest.mark.slow
 def test_the_notebook_walks_from_a_drive_to_a_map_and_its_report(tmp_path: Path) -> None:
     program = "\n\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code")
     (tmp_path / "notebook.py").write_text(program)

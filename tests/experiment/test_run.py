@@ -32,6 +32,7 @@ def finished(output: Path) -> ExperimentConfig:
     return config
 
 
+@pytest.mark.slow
 def test_finished_drives_are_never_opened_again(tmp_path: Path) -> None:
     folder, measured = run_experiment(finished(tmp_path), "name: x\n", lambda *_: None)
     assert [one.title for one in measured] == ["port1", "port2"]

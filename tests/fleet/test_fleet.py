@@ -151,6 +151,7 @@ def test_a_drive_that_wants_a_gpu_where_there_is_none_is_a_row(
         assert (row.status, "none of Ray's machines has a GPU" in row.says) == ("ERROR", True)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_a_drive_cache_and_results_at_an_object_store_make_the_same_map(
     ray: Any, s3: Any, drive: Path, tmp_path: Path
@@ -183,6 +184,7 @@ def written(folder: Path, name: str, drive: object) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_what_fails(
     ray: Any, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,6 +40,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return folders
 
 
+@pytest.mark.slow
 def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
     ray: Any, drives: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -155,6 +155,7 @@ run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], 
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_in_the_middle_of_detection(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache, output = site / "killed_cache", site / "killed"
     arguments = [str(site / "drive"), str(output), str(cache)]

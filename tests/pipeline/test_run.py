@@ -37,6 +37,7 @@ def result(short_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(run_config(short_drive, output, export=list(FORMATS), mosaic=True)).folder
 
 
+@pytest.mark.slow
 def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
     metrics = json.loads((result / "metrics.json").read_text())
     assert set(metrics["results"]) == {"front", "rear", "both"}
@@ -59,6 +60,7 @@ def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
     assert "verdict: PASS" in (result / "run.log").read_text()
 
 
+@pytest.mark.slow
 def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
     short_drive: Path, tmp_path: Path
 ) -> None:
@@ -135,7 +137,8 @@ def test_lane_lines_run_as_the_drive_passed_them(result: Path, short_drive: Path
         assert (steps * headings).sum() > 0
 
 
-def test_the_map_is_the_same_to_the_byte_without_the_truth(
+@pytest.mark.slow
+def test_two_processes_find_the_same_map_to_the_byte_without_the_truth(
     result: Path, short_drive: Path, tmp_path: Path
 ) -> None:
     blind = tmp_path / "short"
@@ -144,14 +147,9 @@ def test_the_map_is_the_same_to_the_byte_without_the_truth(
     description = blind / "drive.yaml"
     lines = description.read_text().splitlines(keepends=True)
     description.write_text("".join(line for line in lines if not line.startswith("truth:")))
-    again = run(run_config(blind, tmp_path / "outputs")).folder
+    again = run(run_config(blind, tmp_path / "outputs", workers=2)).folder
     for name in ("map.geojson", "calibration_front.yaml", "calibration_rear.yaml"):
         assert (again / name).read_bytes() == (result / name).read_bytes()
-
-
-def test_two_worker_processes_find_the_same_map(result: Path, short_drive: Path, tmp_path: Path) -> None:
-    again = run(run_config(short_drive, tmp_path, workers=2)).folder
-    assert (again / "map.geojson").read_bytes() == (result / "map.geojson").read_bytes()
 
 
 def small_copy(short_drive: Path, target: Path) -> Path:

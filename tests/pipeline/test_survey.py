@@ -114,6 +114,7 @@ def figures(result: Path) -> dict[str, float]:
     return dict(metrics["check_points"])
 
 
+@pytest.mark.slow
 def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented: tuple[Path, str]) -> None:
     result, printed = documented
     with (result / "check_points.csv").open(newline="") as file:
@@ -130,6 +131,7 @@ def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented:
     assert {"check points", "survey frame", "surveyed points"} <= set(passed), verdict["findings"]
 
 
+@pytest.mark.slow
 def test_control_points_bring_check_points_down_to_what_map_and_survey_state(
     site: Site, documented: tuple[Path, str], tmp_path: Path
 ) -> None:
@@ -143,6 +145,7 @@ def test_control_points_bring_check_points_down_to_what_map_and_survey_state(
     assert left["nees"] < 2.0
 
 
+@pytest.mark.slow
 def test_check_points_touch_no_part_of_the_map(
     site: Site, documented: tuple[Path, str], tmp_path: Path
 ) -> None:

@@ -25,6 +25,7 @@ def team(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict]]:
     return folder, [torch.load(folder / f"member{rank}.pt", weights_only=True) for rank in range(2)]
 
 
+@pytest.mark.slow
 def test_all_members_end_with_identical_weights(team: tuple[Path, list[dict]]) -> None:
     _, (one, other) = team
     for kind in ("net", "averaged"):

@@ -69,6 +69,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: weights.digest(path) for path in sorted(folder.iterdir())}
 
 
+@pytest.mark.slow
 def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, run, quick):
     told = shipped(Order(source=run, into=into, precision="float32", judge_images=130, lane_images=110))
     weights._problem.cache_clear()
@@ -86,6 +87,7 @@ def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, r
     assert not list(Path("runs").iterdir()), "what was kept to go on from is gone"
 
 
+@pytest.mark.slow
 def test_without_another_folder_the_detectors_own_files_and_the_float32_file_are_replaced(
     into, run, quick, monkeypatch, tmp_path
 ):
@@ -139,6 +141,7 @@ def test_judge_and_lane_score_can_be_kept_for_a_network_that_was_exported_before
     assert digests(into)["judge.onnx"] == after["judge.onnx"]
 
 
+@pytest.mark.slow
 def test_a_float32_file_is_exported_as_a_checkpoint_is(into, run, quick, tmp_path):
     checkpoint = load_checkpoint(run / "best.pt")
     export_checkpoint(checkpoint, tmp_path / "net.onnx", 18, 1e-3)
