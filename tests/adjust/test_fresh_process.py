@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 SOLVE = """
@@ -58,6 +60,8 @@ torch.optim.Optimizer.shut = type("Wrapper", (), {"__wrapped__": Shut()})()
 
 KERNEL = """
 from pathlib import Path
+
+import pytest
 from v2hdm.adjust.engines.numba import build
 build.PLACES = (Path({place!r}),)
 import numpy as np
