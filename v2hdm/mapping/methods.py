@@ -158,7 +158,7 @@ def _below(path: Path, root: Path) -> str:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
-Progress = Callable[[str], None]
+LogStep = Callable[[str], None]
 
 NAIVE_IPMS: Mapping[str, str] = {"CNI": "calibrated", "ENI": "estimated"}
 """Naive methods by the name of the IPM that they use."""
@@ -171,7 +171,7 @@ def run_methods(
     detections: Sequence[ImageDetections],
     cameras: Sequence[str],
     options: MappingOptions | None = None,
-    progress: Progress = silent,
+    progress: LogStep = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
     executor: Executor = IN_PROCESS,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +30,7 @@ from v2hdm.mosaic.sharpness import (
     save_comparison,
 )
 from v2hdm.mosaic.shots import Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.progress import Steps
 from v2hdm.records import Calibration, Drive, FloatArray, GeodeticOrigin
 from v2hdm.report.outputs import write_json
 from v2hdm.store.files import load_yaml, take_number, whole_file
@@ -156,8 +157,6 @@ RESOLUTION_M = 0.02
 
 TIFF, PICTURE, EXTENT, COMPARISON = "mosaic.tif", "mosaic.webp", "mosaic.json", "mosaic_before_after.png"
 
-Progress = Callable[[int, int], None]
-
 
 @dataclass(frozen=True)
 class Ground:
@@ -174,7 +173,7 @@ def write_mosaic(
     drive: Drive,
     resolution_m: float = RESOLUTION_M,
     device: str = "cpu",
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> dict[str, Any]:
     """Write the mosaic of a run's ground into its folder; returns what stands in ``mosaic.json``.
 
@@ -308,6 +307,6 @@ def _compare(
     save_comparison(path, pose, panels, ground.lenses, device)
 
 
-def _half(progress: Progress | None, number: int) -> Progress | None:
+def _half(progress: Steps | None, number: int) -> Steps | None:
     """The progress of one of two passes of about the same work."""
     return progress and (lambda done, total: progress(number * total + done, 2 * total))

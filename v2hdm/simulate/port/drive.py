@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from v2hdm.io.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.io.drive.writing import write_drive, write_truth
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import read_image_list
+from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import AlteredConfig, PortConfig
@@ -103,14 +104,13 @@ def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArr
     return hidden
 
 
-Progress = Callable[[int, int], None]
 _Job = tuple[str, int, str]
 
 _LANE_SIGHTINGS = 2
 _worker_port: Port | None = None
 
 
-def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Progress) -> Path:
+def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Steps) -> Path:
     """The folder of a port's drive in a cache, rendered now unless it was rendered before.
 
     Args:
@@ -159,7 +159,7 @@ def _drop_damaged(folder: Path) -> bool:
     return missing
 
 
-def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progress) -> None:
+def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps) -> None:
     """Render a port's drive into ``folder`` with its truth; see :func:`rendered_drive`."""
     port = build_port(config)
     images = _images(port, folder)
@@ -194,7 +194,7 @@ def _images(port: Port, folder: Path) -> list[Image]:
     ]
 
 
-def _render_all(port: Port, images: list[Image], workers: int, progress: Progress) -> None:
+def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) -> None:
     jobs = [
         (image.camera, k // len(port.cameras), str(image.path))
         for k, image in enumerate(images)
