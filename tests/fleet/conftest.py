@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.stores import quick as quick
 from tests.stores import s3 as s3
+from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +27,13 @@ def ray() -> Iterator[Any]:
         patch.setattr(ray, "init", partial(ray.init, num_gpus=1))
         with cluster(LOCAL, 2) as module:
             yield module
+
+
+@pytest.fixture(scope="session")
+def drive(rendered: Callable[[PortConfig], Path]) -> Path:
+    """Ten images of one camera on a straight."""
+    route = RouteConfig(pieces=[[26.0, 0.0]], image_spacing_m=2.6)
+    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
+    port = PortConfig(name="tiny", seed=3, initial_ipm="calibrated", route=route, yard=yard)
+    port.cameras = {"front": port.cameras["front"]}
+    return rendered(port)

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from tests.fleet.run_files import written
+
 pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 from v2hdm.detection import network
@@ -31,19 +33,6 @@ from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.run import run
 from v2hdm.records import ImageDetections
-from v2hdm.simulate import PortConfig, render_drive
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    route = RouteConfig(pieces=[[26.0, 0.0]], image_spacing_m=2.6)
-    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
-    port = PortConfig(name="tiny", seed=3, initial_ipm="calibrated", route=route, yard=yard)
-    port.cameras = {"front": port.cameras["front"]}
-    folder = tmp_path_factory.mktemp("drives") / "tiny"
-    render_drive(port, folder, 1, lambda done, total: None)
-    return folder
 
 
 def detectors_of(ray: Any, count: int, **options: Any) -> list[Any]:
@@ -176,12 +165,6 @@ def test_a_drive_cache_and_results_at_an_object_store_make_the_same_map(
     for name in ("map.geojson", "calibration_front.yaml"):
         there = s3.get_object(Bucket="bucket", Key=f"results/good/{name}")["Body"].read()
         assert there == (tmp_path / "out" / "good" / name).read_bytes()
-
-
-def written(folder: Path, name: str, drive: object) -> Path:
-    path = folder / f"{name}.yaml"
-    path.write_text(f"# @package _global_\nname: {name}\ndrive:\n  path: {drive}\n")
-    return path
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import torch
 pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 
-from tests.fleet.test_fleet import written
+from tests.fleet.run_files import written
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.executor import RayExecutor
 from v2hdm.fleet.plan import Row, plan_site

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.report.test_check_points import SURVEY_M, checked, point, yard
+from tests.report.yard import SURVEY_M, checked, point, yard
 from v2hdm.records import FloatArray
 from v2hdm.verdict import Finding, Status
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
