@@ -135,3 +135,24 @@ def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_mor
     assert max(right.values()) < 1.2
     small = replace(problem, pose_sigma=PoseSigma(0.01, 0.0001, 0.002, 0.005))
     assert pose_innovations(solve(small, OPTIONS)).rms()["heading"] > 1.4
+
+
+def test_observations_that_the_loss_has_switched_off_do_not_vote() -> None:
+    """Wrong associations put corners into the camera's plane, where residuals and derivatives are huge."""
+    street = scene()
+    problem, seen = street.problem, street.problem.observations
+    cam_from_map = street.cam_from_vehicle[0] @ np.linalg.inv(problem.map_from_vehicle)
+    row = cam_from_map[:, 2]
+    depth_m = street.corners_map @ row[:, :2].T + row[:, 3]
+    corner, frame = (one[:6] for one in np.nonzero((depth_m > 0.01) & (depth_m < 0.1)))
+    assert len(corner) == 6
+    more = replace(
+        seen,
+        camera=np.append(seen.camera, np.zeros(6, dtype=seen.camera.dtype)),
+        frame=np.append(seen.frame, frame),
+        corner=np.append(seen.corner, corner),
+        pinhole_px=np.vstack([seen.pinhole_px, np.full((6, 2), 300.0)]),
+        covariance_px=np.concatenate([seen.covariance_px, np.tile(np.eye(2), (6, 1, 1))]),
+    )
+    wrong, robust = replace(problem, observations=more), replace(OPTIONS, loss="cauchy")
+    assert all(one.sigmas < 5 for one in score_faults(wrong, solve(wrong, robust)))

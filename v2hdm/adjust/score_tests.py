@@ -23,7 +23,6 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.engine import WEIGHT_FLOOR
 from v2hdm.adjust.model import (
     Gradient,
     centre_residual,
@@ -163,7 +162,7 @@ class _Bench:
         engine, estimate = whitening.engine, whitening.estimate
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
-        root = weight.clamp(min=WEIGHT_FLOOR).sqrt()
+        root = weight.sqrt()  # no floor: it keeps corners factorable, and is no evidence
         priors = _prior_residuals(engine.arrays, estimate.cam_from_vehicle, estimate.corners_map)
         return cls(whitening, root, _Column(whitened_px * root, *priors), whitened_px)
 
