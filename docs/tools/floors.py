@@ -46,7 +46,8 @@ def draw() -> str:
         left = float(_MARGIN)
         for name in row:
             width = room * (len(name) + 2) / total
-            kind = ' class="light"' if name in free else ""
+            light = any(f"{name}.".startswith(f"{one}.") for one in free)
+            kind = ' class="light"' if light else ""
             parts.append(
                 f'<rect{kind} x="{left:.0f}" y="{top}" width="{width:.0f}" height="{_FLOOR}" rx="3"/>'
             )
