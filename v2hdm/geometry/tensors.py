@@ -66,11 +66,6 @@ def inverse(dst_from_src: Tensor) -> Tensor:
     return make_transform(src_from_dst_rotation, -(src_from_dst_rotation @ dst_from_src[..., :3, 3:])[..., 0])
 
 
-def apply(dst_from_src: Tensor, points_src: Tensor) -> Tensor:
-    """Points (*batch, n, 3) of ``src`` in ``dst``."""
-    return points_src @ dst_from_src[..., :3, :3].mT + dst_from_src[..., None, :3, 3]
-
-
 def exp(tangent: Tensor) -> Tensor:
     """The rigid motion (*batch, 4, 4) of a tangent (*batch, 6), for rotations up to pi.
 
