@@ -56,6 +56,13 @@ def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> F
     return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
 
 
+def make_transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """The transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    out = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    return out
+
+
 def heading_rad(map_from_vehicle: FloatArray) -> FloatArray:
     """Headings (...), to the left of the map's x axis, of poses (..., 4, 4)."""
     return np.asarray(np.arctan2(map_from_vehicle[..., 1, 0], map_from_vehicle[..., 0, 0]))
@@ -77,7 +84,7 @@ def exp(tangents: FloatArray) -> FloatArray:
     squared = omega @ omega
     sine, cosine, third = _even_series(tangents[..., 3:], EXP_SERIES)
     moved = (np.eye(3) + cosine * omega + third * squared) @ tangents[..., :3, None]
-    return _transform(np.eye(3) + sine * omega + cosine * squared, moved[..., 0])
+    return make_transform(np.eye(3) + sine * omega + cosine * squared, moved[..., 0])
 
 
 def log(dst_from_src: FloatArray) -> FloatArray:
@@ -193,11 +200,14 @@ def rotation_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: Fl
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def _transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """The transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
-    out = np.zeros((*translation.shape[:-1], 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
-    return out
+def euler_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Roll, pitch and yaw (3,) in rad of a rotation (3, 3), as :func:`rotation_from_euler` has them."""
+    flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    pitch = np.arctan2(-rotation[2, 0], flat)
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0]) if flat > 0 else 0.0
+    # By its cosines with the other two axes turned, roll stays exact where the pitch is a right angle.
+    across = rotation.T @ [-np.sin(yaw), np.cos(yaw), 0.0]
+    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
 
 
 def _even_series(rotation: FloatArray, coefficients: tuple[tuple[float, ...], ...]) -> list[FloatArray]:

@@ -22,9 +22,12 @@ _STEEPEST_RAY = 0.999
 
 def take_ipm(content: object, where: str) -> FloatArray:
     """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm."""
-    ipm = take_array(content, (3, 3), where, DriveError)
-    rows, columns = np.linalg.norm(ipm, axis=1, keepdims=True), np.linalg.norm(ipm, axis=0)
-    if not rows.all() or not columns.all() or 1.0 / np.linalg.cond(_balanced(ipm)) < _SINGULAR:
+    ipm = balanced = take_array(content, (3, 3), where, DriveError)
+    invertible = ipm.any(axis=0).all() and ipm.any(axis=1).all()
+    # Rows and columns of comparable norms: pixels and metres must not look singular.
+    for axis in (1, 0) * 4 if invertible else ():
+        balanced = balanced / np.linalg.norm(balanced, axis=axis, keepdims=True)
+    if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
         raise DriveError(
             f"{where}: IPM matrix is not invertible; calibrate it again from at least 4 point pairs"
         )
@@ -139,11 +142,3 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
             f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {', '.join(ipm)}"
         )
     return initial
-
-
-def _balanced(matrix: FloatArray) -> FloatArray:
-    """Rows and columns brought to comparable norms: pixels and metres must not look singular."""
-    for _ in range(4):
-        matrix = matrix / np.linalg.norm(matrix, axis=1, keepdims=True)
-        matrix = matrix / np.linalg.norm(matrix, axis=0, keepdims=True)
-    return matrix

@@ -93,18 +93,12 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
-    return assemble_drive(
-        _name(content, path),
-        path,
-        cameras,
-        files,
-        recorded.trajectory,
-        pose_noise,
-        options.max_gap_s,
-        poses_at,
-        origin=recorded.origin,
-        truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
+    truth_dir = _find_truth(content.get("truth"), path, f"{where}: truth")
+    name = _name(content, path)
+    drive = Drive(
+        name, path, cameras, (), pose_noise, recorded.origin, truth_dir, recorded=recorded.trajectory
     )
+    return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
 def folder_drive_name(path: Path) -> str:

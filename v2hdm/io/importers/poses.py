@@ -26,11 +26,11 @@ from v2hdm.geometry.geodetic import (
     is_geographic,
     position_of,
 )  # fmt: skip
-from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.importers import nmea, tables
 from v2hdm.io.importers.tables import Readings
-from v2hdm.io.trajectory import check_geodetic, pose_matrices, read_tum, why_no_pose
+from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
 
@@ -207,7 +207,7 @@ def assemble(
     if settings.lever_arm_m is not None:
         points = points - rotation @ settings.lever_arm_m
     noise = _noise({"position_m": sigma_m, "heading_rad": heading_sigma_rad})
-    return Recorded(Trajectory(stamp_s, pose_matrices(rotation, points)), noise, origin)
+    return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, origin)
 
 
 def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArray:
@@ -233,14 +233,12 @@ def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[Floa
     assert attitudes is not None
     if np.array_equal(attitudes.stamp_s, readings.stamp_s):
         return attitudes.rotation, np.ones(len(readings.stamp_s), dtype=bool)
-    turns = Trajectory(
-        attitudes.stamp_s, pose_matrices(attitudes.rotation, np.zeros((len(attitudes.stamp_s), 3)))
-    )
+    turns = Trajectory(attitudes.stamp_s, make_transform(attitudes.rotation, np.zeros(3)))
     found, known = interpolate(turns, readings.stamp_s, max_gap_s)
     if not known.any():
         raise DriveError(
-            f"{where}: no position ({readings.stamp_s[0]:.3f} to {readings.stamp_s[-1]:.3f} s) has a heading "
-            f"({attitudes.stamp_s[0]:.3f} to {attitudes.stamp_s[-1]:.3f} s) within {max_gap_s:g} s "
+            f"{where}: no position ({span(readings.stamp_s)}) has a heading "
+            f"({span(attitudes.stamp_s)}) within {max_gap_s:g} s "
             "(drive.max_gap_s): "
             f"{why_no_pose(readings.stamp_s, attitudes.stamp_s, max_gap_s, 'positions', 'headings')}"
         )

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
-from v2hdm.io.trajectory import in_order, pose_matrices
+from v2hdm.geometry.rigid import make_transform, rotation_from_euler
+from v2hdm.io.trajectory import UNITS, checked_rotations, in_order
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
 
@@ -73,7 +73,7 @@ class Readings:
 
 _VEHICLE_FROM_CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _UPRIGHT = 0.5  # least cosine between the poses' z axis and up for poses of a ground vehicle
-_ROTATION_TOLERANCE = _NORM_TOLERANCE = 1e-3
+_ROTATION_TOLERANCE = 1e-3
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
@@ -108,7 +108,7 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
             f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
         )
     rows = in_order(stamp_s, str(path))
-    return readings_of_poses(Trajectory(stamp_s[rows], pose_matrices(rotation[rows], points[rows])))
+    return readings_of_poses(Trajectory(stamp_s[rows], make_transform(rotation[rows], points[rows])))
 
 
 def read_stamps(path: Path) -> FloatArray:
@@ -135,7 +135,7 @@ def _numbers(path: Path, columns: int) -> FloatArray:
     return np.array(rows)
 
 
-_STAMPS: Mapping[str, float] = {"stamp_s": 1.0, "stamp_ms": 1e3, "stamp_us": 1e6, "stamp_ns": 1e9}
+_STAMPS: Mapping[str, float] = {f"stamp_{unit}": scale for unit, scale in UNITS.items()}
 _MAP = ("x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -262,11 +262,7 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
         if angles:
             raise DriveError(f"{path}: has a quaternion and {angles[0]}: say one of them under columns")
         quaternion = np.column_stack([columns[name] for name in _QUATERNION])
-        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
-            k = int(np.argmax(np.abs(norm - 1) > _NORM_TOLERANCE))
-            raise DriveError(f"{path}: pose {k + 1}: quaternion of norm {norm[k, 0]:.6g} instead of 1")
-        return rotation_from_quaternion(quaternion / norm)
+        return checked_rotations(quaternion, lambda k: f"{path}: pose {k + 1}")
     if not yaws:
         return None
     for kind in (("heading_deg", "yaw_deg", "yaw_rad"), ("roll_deg", "roll_rad"),

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.calibration.mounting import roi_ahead
 from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import messages as kinds
@@ -128,7 +128,7 @@ class _Description:
             self._missing.append("turn of the heading's sensor on the vehicle (mounting_rpy_deg)")
             entry["mounting_rpy_deg"] = "?"
         elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:
-            entry["mounting_rpy_deg"] = _rpy_deg(turned[:3, :3])
+            entry["mounting_rpy_deg"] = np.degrees(euler_from_rotation(turned[:3, :3])).tolist()
         return entry
 
     def _camera(self, name: str, topic: Topic, info: Topic | None) -> dict[str, Any]:
@@ -196,10 +196,3 @@ def _info_topic(bag: Bag, image: Topic) -> Topic | None:
 def _only(bag: Bag, kinds: Sequence[str]) -> Topic | None:
     found = [one for one in bag.topics.values() if one.kind in kinds and one.messages >= _LEAST_MESSAGES]
     return found[0] if len(found) == 1 else None
-
-
-def _rpy_deg(rotation: FloatArray) -> list[float]:
-    """Roll, pitch and yaw in degrees, about fixed axes (REP-103)."""
-    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
-    roll, yaw = np.arctan2(rotation[2, 1], rotation[2, 2]), np.arctan2(rotation[1, 0], rotation[0, 0])
-    return [float(np.degrees(angle)) for angle in (roll, pitch, yaw)]

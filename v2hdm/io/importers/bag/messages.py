@@ -11,11 +11,10 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
-from v2hdm.geometry.rigid import rotation_from_quaternion
 from v2hdm.io.importers.nmea import nmea_readings
 from v2hdm.io.importers.tables import Attitudes, Readings
 from v2hdm.io.safe.pixels import png
-from v2hdm.io.trajectory import in_order
+from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import FloatArray
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -180,13 +179,8 @@ def readings_of(
     known = np.isfinite(turned[:, :4]).all(axis=1)
     attitudes = None
     if known.any():
-        norm = np.linalg.norm(turned[known, :4], axis=1, keepdims=True)
-        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
-            raise DriveError(
-                f"{where}: holds a quaternion of norm {norm[np.argmax(np.abs(norm - 1)), 0]:.3g}: no "
-                "orientation was measured there; choose another topic for the heading"
-            )
-        rotation = rotation_from_quaternion(turned[known, :4] / norm)
+        advice = "no orientation was measured there: choose another topic for the heading"
+        rotation = checked_rotations(turned[known, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[known], rotation, turned[known, 4])
     geodetic = kind == FIX
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
+from v2hdm.geometry.rigid import inverse, make_transform, rotation_from_quaternion
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.io.trajectory import in_order, pose_matrices
+from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray, Trajectory
 
 Edge = tuple[str, str]
@@ -38,7 +38,7 @@ class Frames:
             norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
             if not np.isfinite(table).all() or (norm < 0.5).any():
                 raise DriveError(f"{where}: the transform of {child} in {parent} is none; record it anew")
-            poses = pose_matrices(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
+            poses = make_transform(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
             # Old recorders publish fixed frames again and again.
             moves = len(poses) > 1 and bool(np.ptp(poses, axis=0).max() > _FIXED)
             count = len(poses) if moves else 1
