@@ -24,6 +24,7 @@ from v2hdm.io.trajectory import UNITS, read_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 
+_Lister = Callable[[], ImageFiles]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
@@ -57,13 +58,13 @@ class Sources:
         return folder
 
 
-def plan_images(content: object, camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+def plan_images(content: object, camera: str, sources: Sources, where: str) -> _Lister:
     """The function that lists the images of a camera, to be called once all sources are planned."""
     if isinstance(content, str):
         path = sources.root / take_text(content, where, DriveError)
         if path.is_dir():
             return _of_folder({"folder": content}, camera, sources, where)
-        return lambda: _of_list(camera, path, 0.0)
+        return lambda: _of_list(camera, path)
     entry = take_mapping(content, where, DriveError)
     named = [key for key in IMAGE_SOURCES if key in entry]
     if len(named) != 1:
@@ -71,9 +72,9 @@ def plan_images(content: object, camera: str, sources: Sources, where: str) -> C
             f"{where}: name one source, a list file or one of {', '.join(IMAGE_SOURCES)}; "
             f"got {', '.join(named) or 'none'}"
         )
-    source = IMAGE_SOURCES[named[0]]
-    check_keys(entry, (named[0],), source.keys, where, DriveError)
-    return source.plan(entry, camera, sources, where)
+    plan, keys = IMAGE_SOURCES[named[0]]
+    check_keys(entry, (named[0],), keys, where, DriveError)
+    return plan(entry, camera, sources, where)
 
 
 def plan_info(content: object, camera: str, sources: Sources, where: str) -> Callable[[], CameraInfo]:
@@ -98,12 +99,10 @@ def _read_info(path: Path, camera: str | None) -> CameraInfo:
     return read_intrinsics(path, camera, f"camera_info: {{file: {path.name}, camera: NAME}}")
 
 
-def plan_topic_poses(
-    content: object, sources: Sources, where: str
-) -> Callable[[dict[str, Any], str], Readings]:
-    """The function that reads the poses of a topic in ``poses``: messages of poses, or transforms."""
+def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[[], Readings] | None:
+    """The function that reads the poses of a topic in ``poses``, if it names one: of poses, or transforms."""
     if not isinstance(content, dict) or "topic" not in content:
-        return _not_planned
+        return None
     topic = take_text(content["topic"], f"{where}, topic", DriveError)
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
@@ -111,17 +110,12 @@ def plan_topic_poses(
                 raise DriveError(
                     f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle"
                 )
-        frame, vehicle = (
-            take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")
-        )
+        ends = [take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")]
         transforms = streams.TfStream(True, where)
         tf_folder = sources.want(transforms)
-
-        def of_frames(entry: dict[str, Any], where: str) -> Readings:
-            frames = transforms.frames(tf_folder())
-            return readings_of_poses(frames.moving(frame, vehicle, sources.max_gap_s, where))
-
-        return of_frames
+        return lambda: readings_of_poses(
+            transforms.frames(tf_folder()).moving(*ends, sources.max_gap_s, where)
+        )
     for key in ("frame", "vehicle"):
         if key in content:
             raise DriveError(f"{where}, {key}: only for {TF_TOPIC}; drop it")
@@ -130,19 +124,25 @@ def plan_topic_poses(
         heading = take_text(heading, f"{where}, heading_topic", DriveError)
     stream = streams.PoseStream(topic, heading, _take_stamps(content, where), where)
     folder = sources.want(stream)
-    return lambda entry, where: stream.readings(folder())
+    return lambda: stream.readings(folder())
 
 
-def _not_planned(entry: dict[str, Any], where: str) -> Readings:
-    raise AssertionError(where)
-
-
-def _of_list(camera: str, path: Path, start_s: float) -> ImageFiles:
+def _of_list(camera: str, path: Path, start_s: float = 0.0) -> ImageFiles:
     stamp_s, names = read_image_list(path)
     return ImageFiles(camera=camera, stamp_s=stamp_s + start_s, paths=[path.parent / name for name in names])
 
 
-def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
+    topic = take_text(entry["topic"], f"{where}, topic", DriveError)
+    folder = sources.want(streams.ImageStream(topic, _take_stamps(entry, where), where))
+    return lambda: _of_list(camera, folder() / streams.IMAGE_LIST)
+
+
+def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
+    return take_choice(entry.get("stamps", streams.STAMPS[0]), streams.STAMPS, f"{where}, stamps", DriveError)
+
+
+def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
     folder = sources.root / take_text(entry["folder"], f"{where}, folder", DriveError)
     unit = take_choice(entry.get("unit", "s"), UNITS, f"{where}, unit", DriveError)
 
@@ -173,7 +173,7 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
     return images
 
 
-def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
     path = sources.root / take_text(entry["video"], f"{where}, video", DriveError)
     if ("start_s" in entry) == ("stamps" in entry):
         raise DriveError(
@@ -185,7 +185,7 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         frames = import_video(path, sources.cache, where) / IMAGE_LIST
         if "start_s" in entry:
             return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
-        listed = _of_list(camera, frames, 0.0)
+        listed = _of_list(camera, frames)
         stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
         if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
             raise DriveError(
@@ -197,25 +197,11 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
     return images
 
 
-def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
-    topic = take_text(entry["topic"], f"{where}, topic", DriveError)
-    folder = sources.want(streams.ImageStream(topic, _take_stamps(entry, where), where))
-    return lambda: _of_list(camera, folder() / streams.IMAGE_LIST, 0.0)
-
-
-def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
-    return take_choice(entry.get("stamps", streams.STAMPS[0]), streams.STAMPS, f"{where}, stamps", DriveError)
-
-
-@dataclass(frozen=True)
-class _ImageSource:
-    plan: Callable[[dict[str, Any], str, Sources, str], Callable[[], ImageFiles]]
-    keys: tuple[str, ...]
-
-
-IMAGE_SOURCES: Mapping[str, _ImageSource] = {
-    "folder": _ImageSource(_of_folder, ("stamps", "unit")),
-    "video": _ImageSource(_of_video, ("start_s", "stamps")),
-    "topic": _ImageSource(_of_topic, ("stamps",)),
+IMAGE_SOURCES: Mapping[
+    str, tuple[Callable[[dict[str, Any], str, Sources, str], _Lister], tuple[str, ...]]
+] = {
+    "folder": (_of_folder, ("stamps", "unit")),
+    "video": (_of_video, ("start_s", "stamps")),
+    "topic": (_of_topic, ("stamps",)),
 }
-"""Sources of images other than a list file, by the key that names them."""
+"""Sources of images other than a list file, by the key that names them: how they are planned, other keys."""

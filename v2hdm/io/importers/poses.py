@@ -16,16 +16,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.geodetic import (
-    convergence_rad,
-    datum_of,
-    enu_axes,
-    enu_from_geodetic,
-    geodetic_from_grid,
-    has_height_datum,
-    is_geographic,
-    position_of,
-)  # fmt: skip
+from v2hdm.geometry import geodetic as earth
 from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.importers import nmea, tables
@@ -41,7 +32,6 @@ COMMON_KEYS = (
     "crs", "heading", "lever_arm_m", "mounting_rpy_deg", "max_sigma_m", "geoid_m", "epoch", "offset_s",
 )  # fmt: skip
 TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
-ReadTopic = Callable[[dict[str, Any], str], Readings]
 
 
 @dataclass(frozen=True)
@@ -82,25 +72,15 @@ class Recorded:
     origin: GeodeticOrigin | None
 
 
-@dataclass(frozen=True)
-class PoseFormat:
-    """One format: ``read(path, entry, root, where)`` and the ``keys`` that it has of its own."""
+_Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
 
-    read: Callable[[Path, dict[str, Any], Path, str], Readings]
-    keys: tuple[str, ...] = ()
-
-
-def _read_tum(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    return tables.readings_of_poses(read_tum(path))
-
-
-POSE_FORMATS: Mapping[str, PoseFormat] = {
-    "tum": PoseFormat(_read_tum),
-    "kitti": PoseFormat(tables.read_kitti_rows, tables.KITTI_KEYS),
-    "csv": PoseFormat(tables.read_table, tables.TABLE_KEYS),
-    "nmea": PoseFormat(nmea.read_nmea, nmea.KEYS),
+POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
+    "tum": (lambda path, entry, root, where: tables.readings_of_poses(read_tum(path)), ()),
+    "kitti": (tables.read_kitti_rows, tables.KITTI_KEYS),
+    "csv": (tables.read_table, tables.TABLE_KEYS),
+    "nmea": (nmea.read_nmea, nmea.KEYS),
 }
-"""Formats of files by the key that names the file; ``topic`` names one of a bag instead."""
+"""Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
 
 
 def read_poses(
@@ -109,13 +89,13 @@ def read_poses(
     origin: GeodeticOrigin | None,
     max_gap_s: float,
     where: str,
-    read_topic: ReadTopic,
+    read_topic: Callable[[], Readings] | None,
 ) -> Recorded:
     """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
 
     File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
     attitudes further apart than ``max_gap_s`` are not interpolated across, ``where`` names the key in errors,
-    and ``read_topic`` reads a topic of the drive's bag.
+    and ``read_topic`` reads the topic of the drive's bag that is named, if one is.
     """
     if isinstance(content, str):
         return Recorded(read_tum(root / content), {}, origin)
@@ -127,13 +107,13 @@ def read_poses(
             f"of the bag; got {', '.join(named) or 'none'}"
         )
     (kind,) = named
-    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys
+    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind][1]
     check_keys(entry, (kind,), (*keys, *COMMON_KEYS), where, DriveError)
     settings = _take_settings(entry, where)
     name = take_text(entry[kind], f"{where}, {kind}", DriveError)
-    if kind == "topic":
-        return assemble(read_topic(entry, where), settings, origin, max_gap_s, f"{where}, topic {name}")
-    readings = POSE_FORMATS[kind].read(root / name, entry, root, where)
+    if read_topic is not None:
+        return assemble(read_topic(), settings, origin, max_gap_s, f"{where}, topic {name}")
+    readings = POSE_FORMATS[kind][0](root / name, entry, root, where)
     return assemble(readings, settings, origin, max_gap_s, str(root / name))
 
 
@@ -192,13 +172,13 @@ def assemble(
         if readings.geodetic:
             check_geodetic(points, where)
         geodetic, north_rad = _on_earth(points, readings.geodetic, settings, where)
-        datum = "WGS84" if settings.crs is None else datum_of(settings.crs, where, DriveError)
+        datum = "WGS84" if settings.crs is None else earth.datum_of(settings.crs, where, DriveError)
         origin = _origin(origin, geodetic[0], datum, settings, where)
         zeros = np.zeros(len(points))
         # A grid whose north lies clockwise of true north turns all that is measured from it clockwise.
         rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
-        rotation = enu_axes(position_of(origin))[0].T @ enu_axes(geodetic) @ rotation
-        points = enu_from_geodetic(origin, geodetic)
+        rotation = earth.enu_axes(earth.position_of(origin))[0].T @ earth.enu_axes(geodetic) @ rotation
+        points = earth.enu_from_geodetic(origin, geodetic)
     elif settings.heading is not None or settings.geoid_m is not None:
         key = "heading" if settings.heading is not None else "geoid_m"
         raise DriveError(
@@ -253,14 +233,14 @@ def _on_earth(
 ) -> tuple[FloatArray, FloatArray]:
     """Latitude, longitude and height above the ellipsoid (P, 3), and the north that counts (P,), rad."""
     crs = settings.crs
-    if crs is not None and has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
+    if crs is not None and earth.has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
         raise DriveError(
             f"{where}: heights of {crs} count from the sea: add geoid_m, the geoid's height above the "
             "ellipsoid"
         )
     raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
     if geodetic:
-        if crs is not None and not is_geographic(crs, where, DriveError):
+        if crs is not None and not earth.is_geographic(crs, where, DriveError):
             raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
         if settings.heading == "grid":
             raise DriveError(
@@ -275,8 +255,8 @@ def _on_earth(
         )
     north_rad = np.zeros(len(points))
     if settings.heading == "grid":
-        north_rad = convergence_rad(crs, raised, where, DriveError)
-    return geodetic_from_grid(crs, raised, where, DriveError), north_rad
+        north_rad = earth.convergence_rad(crs, raised, where, DriveError)
+    return earth.geodetic_from_grid(crs, raised, where, DriveError), north_rad
 
 
 def _origin(

@@ -14,15 +14,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.io.maps.features import ground_height_m
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Road
-from v2hdm.store.files import (
-    load_json,
-    read_text,
-    replace_text,
-    take_array,
-    take_mapping,
-    take_number,
-    take_text,
-)
+from v2hdm.store import files
 
 FILE = "residuals.csv"  # in a result folder
 
@@ -90,12 +82,12 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
             residuals.marking[k] or "", residuals.corner[k] + 1, int(residuals.is_point[k]),
             f"{u:.3f}", f"{v:.3f}", f"{du:.4f}", f"{dv:.4f}", f"{residuals.distance_sigma[k]:.3f}",
         ])  # fmt: skip
-    replace_text(path, text.getvalue())
+    files.replace_text(path, text.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
     """Read the file of :func:`write_residuals`; raises MapFileError where it is missing or damaged."""
-    rows = list(csv.reader(io.StringIO(read_text(path, MapFileError))))
+    rows = list(csv.reader(io.StringIO(files.read_text(path, MapFileError))))
     if not rows or tuple(rows[0]) != COLUMNS:
         raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
     images: dict[str, tuple[int, str, float]] = {}
@@ -111,18 +103,11 @@ def read_residuals(path: Path) -> Residuals:
             raise MapFileError(f"{path}: line {line}: not {len(COLUMNS)} fields as named above") from None
         row_image.append(number)
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
-    return Residuals(
-        image=tuple(images),
-        camera=tuple(camera for _, camera, _ in images.values()),
-        taken_s=np.array([taken_s for _, _, taken_s in images.values()]),
-        row_image=np.array(row_image, dtype=np.int64),
-        marking=table[:, 0].astype(np.int64),
-        corner=table[:, 1].astype(np.int64) - 1,
-        is_point=table[:, 2] > 0,
-        observed_px=table[:, 3:5],
-        residual_px=table[:, 5:7],
-        distance_sigma=table[:, 7],
-    )
+    cameras = tuple(camera for _, camera, _ in images.values())
+    taken_s = np.array([taken_s for _, _, taken_s in images.values()])
+    marking, corner = table[:, :2].astype(np.int64).T
+    known = (np.array(row_image, dtype=np.int64), marking, corner - 1, table[:, 2] > 0)
+    return Residuals(tuple(images), cameras, taken_s, *known, table[:, 3:5], table[:, 5:7], table[:, 7])
 
 
 @dataclass(frozen=True)
@@ -144,14 +129,8 @@ def write_exclusions(
     for number, one in enumerate(excluded):
         place = one.position_map.reshape(1, 2)
         heights = None if road is None else ground_height_m(road, place)
-        properties = {
-            "id": number,
-            "class": one.kind,
-            "reason": one.reason,
-            "sightings": one.sightings,
-            "cameras": one.cameras,
-            "position_map": one.position_map.tolist(),
-        }
+        properties = {"id": number, "class": one.kind, "reason": one.reason, "sightings": one.sightings}
+        properties |= {"cameras": one.cameras, "position_map": one.position_map.tolist()}
         (position,) = geojson_positions(place, heights, origin)
         features.append(geojson_feature(f"excluded/{number}", "Point", position, properties))
     write_features(path, features, origin, {})
@@ -159,19 +138,19 @@ def write_exclusions(
 
 def read_exclusions(path: Path) -> list[ExcludedMarking]:
     """Read the file of :func:`write_exclusions`; raises MapFileError where it is missing or damaged."""
-    features = load_json(path, MapFileError).get("features")
+    features = files.load_json(path, MapFileError).get("features")
     if not isinstance(features, list):
         raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
     excluded = []
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
-        feature = take_mapping(feature, where, MapFileError)
-        entry = take_mapping(feature.get("properties"), where, MapFileError)
+        feature = files.take_mapping(feature, where, MapFileError)
+        entry = files.take_mapping(feature.get("properties"), where, MapFileError)
         kind, reason, cameras = (
-            take_text(entry.get(key), f"{where}: {key}", MapFileError)
+            files.take_text(entry.get(key), f"{where}: {key}", MapFileError)
             for key in ("class", "reason", "cameras")
         )
-        at = take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
-        sightings = take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
+        at = files.take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
+        sightings = files.take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
         excluded.append(ExcludedMarking(kind, at, int(sightings), reason, cameras))
     return excluded
