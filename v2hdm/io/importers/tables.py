@@ -151,19 +151,22 @@ up."""
 
 def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
     """Read the CSV file at ``path``, separated by commas, semicolons, tabs or blanks."""
-    columns = _columns(path, _take_names(entry.get("columns"), f"{where}, columns"))
+    names = take_mapping(entry.get("columns") or {}, f"{where}, columns", DriveError)
+    check_keys(names, (), NAMES, f"{where}, columns", DriveError)
+    texts = {ours: take_text(name, f"{where}, columns, {ours}", DriveError) for ours, name in names.items()}
+    columns = _columns(path, texts)
     stamp_s = _stamps(columns, path)
     rows = in_order(stamp_s, str(path), "pose")
     columns = {name: values[rows] for name, values in columns.items()}
     geodetic = _GEODETIC[0] in columns
-    names = _GEODETIC if geodetic else _MAP
+    coordinates = _GEODETIC if geodetic else _MAP
     if geodetic == (_MAP[0] in columns):
         raise DriveError(
             f"{path}: needs positions, as columns {', '.join(_MAP)} or {', '.join(_GEODETIC)}, one of the two"
         )
-    _need(columns, names[:2], path)
+    _need(columns, coordinates[:2], path)
     count = len(rows)
-    points = np.column_stack([columns.get(name, np.zeros(count)) for name in names])
+    points = np.column_stack([columns.get(name, np.zeros(count)) for name in coordinates])
     sigma_m = columns.get("sigma_m", np.full(count, np.nan))
     if "quality" in columns:
         stated = np.array([SIGMA_OF_QUALITY_M.get(value, np.inf) for value in columns["quality"]])
@@ -172,14 +175,6 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     rotation = _rotation(columns, path)
     attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
     return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, antenna=geodetic)
-
-
-def _take_names(content: object, where: str) -> dict[str, str]:
-    if content is None:
-        return {}
-    entry = take_mapping(content, where, DriveError)
-    check_keys(entry, (), NAMES, where, DriveError)
-    return {ours: take_text(theirs, f"{where}, {ours}", DriveError) for ours, theirs in entry.items()}
 
 
 def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
@@ -273,9 +268,8 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
     zeros = np.zeros(len(columns[yaws[0]]))
 
     def radians(kind: str) -> FloatArray:
-        if f"{kind}_rad" in columns:
-            return columns[f"{kind}_rad"]
-        return np.radians(columns.get(f"{kind}_deg", zeros))
+        degrees = columns.get(f"{kind}_deg", zeros)
+        return columns[f"{kind}_rad"] if f"{kind}_rad" in columns else np.radians(degrees)
 
     yaw = np.pi / 2 - radians("heading") if "heading_deg" in columns else radians("yaw")
     pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 import cv2
@@ -11,7 +10,6 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
-from v2hdm.io.importers.nmea import nmea_readings
 from v2hdm.io.importers.tables import Attitudes, Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import checked_rotations, in_order
@@ -142,7 +140,12 @@ Row = tuple[float, ...]
 def position_row(kind: str, fields: Any) -> Row:
     """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
     if kind == FIX:
-        return _fix(fields)
+        sigma_m = np.nan
+        if fields.position_covariance_type:
+            sigma_m = _sigma((fields.position_covariance[0] + fields.position_covariance[4]) / 2)
+        if fields.status.status <= _NO_FIX:
+            sigma_m = np.inf
+        return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
     return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
 
 
@@ -169,12 +172,9 @@ def readings_of(
     stamp_s, rows = stamp_s[order], rows[order]
     if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
         raise DriveError(f"{where}: holds a position that is not finite; record it anew")
-    if headings is not None:
-        heading_s, turned = headings
-        by_time = in_order(heading_s, where, "message of the heading")
-        heading_s, turned = heading_s[by_time], turned[by_time]
-    else:
-        heading_s, turned = stamp_s, rows[:, 4:]
+    heading_s, turned = headings or (stamp_s, rows[:, 4:])
+    by_time = in_order(heading_s, where, "message of the heading")
+    heading_s, turned = heading_s[by_time], turned[by_time]
     # A dual antenna writes nan where it has none.
     known = np.isfinite(turned[:, :4]).all(axis=1)
     attitudes = None
@@ -186,26 +186,12 @@ def readings_of(
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
 
 
-def readings_of_sentences(first_s: float, lines: list[str], where: str) -> Readings:
-    """Readings of NMEA sentences in messages, the first of which was stamped ``first_s``."""
-    return nmea_readings(lines, where, datetime.fromtimestamp(first_s, tz=UTC).date())
-
-
 def _pose(pose: Any, covariance: Any) -> Row:
     place = pose.position
     sigma_m, sigma_rad = np.nan, np.nan
     if covariance is not None:
         sigma_m, sigma_rad = _sigma((covariance[0] + covariance[7]) / 2), _sigma(covariance[_YAW])
     return (place.x, place.y, place.z, sigma_m, *_quaternion(pose.orientation), sigma_rad)
-
-
-def _fix(fields: Any) -> Row:
-    sigma_m = np.nan
-    if fields.position_covariance_type:
-        sigma_m = _sigma((fields.position_covariance[0] + fields.position_covariance[4]) / 2)
-    if fields.status.status <= _NO_FIX:
-        sigma_m = np.inf
-    return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
 
 
 def _quaternion(orientation: Any) -> Row:
