@@ -6,6 +6,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.safe.fields import recorded_distance
 from v2hdm.records import BoolArray, CameraInfo, CentrePrior, FloatArray
@@ -61,15 +62,9 @@ def take_roi(content: object, where: str) -> FloatArray:
     roi = take_array(content, (-1, 2), where, DriveError)
     if len(roi) < 3:
         raise DriveError(f"{where}: a polygon needs at least 3 points, got {len(roi)}; add points")
-    edges = np.roll(roi, -1, axis=0) - roi
-    following = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    winding_rad = np.arctan2(turns, np.sum(edges * following, axis=1)).sum()
-    # Straight corners are fine; a star turns one way at every corner but goes around twice.
-    one_way = (turns >= 0).all() or (turns <= 0).all()
-    if not one_way or not turns.any() or not np.isclose(abs(winding_rad), 2 * np.pi):
+    if not (turning := winding(roi)):
         raise DriveError(f"{where}: polygon is not convex; give its corners in order around the region")
-    return roi if winding_rad > 0 else roi[::-1].copy()
+    return roi if turning > 0 else roi[::-1].copy()
 
 
 def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray, where: str) -> None:

@@ -160,9 +160,8 @@ def _table(rows: dict[float, tuple[float, ...]], begin_s: float, where: str) -> 
 def _fields(sentence: str) -> list[str]:
     """The fields of a sentence; ValueError where its checksum is wrong."""
     body, star, check = sentence[1:].strip().partition("*")
-    if star:
-        if f"{reduce(xor, map(ord, body), 0):02X}" != check[:2].upper():
-            raise ValueError(check)
+    if star and f"{reduce(xor, map(ord, body), 0):02X}" != check[:2].upper():
+        raise ValueError(check)
     return body.split(",")
 
 

@@ -151,7 +151,7 @@ up."""
 
 def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
     """Read the CSV file at ``path``, separated by commas, semicolons, tabs or blanks."""
-    names = take_mapping(entry.get("columns") or {}, f"{where}, columns", DriveError)
+    names = take_mapping(entry.get("columns", {}), f"{where}, columns", DriveError)
     check_keys(names, (), NAMES, f"{where}, columns", DriveError)
     texts = {ours: take_text(name, f"{where}, columns, {ours}", DriveError) for ours, name in names.items()}
     columns = _columns(path, texts)

@@ -343,21 +343,14 @@ class _Alterer:
 
 
 def _painted(layout: Layout, done: list[Alteration], rng: np.random.Generator) -> Layout:
-    altered = {id(one.before): one.after for one in done if one.before is not None}
-
-    def now(corners: FloatArray) -> FloatArray | None:
-        return altered.get(id(corners), corners)
-
-    paints = [
-        replace(one, polygon_map=polygon)
-        for one in layout.paints
-        if (polygon := now(one.polygon_map)) is not None
-    ]
-    markings = [
-        replace(one, corners_map=corners)
-        for one in layout.markings
-        if (corners := now(one.corners_map)) is not None
-    ]
+    now = {id(one.before): one.after for one in done if one.before is not None}
+    paints, markings = [], []
+    for paint in layout.paints:
+        if (polygon := now.get(id(paint.polygon_map), paint.polygon_map)) is not None:
+            paints.append(replace(paint, polygon_map=polygon))
+    for marking in layout.markings:
+        if (corners := now.get(id(marking.corners_map), marking.corners_map)) is not None:
+            markings.append(replace(marking, corners_map=corners))
     like = next((paint for paint in layout.paints if paint.kind == DIAMOND), None)
     for one in done:
         if one.before is None and one.after is not None and like is not None:

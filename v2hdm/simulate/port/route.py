@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
+from v2hdm.geometry.rigid import heading_rad, make_transform, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
@@ -161,11 +161,7 @@ def _recorded(
 def _poses(
     points: FloatArray, height: FloatArray, roll: FloatArray, pitch: FloatArray, yaw: FloatArray
 ) -> FloatArray:
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    poses[:, :3, :3] = rotation_from_euler(roll, pitch, yaw)
-    poses[:, :2, 3] = points
-    poses[:, 2, 3] = height
-    return poses
+    return make_transform(rotation_from_euler(roll, pitch, yaw), np.column_stack([points, height]))
 
 
 def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:
