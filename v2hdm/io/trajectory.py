@@ -6,7 +6,7 @@ Trajectories are files in the format of the TUM RGB-D benchmark, ``timestamp tx 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -74,13 +74,11 @@ def check_geodetic(geodetic: FloatArray, where: str) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read the trajectory at ``path``: stamps in s, strictly rising, and poses ``map_from_vehicle`` in m."""
     rows: dict[int, list[float]] = {}
-    for number, line in _content_lines(path):
+    for number, line in _content_lines(path, "holds no pose", _COLUMNS):
         where, parts = f"{path}: line {number}", line.replace(",", " ").split()
         if len(parts) != 8:
             raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
         rows[number] = [_parse_float(part, where) for part in parts]
-    if not rows:
-        raise DriveError(f"{path}: holds no pose; expected lines '{_COLUMNS}'")
     numbers, table = list(rows), np.array(list(rows.values()))
     _check_rising(table[:, 0], numbers, path)
     advice = "normalise it, order qx qy qz qw"
@@ -101,14 +99,12 @@ def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
     """Read ``timestamp filename`` lines: stamps (N,) in s, strictly rising, and the file names."""
     stamps: dict[int, float] = {}
     names: list[str] = []
-    for number, line in _content_lines(path):
+    for number, line in _content_lines(path, "lists no image", "timestamp filename"):
         where, parts = f"{path}: line {number}", line.split(maxsplit=1)
         if len(parts) != 2:
             raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
         stamps[number] = _parse_float(parts[0], where)
         names.append(parts[1])
-    if not names:
-        raise DriveError(f"{path}: lists no image; expected lines 'timestamp filename'")
     stamp_s = np.array(list(stamps.values()))
     _check_rising(stamp_s, list(stamps), path)
     return stamp_s, names
@@ -120,11 +116,13 @@ def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> N
     replace_text(path, "\n".join(["# timestamp filename", *lines]) + "\n")
 
 
-def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
-    for number, raw in enumerate(read_text(path, DriveError).splitlines(), start=1):
-        line = raw.strip()
-        if line and not line.startswith("#"):
-            yield number, line
+def _content_lines(path: Path, problem: str, expected: str) -> list[tuple[int, str]]:
+    """The lines that are neither empty nor comments, with their numbers; none of them is a ``problem``."""
+    lines = ((k, line.strip()) for k, line in enumerate(read_text(path, DriveError).splitlines(), start=1))
+    content = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    if not content:
+        raise DriveError(f"{path}: {problem}; expected lines '{expected}'")
+    return content
 
 
 def _parse_float(text: str, where: str) -> float:

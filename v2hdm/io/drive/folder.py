@@ -14,15 +14,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.mounting import (
-    IPM_NAMES,
-    check_roi_in_view,
-    choose_initial,
-    ipm_from_guess,
-    take_centre_prior,
-    take_ipm,
-    take_roi,
-)  # fmt: skip
+from v2hdm.io.calibration import mounting
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
@@ -115,25 +107,29 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         raise DriveError(f"{where}: give either 'ipm' or 'cam_from_vehicle', one of the two")
     if "ipm" in entry:
         matrices = take_mapping(entry["ipm"], f"{where}, ipm", DriveError)
-        check_keys(matrices, (), IPM_NAMES, f"{where}, ipm", DriveError)
-        ipm = {name: take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
+        check_keys(matrices, (), mounting.IPM_NAMES, f"{where}, ipm", DriveError)
+        ipm = {name: mounting.take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
         if not ipm:
-            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(IPM_NAMES)}")
+            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(mounting.IPM_NAMES)}")
     else:
-        ipm = {"estimated": ipm_from_guess(info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle")}
+        ipm = {
+            "estimated": mounting.ipm_from_guess(
+                info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle"
+            )
+        }
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
-    initial_ipm = choose_initial(entry.get("initial_ipm"), ipm, where)
-    roi_vehicle = take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
-    check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
+    initial_ipm = mounting.choose_initial(entry.get("initial_ipm"), ipm, where)
+    roi_vehicle = mounting.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+    mounting.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     return Camera(
         info=info,
         ipm=ipm,
         initial_ipm=initial_ipm,
         roi_vehicle=roi_vehicle,
-        centre_prior=None if prior is None else take_centre_prior(prior, f"{where}, centre_prior"),
+        centre_prior=None if prior is None else mounting.take_centre_prior(prior, f"{where}, centre_prior"),
         linear_response=linear,
         own_vehicle=_read_mask(entry, root, info, where),
     )

@@ -33,11 +33,8 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
         write_image_list(np.array([image.stamp_s for image in mine]), names, folder / name / "images.txt")
         entries[name] = _describe_camera(name, camera)
     write_tum(trajectory, folder / POSES_FILE)
-    content: dict[str, Any] = {
-        "name": drive.name,
-        "poses": POSES_FILE,
-        "pose_noise": asdict(drive.pose_noise),
-    }
+    noise = asdict(drive.pose_noise)
+    content: dict[str, Any] = {"name": drive.name, "poses": POSES_FILE, "pose_noise": noise}
     if drive.origin is not None:
         content["origin"] = asdict(drive.origin)
     if drive.truth_dir is not None:
@@ -73,11 +70,8 @@ def write_truth(folder: Path, truth: Truth, images: Sequence[Image]) -> None:
         for i, j in np.argwhere(truth.visibility > 0)
     )
     replace_text(folder / "sightings.csv", "\n".join([",".join(SIGHTINGS), *sightings]) + "\n")
-    visible = (
-        f"{lane},{vertex}"
-        for lane, flags in enumerate(truth.lane_visible)
-        for vertex in np.flatnonzero(flags)
-    )
+    lanes = enumerate(map(np.flatnonzero, truth.lane_visible))
+    visible = (f"{lane},{vertex}" for lane, vertices in lanes for vertex in vertices)
     replace_text(folder / "lane_visible.csv", "\n".join([",".join(LANE_VISIBLE), *visible]) + "\n")
     disturbances = {key: float(value) for key, value in truth.disturbances.items()}
     replace_text(folder / "disturbances.yaml", dump_yaml(disturbances))

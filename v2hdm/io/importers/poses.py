@@ -36,27 +36,16 @@ TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """The keys of ``poses`` in ``drive.yaml`` that every format has.
+    """The keys of ``poses`` in ``drive.yaml`` that every format has; None is not stated."""
 
-    Attributes:
-        crs: system of the coordinates, such as EPSG:25832; None for the map's own, or WGS84.
-        heading: north that headings count from, ``true`` or ``grid``; None where it is not stated.
-        lever_arm_m: (3,) the point that positions are of, in the vehicle frame; None where it is not stated.
-        vehicle_from_sensor: (3, 3) turn of the attitude's sensor on the vehicle.
-        max_sigma_m: positions stated to be less sure are left out: RTK fixed is 0.02, float about 0.5.
-        geoid_m: height of the geoid above the ellipsoid, for heights above the sea; None if not stated.
-        epoch: of the coordinates, in years; None if not stated.
-        offset_s: added to the recorded times.
-    """
-
-    vehicle_from_sensor: FloatArray
-    crs: str | None = None
-    heading: str | None = None
-    lever_arm_m: FloatArray | None = None
-    max_sigma_m: float = 0.1
-    geoid_m: float | None = None
-    epoch: float | None = None
-    offset_s: float = 0.0
+    vehicle_from_sensor: FloatArray  # (3, 3), turn of the attitude's sensor on the vehicle
+    crs: str | None = None  # of the coordinates, such as EPSG:25832; None for the map's own, or WGS84
+    heading: str | None = None  # north that headings count from, one of HEADINGS
+    lever_arm_m: FloatArray | None = None  # (3,), the point that positions are of, in the vehicle frame
+    max_sigma_m: float = 0.1  # less sure positions are left out: RTK fixed is 0.02, float about 0.5
+    geoid_m: float | None = None  # height of the geoid above the ellipsoid, for heights above the sea
+    epoch: float | None = None  # of the coordinates, in years
+    offset_s: float = 0.0  # added to the recorded times
 
 
 @dataclass(frozen=True)
@@ -119,12 +108,10 @@ def read_poses(
 
 def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
     given: dict[str, Any] = {}
-    for key in ("max_sigma_m", "geoid_m", "epoch", "offset_s"):
-        if key in entry:
-            given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
-    for key in ("lever_arm_m", "mounting_rpy_deg"):
-        if key in entry:
-            given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
+    for key in filter(entry.__contains__, ("max_sigma_m", "geoid_m", "epoch", "offset_s")):
+        given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
+    for key in filter(entry.__contains__, ("lever_arm_m", "mounting_rpy_deg")):
+        given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
     if entry.get("heading") is not None:
         given["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
     if given.get("max_sigma_m", 1.0) <= 0:
@@ -179,14 +166,19 @@ def assemble(
         rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
         rotation = earth.enu_axes(earth.position_of(origin))[0].T @ earth.enu_axes(geodetic) @ rotation
         points = earth.enu_from_geodetic(origin, geodetic)
-    elif settings.heading is not None or settings.geoid_m is not None:
-        key = "heading" if settings.heading is not None else "geoid_m"
-        raise DriveError(
-            f"{where}, {key}: only for coordinates with a place on the earth; add crs or drop it"
-        )
+    else:
+        for key in ("heading", "geoid_m"):
+            if getattr(settings, key) is not None:
+                only = "only for coordinates with a place on the earth; add crs or drop it"
+                raise DriveError(f"{where}, {key}: {only}")
     if settings.lever_arm_m is not None:
         points = points - rotation @ settings.lever_arm_m
-    noise = _noise({"position_m": sigma_m, "heading_rad": heading_sigma_rad})
+    # Root mean squares of the sigmas that are stated.
+    noise = {
+        key: float(np.sqrt(np.mean(np.square(stated))))
+        for key, values in (("position_m", sigma_m), ("heading_rad", heading_sigma_rad))
+        if len(stated := values[np.isfinite(values) & (values > 0)])
+    }
     return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, origin)
 
 
@@ -271,12 +263,3 @@ def _origin(
             f"give the origin in {datum} (datum: {datum})"
         )
     return given if given.epoch is not None else replace(given, epoch=settings.epoch)
-
-
-def _noise(sigmas: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Root mean squares of the sigmas that are stated."""
-    return {
-        key: float(np.sqrt(np.mean(np.square(stated))))
-        for key, values in sigmas.items()
-        if len(stated := values[np.isfinite(values) & (values > 0)])
-    }

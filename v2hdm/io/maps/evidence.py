@@ -30,30 +30,18 @@ projected minus observed, ``distance_sigma`` the same in standard deviations."""
 
 @dataclass(frozen=True)
 class Residuals:
-    """K corner observations that an optimisation accepted.
+    """K corner observations in I images that an optimisation accepted."""
 
-    Attributes:
-        image: paths of the images, below the drive's folder; ``row_image`` (K,) are indices into them.
-        camera: name of the camera of each image.
-        taken_s: (I,) times of the images, on the clock of the poses.
-        marking: (K,) the id of the marking, 0 where its candidate was left out of the map.
-        corner: (K,) 0 to 3, in the order of its corners.
-        is_point: (K,) whether the observation says where the corner is, not only on which line.
-        observed_px: (K, 2) pinhole pixels.
-        residual_px: (K, 2) projected minus observed.
-        distance_sigma: (K,) its length in standard deviations.
-    """
-
-    image: tuple[str, ...]
-    camera: tuple[str, ...]
-    taken_s: FloatArray
-    row_image: IntArray
-    marking: IntArray
-    corner: IntArray
-    is_point: BoolArray
-    observed_px: FloatArray
-    residual_px: FloatArray
-    distance_sigma: FloatArray
+    image: tuple[str, ...]  # I paths below the drive's folder
+    camera: tuple[str, ...]  # the name of each image's camera
+    taken_s: FloatArray  # (I,) times of the images, on the clock of the poses
+    row_image: IntArray  # (K,) indices into the images
+    marking: IntArray  # (K,) the id of the marking, 0 where its candidate was left out of the map
+    corner: IntArray  # (K,) 0 to 3, in the order of its corners
+    is_point: BoolArray  # (K,) whether the observation says where the corner is, not only on which line
+    observed_px: FloatArray  # (K, 2) pinhole pixels
+    residual_px: FloatArray  # (K, 2) projected minus observed
+    distance_sigma: FloatArray  # (K,) its length in standard deviations
 
     def __len__(self) -> int:
         return len(self.row_image)

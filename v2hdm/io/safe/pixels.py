@@ -15,7 +15,7 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -146,7 +146,8 @@ def _checked(data: _Data, path: Path) -> Header:
         header = _header(data)
     except (struct.error, LookupError, ValueError):
         header = None
-    if header is None or not _is_whole(data):
+    end = {_JPEG: b"\xff\xd9", _PNG[:2]: b"IEND"}.get(begin[:2], b"")
+    if header is None or end not in data[-_TAIL_BYTES:]:
         raise DriveError(f"{path}: image is truncated or damaged; restore it or drop it from the list")
     size = f"{path}: image is {header.width} x {header.height} px"
     if min(header.width, header.height) < LEAST_SIDE_PX:
@@ -154,12 +155,6 @@ def _checked(data: _Data, path: Path) -> Header:
     if header.width * header.height > MOST_PX:
         raise DriveError(f"{size}, more than {MOST_PX // 10**6} million in all; scale it down or drop it")
     return header
-
-
-def _is_whole(data: _Data) -> bool:
-    """Whether a file has its end."""
-    end = {_JPEG: b"\xff\xd9", _PNG[:2]: b"IEND"}.get(data[:2], b"")
-    return end in data[-_TAIL_BYTES:]
 
 
 def _header(data: _Data) -> Header | None:
@@ -247,11 +242,10 @@ def _webp_header(data: bytes) -> Header:
 
 def _orientation(exif: bytes) -> int:
     """The orientation in an EXIF block, upright where that is damaged."""
-    try:
-        tag = _tiff_tags(exif).get(_ORIENTATION_TAG, _UPRIGHT) if exif.startswith(_TIFF) else _UPRIGHT
-    except struct.error:
-        return _UPRIGHT
-    return tag if 1 <= tag <= 8 else _UPRIGHT
+    with suppress(struct.error):
+        tag = _tiff_tags(exif).get(_ORIENTATION_TAG, 0) if exif.startswith(_TIFF) else 0
+        return tag if 1 <= tag <= 8 else _UPRIGHT
+    return _UPRIGHT
 
 
 def _tiff_tags(data: _Data) -> dict[int, int]:

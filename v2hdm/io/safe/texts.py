@@ -103,7 +103,9 @@ def read_json(path: Path, error: type[V2hdmError]) -> Any:
 
 def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
     """The content of a JSON text from ``where``."""
-    if json_depth(text) > MOST_DEPTH:
+    letters = np.frombuffer(_QUOTED.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
+    steps = np.isin(letters, _OPENING).astype(np.int32) - np.isin(letters, _CLOSING)
+    if np.cumsum(steps).max(initial=0) > MOST_DEPTH:
         raise error(f"{where}: JSON nested deeper than {MOST_DEPTH} levels; mend it")
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -126,13 +128,6 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
         raise error(
             f"{where}: line {failure.lineno} JSON syntax error: {failure.msg}; mend that line"
         ) from None
-
-
-def json_depth(text: str) -> int:
-    """The depth of nested lists and objects in a JSON text."""
-    letters = np.frombuffer(_QUOTED.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
-    steps = np.isin(letters, _OPENING).astype(np.int32) - np.isin(letters, _CLOSING)
-    return int(np.cumsum(steps).max(initial=0))
 
 
 def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
