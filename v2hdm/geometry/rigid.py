@@ -31,11 +31,7 @@ ad^n / (n + 1)!, see :func:`left_jacobian`."""
 
 def inverse(dst_from_src: FloatArray) -> FloatArray:
     """The inverse (..., 4, 4) of rigid transforms, by transposing their rotation."""
-    src_from_dst = np.zeros_like(dst_from_src)
-    src_from_dst[..., :3, :3] = np.swapaxes(dst_from_src[..., :3, :3], -1, -2)
-    src_from_dst[..., :3, 3] = camera_centre(dst_from_src)
-    src_from_dst[..., 3, 3] = 1.0
-    return src_from_dst
+    return make_transform(np.swapaxes(dst_from_src[..., :3, :3], -1, -2), camera_centre(dst_from_src))
 
 
 def camera_centre(cam_from_frame: FloatArray) -> FloatArray:
@@ -175,17 +171,13 @@ def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatA
     cosine = np.sum(first * second, axis=1, keepdims=True)
     second = np.where(cosine < 0, -second, second)
     # atan2 of chord and sum keeps full precision for angles near zero, where arccos does not.
-    angle = 2 * np.arctan2(
-        np.linalg.norm(second - first, axis=1, keepdims=True),
-        np.linalg.norm(second + first, axis=1, keepdims=True),
-    )
+    chord, total = (np.linalg.norm(way, axis=1, keepdims=True) for way in (second - first, second + first))
+    angle = 2 * np.arctan2(chord, total)
     t = fraction[:, None]
     # sin(t a) / sin(a) as a ratio of sincs, which is t at a = 0.
     sinc = np.sinc(angle / np.pi)
-    mixed = (
-        first * (1 - t) * np.sinc((1 - t) * angle / np.pi) / sinc
-        + second * t * np.sinc(t * angle / np.pi) / sinc
-    )
+    mixed = first * (1 - t) * np.sinc((1 - t) * angle / np.pi) / sinc
+    mixed += second * t * np.sinc(t * angle / np.pi) / sinc
     return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
 
 

@@ -157,11 +157,11 @@ def _frames(asked: _Asked, detector: Detector, lens: CameraInfo | None) -> _Fram
             for image in paths:
                 note_input(image)
             return ((frame, road) for frame in image_frames(paths))
-        if any(reader.accepts(path) for reader in READERS.values()):
+        if any(accepts(path) for accepts, _ in READERS.values()):
             return _drive_frames(path, detector, road, lens)
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
     note_input(path)
-    if READERS["bag"].accepts(path):
+    if READERS["bag"][0](path):
         return _drive_frames(path, detector, road, lens)
     frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
     return ((frame, road) for frame in frames)

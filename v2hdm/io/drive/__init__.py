@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
@@ -18,17 +17,9 @@ from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.records import Drive, Trajectory
 
 __all__ = [
-    "READERS", "KittiOptions", "ReadOptions", "Reader", "Trajectory", "drive_name", "join_drives",
+    "READERS", "KittiOptions", "ReadOptions", "Trajectory", "drive_name", "join_drives",
     "read_drive", "with_clock_offsets",
 ]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Reader:
-    """One format: ``accepts`` a path by a look at it, ``read`` makes a drive of it."""
-
-    accepts: Callable[[Path], bool]
-    read: Callable[[Path, ReadOptions], Drive]
 
 
 def _read_bag(path: Path, options: ReadOptions) -> Drive:
@@ -36,12 +27,13 @@ def _read_bag(path: Path, options: ReadOptions) -> Drive:
     return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
 
 
-READERS: Mapping[str, Reader] = {
-    "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
-    "kitti": Reader(accepts=is_kitti_drive, read=read_kitti_drive),
-    "nuscenes": Reader(accepts=is_nuscenes_drive, read=read_nuscenes_drive),
-    "bag": Reader(accepts=is_bag, read=_read_bag),
+READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions], Drive]]] = {
+    "folder": (is_folder_drive, read_folder_drive),
+    "kitti": (is_kitti_drive, read_kitti_drive),
+    "nuscenes": (is_nuscenes_drive, read_nuscenes_drive),
+    "bag": (is_bag, _read_bag),
 }
+"""Formats by name: whether a path looks like one, and what makes a drive of it."""
 
 
 def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
@@ -59,9 +51,9 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
     if options.format not in ("auto", *READERS):
         raise DriveError(f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}")
-    for name, reader in READERS.items():
-        if options.format == name or (options.format == "auto" and reader.accepts(path)):
-            return part_of(reader.read(path, options), options)
+    for name, (accepts, read) in READERS.items():
+        if options.format == name or (options.format == "auto" and accepts(path)):
+            return part_of(read(path, options), options)
     raise DriveError(
         f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
     )

@@ -154,19 +154,15 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
         raise DriveError(f"drive.limit is {options.limit}: give 1 or more images of each camera")
     first_s = min(image.stamp_s for image in drive.images)
     end_s = float("inf") if options.end_s is None else options.end_s
-    counts: Counter[str] = Counter()
-    images = []
-    for image in drive.images:
-        if not options.start_s <= image.stamp_s - first_s <= end_s:
-            continue
-        counts[image.camera] += 1
-        if options.limit is None or counts[image.camera] <= options.limit:
-            images.append(image)
+    images: list[Image] = []
     for name in drive.cameras:
-        if not counts[name]:
+        own = [image for image in drive.images if image.camera == name]
+        own = [image for image in own if options.start_s <= image.stamp_s - first_s <= end_s]
+        images += own[: options.limit]
+        if not own:
             lasts_s = max(image.stamp_s for image in drive.images) - first_s
             raise DriveError(
                 f"{drive.root}: no image of camera '{name}' is left from {options.start_s:g} to {end_s:g} s; "
                 f"the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
             )
-    return replace(drive, images=tuple(images))
+    return replace(drive, images=tuple(sorted(images, key=in_order)))

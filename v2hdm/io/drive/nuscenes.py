@@ -21,7 +21,6 @@ from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, PoseNoise, Traj
 from v2hdm.store.files import take_array, take_number, take_text
 
 _TABLES = ("sensor", "calibrated_sensor", "ego_pose", "sample_data")
-_MICROSECONDS = 1e6
 
 Row = dict[str, Any]
 
@@ -53,10 +52,16 @@ def read_nuscenes_drive(path: Path, options: ReadOptions) -> Drive:
         stamp_s = np.array([_stamp(row, str(folder)) for row in rows])
         if (np.diff(stamp_s) <= 0).any():
             raise DriveError(f"{folder}: two images of {name} at one time; give one recording, not several")
-        files.append(ImageFiles(name, stamp_s, [path / _file(row, folder) for row in rows]))
+        at = f"{folder}: sample_data of {name}, filename"
+        names = [take_text(row.get("filename"), at, DriveError) for row in rows]
+        files.append(ImageFiles(name, stamp_s, [path / file for file in names]))
     where = f"{folder}: ego_pose"
-    name, noise, recorded = path.resolve().name, PoseNoise.as_far_as_stated(), _trajectory(egos, where)
-    drive = Drive(name, path, cameras, (), noise, recorded=recorded)
+    rows = sorted(egos.values(), key=lambda row: _stamp(row, where))
+    stamp_s = np.array([_stamp(row, where) for row in rows])
+    order = in_order(stamp_s, where, "row")
+    recorded = Trajectory(stamp_s[order], np.array([_pose(rows[n], where) for n in order.tolist()]))
+    noise = PoseNoise.as_far_as_stated()
+    drive = Drive(path.resolve().name, path, cameras, (), noise, recorded=recorded)
     return assemble_drive(drive, files, options.max_gap_s, where)
 
 
@@ -84,11 +89,7 @@ def _of(table: dict[str, Row], row: Row, key: str, folder: Path) -> Row:
 
 
 def _stamp(row: Row, where: str) -> float:
-    return take_number(row.get("timestamp"), f"{where}: timestamp", DriveError) / _MICROSECONDS
-
-
-def _file(row: Row, folder: Path) -> str:
-    return take_text(row.get("filename"), f"{folder}: sample_data {row['token']}, filename", DriveError)
+    return take_number(row.get("timestamp"), f"{where}: timestamp", DriveError) / 1e6
 
 
 def _camera(name: str, rows: list[Row], calibrated: dict[str, Row], folder: Path) -> Camera:
@@ -106,13 +107,6 @@ def _camera(name: str, rows: list[Row], calibrated: dict[str, Row], folder: Path
     vehicle_from_cam = _pose(row, where)
     ipm = {"estimated": ipm_from_guess(info, inverse(vehicle_from_cam), where)}
     return Camera(info, ipm, "estimated", roi_ahead(vehicle_from_cam))
-
-
-def _trajectory(egos: dict[str, Row], where: str) -> Trajectory:
-    rows = sorted(egos.values(), key=lambda row: _stamp(row, where))
-    stamp_s = np.array([_stamp(row, where) for row in rows])
-    order = in_order(stamp_s, where, "row")
-    return Trajectory(stamp_s[order], np.array([_pose(rows[n], where) for n in order.tolist()]))
 
 
 def _pose(row: Row, where: str) -> FloatArray:

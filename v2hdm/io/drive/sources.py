@@ -110,11 +110,11 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
                 raise DriveError(
                     f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle"
                 )
-        ends = [take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")]
+        dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
         transforms = streams.TfStream(True, where)
         tf_folder = sources.want(transforms)
         return lambda: readings_of_poses(
-            transforms.frames(tf_folder()).moving(*ends, sources.max_gap_s, where)
+            transforms.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where)
         )
     for key in ("frame", "vehicle"):
         if key in content:

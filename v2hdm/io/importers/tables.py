@@ -164,7 +164,7 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
         raise DriveError(
             f"{path}: needs positions, as columns {', '.join(_MAP)} or {', '.join(_GEODETIC)}, one of the two"
         )
-    _need(columns, coordinates[:2], path)
+    _check_there(columns, coordinates[:2], path)
     count = len(rows)
     points = np.column_stack([columns.get(name, np.zeros(count)) for name in coordinates])
     sigma_m = columns.get("sigma_m", np.full(count, np.nan))
@@ -242,18 +242,22 @@ def _parse(name: str, cell: str, where: str) -> float:
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     named = [name for name in (*_STAMPS, "utc") if name in columns]
     if len(named) != 1:
-        has = ", ".join(named) or "none"
-        raise DriveError(
-            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; see columns"
-        )
+        wanted, has = ", ".join(_STAMPS), ", ".join(named) or "none"
+        raise DriveError(f"{path}: needs one column of times, {wanted} or utc, has {has}; see columns")
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
+
+
+def _check_there(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
+    for name in names:
+        if name not in columns:
+            raise DriveError(f"{path}: has no column '{name}'; say under columns what the file calls it")
 
 
 def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
     angles = [name for name in _ANGLES if name in columns]
     yaws = [name for name in angles if name.startswith(("heading", "yaw"))]
     if "qw" in columns:
-        _need(columns, _QUATERNION, path)
+        _check_there(columns, _QUATERNION, path)
         if angles:
             raise DriveError(f"{path}: has a quaternion and {angles[0]}: say one of them under columns")
         quaternion = np.column_stack([columns[name] for name in _QUATERNION])
@@ -274,9 +278,3 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
     yaw = np.pi / 2 - radians("heading") if "heading_deg" in columns else radians("yaw")
     pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")
     return rotation_from_euler(radians("roll"), pitch, yaw)
-
-
-def _need(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise DriveError(f"{path}: has no column '{missing[0]}'; say under columns what the file calls it")

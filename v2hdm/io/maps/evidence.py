@@ -92,10 +92,10 @@ def read_residuals(path: Path) -> Residuals:
         row_image.append(number)
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
     cameras = tuple(camera for _, camera, _ in images.values())
-    taken_s = np.array([taken_s for _, _, taken_s in images.values()])
-    marking, corner = table[:, :2].astype(np.int64).T
-    known = (np.array(row_image, dtype=np.int64), marking, corner - 1, table[:, 2] > 0)
-    return Residuals(tuple(images), cameras, taken_s, *known, table[:, 3:5], table[:, 5:7], table[:, 7])
+    stamps = np.array([stamp for _, _, stamp in images.values()])
+    ids, corners = table[:, :2].astype(np.int64).T
+    known = (np.array(row_image, dtype=np.int64), ids, corners - 1, table[:, 2] > 0)
+    return Residuals(tuple(images), cameras, stamps, *known, table[:, 3:5], table[:, 5:7], table[:, 7])
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class Feature:
 
 def features_of(hd_map: HdMap) -> list[Feature]:
     """Markings, lanes, then symbols, each with its own id: that which it has, else the next free one."""
-    everything = (*hd_map.markings, *hd_map.lanes, *hd_map.symbols)
+    everything: list[Any] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
     ids = unique_ids([one.id or 0 for one in everything], hd_map.largest_id)
     features = []
     for one, number in zip(everything, ids, strict=True):

@@ -133,7 +133,7 @@ class PoseStream(Stream):
     """Positions of a topic, and headings of another one if need be, as rows of numbers."""
 
     def __init__(self, topic: str, heading_topic: str | None, stamps: str, where: str) -> None:
-        needs = [(topic, kinds.POSE_KINDS, where)]
+        needs: list[tuple[str, Collection[str], str]] = [(topic, kinds.POSE_KINDS, where)]
         if heading_topic is not None:
             needs.append((heading_topic, kinds.HEADING_KINDS, f"{where}, heading_topic"))
         super().__init__(topic, ["poses", heading_topic, stamps], where, *needs)
