@@ -87,7 +87,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
 
 def is_calibration(path: Path) -> bool:
     """Whether the file is a calibration of ours, which says where the camera sits, too."""
-    return _is_own(_read_document(path))
+    return INTRINSICS["V2HDM calibration"].accepts(_read_document(path))
 
 
 def _read_document(path: Path) -> Document:
@@ -104,7 +104,7 @@ def _read_document(path: Path) -> Document:
         # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag adds nothing to the keys.
         plain = start.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
         content = parse_yaml(_END_OF_MESSAGE.sub("\n", plain), str(path), DriveError)
-    return Document(path, text, content if isinstance(content, dict) else {})
+    return Document(path, text, _mapping(content))
 
 
 def _of_xml(path: Path, text: str) -> dict[str, Any]:
@@ -116,15 +116,13 @@ def _of_xml(path: Path, text: str) -> dict[str, Any]:
         raise DriveError(f"{path}: line {failure.position[0]}: XML syntax error; restore the file") from None
     if root.tag != "opencv_storage":
         raise DriveError(f"{path}: expected OpenCV's <opencv_storage>, got <{root.tag}>; name another file")
-    return {node.tag: _xml_value(node) for node in root}
-
-
-def _xml_value(node: ET.Element) -> object:
-    if node.get("type_id") == "opencv-matrix":
-        entry: dict[str, object] = {child.tag: _scalar(child.text) for child in node}
-        entry["data"] = [_scalar(word) for word in (node.findtext("data") or "").split()]
-        return entry
-    return _scalar(node.text)
+    entries: dict[str, Any] = {}
+    for node in root:
+        entries[node.tag] = _scalar(node.text)
+        if node.get("type_id") == "opencv-matrix":
+            entries[node.tag] = {child.tag: _scalar(child.text) for child in node}
+            entries[node.tag]["data"] = [_scalar(word) for word in (node.findtext("data") or "").split()]
+    return entries
 
 
 def _scalar(text: str | None) -> object:
@@ -164,6 +162,10 @@ def _complete(model: str, coefficients: Sequence[float]) -> _Lens:
     """A lens whose further coefficients are zero."""
     missing = DISTORTION_COEFFICIENTS[model] - len(coefficients)
     return model, (*map(float, coefficients), *(0.0,) * missing)
+
+
+def _mapping(content: object) -> dict[str, Any]:
+    return content if isinstance(content, dict) else {}
 
 
 def _beyond(where: str, lens: str, instead: str) -> DriveError:
@@ -207,11 +209,6 @@ COLMAP_MODELS: Mapping[str, tuple[int, int, str]] = {
 def _colmap_lines(document: Document) -> list[tuple[int, str]]:
     lines = ((number, line.strip()) for number, line in enumerate(document.text.splitlines(), 1))
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
-
-
-def _is_colmap(document: Document) -> bool:
-    lines = _colmap_lines(document)
-    return bool(lines) and bool(_COLMAP_LINE.match(lines[0][1]))
 
 
 def _read_colmap(document: Document, name: str) -> CameraInfo:
@@ -269,11 +266,6 @@ def _read_kalibr(document: Document, name: str) -> CameraInfo:
     return _camera(name, size, [f"{where}, resolution"] * 2, _matrix(*numbers.tolist()), lens, where)
 
 
-def _is_opencv(document: Document) -> bool:
-    entry = document.lower.get("camera_matrix")
-    return isinstance(entry, dict) and "dt" in entry
-
-
 def _read_opencv(document: Document, name: str) -> CameraInfo:
     where, entries, sides = str(document.path), document.lower, ("image_width", "image_height")
     if "xi" in entries:
@@ -291,10 +283,6 @@ def _read_opencv(document: Document, name: str) -> CameraInfo:
     return _camera(name, size, [f"{where}: {key}" for key in sides], intrinsic, lens, where)
 
 
-def _is_own(document: Document) -> bool:
-    return isinstance(document.entries.get("camera_matrix"), list)
-
-
 def _read_own(document: Document, name: str) -> CameraInfo:
     try:
         info = read_calibration(document.path).info
@@ -310,16 +298,13 @@ def _read_own(document: Document, name: str) -> CameraInfo:
 
 def _message_names(document: Document) -> list[str]:
     """Its only camera, by the frame of its header."""
-    header = document.entries.get("header")
-    frame = header.get("frame_id") if isinstance(header, dict) else None
-    return [str(frame or document.path.stem)]
+    return [str(_mapping(document.entries.get("header")).get("frame_id") or document.path.stem)]
 
 
 def _read_message(document: Document, name: str) -> CameraInfo:
     where, entries = str(document.path), document.lower
     _need(entries, ("k", "d"), where, "write the message to the file again")
-    region = entries.get("roi")
-    region = region if isinstance(region, dict) else {}
+    region = _mapping(entries.get("roi"))
     fields = SimpleNamespace(
         k=take_array(entries["k"], (9,), f"{where}: k", DriveError),
         d=take_array(entries["d"], (-1,), f"{where}: d", DriveError) if entries["d"] else np.empty(0),
@@ -335,11 +320,15 @@ def _read_message(document: Document, name: str) -> CameraInfo:
 
 INTRINSICS: Mapping[str, IntrinsicsFormat] = {
     "COLMAP cameras.txt": IntrinsicsFormat(
-        _is_colmap, _read_colmap, lambda one: [line.split()[0] for _, line in _colmap_lines(one)]
+        lambda one: any(_COLMAP_LINE.match(line) for _, line in _colmap_lines(one)[:1]),
+        _read_colmap,
+        lambda one: [line.split()[0] for _, line in _colmap_lines(one)],
     ),
     "Kalibr camchain": IntrinsicsFormat(lambda one: bool(_kalibr_names(one)), _read_kalibr, _kalibr_names),
-    "V2HDM calibration": IntrinsicsFormat(_is_own, _read_own),
-    "OpenCV": IntrinsicsFormat(_is_opencv, _read_opencv),
+    "V2HDM calibration": IntrinsicsFormat(
+        lambda one: isinstance(one.entries.get("camera_matrix"), list), _read_own
+    ),
+    "OpenCV": IntrinsicsFormat(lambda one: "dt" in _mapping(one.lower.get("camera_matrix")), _read_opencv),
     "ROS CameraInfo message": IntrinsicsFormat(
         lambda one: {"height", "width", "distortion_model"} <= set(one.entries), _read_message, _message_names
     ),

@@ -85,7 +85,11 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
-    truth_dir = _find_truth(content.get("truth"), path, f"{where}: truth")
+    truth_dir = None
+    if content.get("truth") is not None:
+        truth_dir = path / take_text(content["truth"], f"{where}: truth", DriveError)
+        if not truth_dir.is_dir():
+            raise DriveError(f"{where}: truth: no such folder {truth_dir}; restore it or drop the key")
     name = _name(content, path)
     drive = Drive(
         name, path, cameras, (), pose_noise, recorded.origin, truth_dir, recorded=recorded.trajectory
@@ -167,12 +171,3 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise
-
-
-def _find_truth(content: object, root: Path, where: str) -> Path | None:
-    if content is None:
-        return None
-    truth_dir = root / take_text(content, where, DriveError)
-    if not truth_dir.is_dir():
-        raise DriveError(f"{where}: no such folder {truth_dir}; restore it or drop the key")
-    return truth_dir

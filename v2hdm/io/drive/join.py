@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, count
 
 import numpy as np
 
@@ -63,7 +64,10 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
     if len(drives) == 1:
         return drives[0]
     _check(drives)
-    names = _distinct([drive.name for drive in drives])
+    names: list[str] = []
+    for drive in drives:
+        again = (f"{drive.name}-{number}" for number in count(2))
+        names.append(next(name for name in chain([drive.name], again) if name not in names))
     cameras: dict[str, Camera] = {}
     images, visits, roads = [], [], []
     for number, (drive, name) in enumerate(zip(drives, names, strict=True)):
@@ -128,17 +132,6 @@ def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera],
         camera, visit, why, camera, visit,
     )  # fmt: skip
     return f"{camera}@{visit}"
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, with a number behind those that were there before."""
-    out: list[str] = []
-    for name in names:
-        number, one = 2, name
-        while one in out:
-            number, one = number + 1, f"{name}-{number}"
-        out.append(one)
-    return out
 
 
 def _check(drives: Sequence[Drive]) -> None:

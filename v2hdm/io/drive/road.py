@@ -83,7 +83,12 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
         return Laid(recorded, None, np.zeros(2))
     height_sigma_m = _HEIGHT_SIGMAS * position_sigma_m
     if not measured.all():
-        ground = stations.at_poses(_slope_of_heights(stations, height_m, height_sigma_m))
+        # By its heights alone, which hardly say anything of the slope across a straight road.
+        pieces = np.sqrt(2.0 * np.pi) * _HEIGHTS_M / _HEIGHT_M
+        trust_m2 = np.full(len(height_m), (height_sigma_m / _CROSS_FALL) ** 2 / pieces)
+        level = np.zeros((len(height_m), 2, 1))
+        by_heights = local_planes(stations, height_m[:, None], level, _HEIGHTS_M, trust_m2)[1][..., 0]
+        ground = stations.at_poses(by_heights)
         lean[:, ~measured] = _turned(ground, -yaw)[:, ~measured]
     leans = stations.mean(_with_mount(lean, yaw, measured))
     ground_m, ground_slope, mount = _fit(stations, height_m, leans, height_sigma_m)
@@ -147,14 +152,6 @@ def _mount(leans: FloatArray) -> FloatArray:
     recorded, by_mount = leans[..., 0], leans[..., 1:]
     normal = weight * np.einsum("nim,nik->mk", by_mount, by_mount) + np.diag(1.0 / np.square(_MOUNT_RAD))
     return np.asarray(np.linalg.solve(normal, -weight * np.einsum("nim,ni->m", by_mount, recorded)))
-
-
-def _slope_of_heights(stations: Stations, height_m: FloatArray, height_sigma_m: float) -> FloatArray:
-    """Slope (N, 2) of the ground by its heights alone, which hardly say anything across a straight road."""
-    pieces = np.sqrt(2.0 * np.pi) * _HEIGHTS_M / _HEIGHT_M
-    trust_m2 = np.full(len(height_m), (height_sigma_m / _CROSS_FALL) ** 2 / pieces)
-    level = np.zeros((len(height_m), 2, 1))
-    return local_planes(stations, height_m[:, None], level, _HEIGHTS_M, trust_m2)[1][..., 0]
 
 
 def _with_mount(lean: FloatArray, yaw: FloatArray, measured: BoolArray) -> FloatArray:

@@ -53,19 +53,15 @@ def write_dxf(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
             document.layers.add(layer, color=1 + len(document.layers) % _COLOURS)
         points = feature.xyz_map[feature.ring].tolist()
         line = space.add_polyline3d(points, close=feature.closed, dxfattribs={"layer": layer})
-        line.set_xdata(APPLICATION, _extended(feature))
+        data: list[tuple[int, Any]] = [(_TEXT, "id"), (_WHOLE, feature.id)]
+        data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
+        if feature.relative_sigma_m is not None:
+            data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
+        if (covariance := feature.ring_covariance_m2) is not None:
+            data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
+        line.set_xdata(APPLICATION, data)
     with whole_file(path) as partial:
         document.saveas(partial)
-
-
-def _extended(feature: Feature) -> list[tuple[int, Any]]:
-    data: list[tuple[int, Any]] = [(_TEXT, "id"), (_WHOLE, feature.id)]
-    data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
-    if feature.relative_sigma_m is not None:
-        data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
-    if (covariance := feature.ring_covariance_m2) is not None:
-        data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
-    return data
 
 
 COLUMNS: tuple[str, ...] = (
@@ -84,10 +80,8 @@ def write_csv(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
     A CSV has no place for the ``verdict``.
     """
     text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
-    for feature in features_of(hd_map):
-        table.writerows(_rows(feature, hd_map.origin))
+    rows = (row for feature in features_of(hd_map) for row in _rows(feature, hd_map.origin))
+    csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
     replace_text(path, text.getvalue())
 
 

@@ -36,17 +36,8 @@ from v2hdm.store.files import whole_file
 from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
 
-_SAMPLES = 5
 _FARTHEST_M = 40.0
 _NEAR_M = 0.3
-
-
-def quad_samples(corners: FloatArray) -> FloatArray:
-    """A grid of points (J, 25, 2), each standing for an equal share of quadrilaterals (J, 4, 2)."""
-    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    s, t = (g.ravel()[None, :, None] for g in np.meshgrid(steps, steps))
-    a, b, c, d = (corners[:, k, None, :] for k in range(4))
-    return np.asarray((1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d)
 
 
 def points_seen(
@@ -219,7 +210,11 @@ def _truth(port: Port, images: list[Image]) -> Truth:
     A lane vertex counts as seen when two images show it within their camera's region of interest.
     """
     corners = np.array([m.corners_map for m in port.hd_map.markings]).reshape(-1, 4, 2)
-    samples = quad_samples(corners)
+    # A grid of points (J, 25, 2), each standing for an equal share of its quadrilateral.
+    steps = (np.arange(5) + 0.5) / 5
+    s, t = (axis.ravel()[None, :, None] for axis in np.meshgrid(steps, steps))
+    a, b, c, d = (corners[:, k, None, :] for k in range(4))
+    samples = (1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d
     per_marking = samples.shape[1]
     vertices = [lane.points_map for lane in port.hd_map.lanes]
     points = np.vstack([samples.reshape(-1, 2), *vertices])

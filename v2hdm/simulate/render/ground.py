@@ -260,7 +260,9 @@ def _opacity(
     shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
     flaking = _faded(_WEAR_TILE, x, y, footprint, shift)
     flaking += np.float32(0.7) * _faded(MEDIUM_TILE, x, y, footprint, shift)
-    threshold = np.float32(_normal_quantile(paint.wear) * 1.22)
+    # The standard normal quantile by Tukey's lambda approximation (0.14), good to 0.01 within +-2.5.
+    p = min(max(paint.wear, 1e-3), 1 - 1e-3)
+    threshold = np.float32(float((p**0.14 - (1 - p) ** 0.14) * 4.91) * 1.22)
     softness = np.float32(0.35) + footprint * np.float32(12.0)
     kept = np.clip((flaking - threshold) / softness + np.float32(0.5), 0, 1)
     grain = fine_tile("asphalt")
@@ -272,9 +274,3 @@ def _opacity(
 
 def _faded(tile: Tile, x: Float32, y: Float32, footprint: Float32, shift: tuple[float, float]) -> Float32:
     return np.asarray(sample(tile, x, y, shift) * fade(tile, footprint))
-
-
-def _normal_quantile(fraction: float) -> float:
-    """The standard normal quantile by Tukey's lambda approximation (0.14), good to 0.01 within +-2.5."""
-    p = min(max(fraction, 1e-3), 1 - 1e-3)
-    return float((p**0.14 - (1 - p) ** 0.14) * 4.91)

@@ -97,7 +97,11 @@ class Renderer:
         if last_row:
             background = draw_background(view, scene.light, scene.backdrop, last_row)
             radiance[: ground.first_row] = background[: ground.first_row]
-            _haze(radiance, background, ground, last_row, scene.backdrop.haze_m)
+            # The ground's far rows fade into the background of the same pixels.
+            rows, part = slice(ground.first_row, last_row), slice(0, last_row - ground.first_row)
+            clear = np.exp(ground.depth_m[part] * np.float32(-1.0 / scene.backdrop.haze_m))
+            clear = np.where(ground.below[part], clear, 0)[..., None]
+            radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
         return radiance
 
     def _ground(
@@ -134,14 +138,6 @@ def _fresnel(ground: GroundField, view: View) -> Float32:
     grazing = np.float32(1.0) - np.maximum(sine, np.float32(0.12))
     squared = grazing * grazing
     return np.asarray(np.float32(0.02) + np.float32(0.45) * squared * squared * grazing)
-
-
-def _haze(radiance: Float32, background: Float32, ground: GroundField, last_row: int, haze_m: float) -> None:
-    """Let the ground's far rows fade into the background of the same pixels."""
-    rows, part = slice(ground.first_row, last_row), slice(0, last_row - ground.first_row)
-    clear = np.exp(ground.depth_m[part] * np.float32(-1.0 / haze_m))
-    clear = np.where(ground.below[part], clear, 0)[..., None]
-    radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
 
 
 _CODE_STEPS = 16384

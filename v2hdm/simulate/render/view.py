@@ -202,7 +202,12 @@ def coverage(view: View, shape: Outline, window: Window, grown_px: float = 0.0) 
     faces that share one.
     """
     u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
-    parts = [_edge_coverage(u, v, edge, grown_px) for edge in shape.edges]
+    parts: list[Float32] = []
+    for edge in shape.edges:
+        distance = u * np.float32(edge[0])
+        distance += v * np.float32(edge[1])
+        distance += np.float32(edge[2] + 0.5 + grown_px)
+        parts.append(np.clip(distance, 0, 1, out=distance))
     if len(parts) == 4:
         across = np.maximum(parts[0] + parts[2] - np.float32(1.0), 0)
         return np.asarray(across * np.maximum(parts[1] + parts[3] - np.float32(1.0), 0))
@@ -210,11 +215,3 @@ def coverage(view: View, shape: Outline, window: Window, grown_px: float = 0.0) 
     for part in parts[1:]:
         total += part
     return np.asarray(np.maximum(total, 0))
-
-
-def _edge_coverage(u: Float32, v: Float32, edge: FloatArray, grown_px: float) -> Float32:
-    a, b = np.float32(edge[0]), np.float32(edge[1])
-    distance = u * a
-    distance += v * b
-    distance += np.float32(edge[2] + 0.5 + grown_px)
-    return np.asarray(np.clip(distance, 0, 1, out=distance))
