@@ -29,9 +29,8 @@ def take_ipm(content: object, where: str) -> FloatArray:
     for axis in (1, 0) * 4 if invertible else ():
         balanced = balanced / np.linalg.norm(balanced, axis=axis, keepdims=True)
     if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
-        raise DriveError(
-            f"{where}: IPM matrix is not invertible; calibrate it again from at least 4 point pairs"
-        )
+        advice = "calibrate it again from at least 4 point pairs"
+        raise DriveError(f"{where}: IPM matrix is not invertible; {advice}")
     return np.asarray(ipm / np.linalg.norm(ipm))
 
 
@@ -119,9 +118,8 @@ def take_centre_prior(content: object, where: str) -> CentrePrior:
     sigmas = sigma if isinstance(sigma, list) else [sigma] * 3
     sigma_m = take_array(sigmas, (3,), f"{where}, sigma_m", DriveError)
     if (sigma_m <= 0).any():
-        raise DriveError(
-            f"{where}, sigma_m: must be positive; give the survey's standard deviation in metres"
-        )
+        advice = "give the survey's standard deviation in metres"
+        raise DriveError(f"{where}, sigma_m: must be positive; {advice}")
     return CentrePrior(take_array(entry["xyz"], (3,), f"{where}, xyz", DriveError), sigma_m)
 
 
@@ -133,7 +131,6 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
         raise DriveError(f"{where}: missing key 'initial_ipm'; choose from: {', '.join(ipm)}")
     initial = take_text(name, f"{where}, initial_ipm", DriveError)
     if initial not in ipm:
-        raise DriveError(
-            f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {', '.join(ipm)}"
-        )
+        names = ", ".join(ipm)
+        raise DriveError(f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {names}")
     return initial

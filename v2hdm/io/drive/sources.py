@@ -5,6 +5,7 @@ All that a drive wants of its bag is gathered first and then imported in one pas
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,16 +14,21 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.extras import need
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles
+from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
-from v2hdm.io.importers.video import IMAGE_LIST, import_video
-from v2hdm.io.trajectory import UNITS, read_image_list
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
+from v2hdm.store.folders import entry_folder, is_whole
+
+_log = logging.getLogger(__name__)
 
 _Lister = Callable[[], ImageFiles]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -173,6 +179,43 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
     return images
 
 
+def _import_video(path: Path, cache: Path, where: str) -> Path:
+    """The folder of the frames of a video as PNG files, decoded by PyAV now unless they were before.
+
+    Their list has the container's times, s since the first frame.
+    """
+    if not path.is_file():
+        raise DriveError(f"{where}: {path}: no such video; check the path")
+    folder = entry_folder(cache, [path], "video", ["frames"])
+    if is_whole(folder):
+        return folder
+    av = need("av", "video", f"{where}: a video", DriveError)
+    _log.info("%s: decoding its frames into %s, once", path, cache)
+    with new_entry(folder) as partial:
+        stamps: list[float] = []
+        names: list[str] = []
+        try:
+            with av.open(str(path)) as container:
+                for frame in container.decode(video=0):
+                    where = f"{path}: frame {len(stamps) + 1}"
+                    if frame.pts is None:
+                        raise DriveError(f"{where} has no time; give stamps, a time a line")
+                    stamps.append(float(frame.pts * frame.time_base))
+                    if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
+                        raise DriveError(f"{where}: its time does not rise; convert the video")
+                    names.append(f"{len(names):06d}.png")
+                    (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
+        except (av.error.FFmpegError, IndexError) as failure:
+            reason = " ".join(str(failure).split())
+            raise DriveError(
+                f"{path}: not readable as a video ({reason}); convert or copy it again"
+            ) from None
+        if not stamps:
+            raise DriveError(f"{path}: holds no frame; convert or copy it again")
+        write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
+    return folder
+
+
 def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
     path = sources.root / take_text(entry["video"], f"{where}, video", DriveError)
     if ("start_s" in entry) == ("stamps" in entry):
@@ -182,7 +225,7 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         )
 
     def images() -> ImageFiles:
-        frames = import_video(path, sources.cache, where) / IMAGE_LIST
+        frames = _import_video(path, sources.cache, where) / streams.IMAGE_LIST
         if "start_s" in entry:
             return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
         listed = _of_list(camera, frames)

@@ -226,18 +226,14 @@ def _on_earth(
     """Latitude, longitude and height above the ellipsoid (P, 3), and the north that counts (P,), rad."""
     crs = settings.crs
     if crs is not None and earth.has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
-        raise DriveError(
-            f"{where}: heights of {crs} count from the sea: add geoid_m, the geoid's height above the "
-            "ellipsoid"
-        )
+        advice = "add geoid_m, the geoid's height above the ellipsoid"
+        raise DriveError(f"{where}: heights of {crs} count from the sea: {advice}")
     raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
     if geodetic:
         if crs is not None and not earth.is_geographic(crs, where, DriveError):
             raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
         if settings.heading == "grid":
-            raise DriveError(
-                f"{where}: heading 'grid' of latitudes and longitudes, which have no grid; mend it"
-            )
+            raise DriveError(f"{where}: heading 'grid' of latitudes, longitudes, which have no grid; mend it")
         return raised, np.zeros(len(points))
     assert crs is not None
     if settings.heading is None:

@@ -29,7 +29,6 @@ from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
 from v2hdm.store.files import dump_yaml, replace_text
 
-PROJECTOR_FILE = "map_projector_info.yaml"
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
 
@@ -79,7 +78,14 @@ def write_lanelet2(
     lanes.write()
     square = document.place_nodes()
     replace_text(path, document.text())
-    replace_text(path.with_name(PROJECTOR_FILE), dump_yaml(_projector_info(projector, hd_map.origin, square)))
+    info: dict[str, Any] = {"projector_type": projector}
+    if projector != LOCAL and hd_map.origin is not None:
+        place = zip(
+            ("latitude", "longitude", "altitude"), position_of(hd_map.origin)[0].tolist(), strict=True
+        )
+        where = {"map_origin": dict(place)} if square is None else {"mgrs_grid": square}
+        info |= {"vertical_datum": "WGS84"} | where
+    replace_text(path.with_name("map_projector_info.yaml"), dump_yaml(info))
 
 
 def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None:
@@ -273,13 +279,3 @@ def _more_tags(feature: Feature) -> dict[str, str]:
 def _add_tags(element: ET.Element, tags: Mapping[str, str]) -> None:
     for key, value in tags.items():
         ET.SubElement(element, "tag", k=key, v=value)
-
-
-def _projector_info(projector: str, origin: GeodeticOrigin | None, square: str | None) -> dict[str, Any]:
-    if projector == LOCAL or origin is None:
-        return {"projector_type": LOCAL}
-    info: dict[str, Any] = {"projector_type": projector, "vertical_datum": "WGS84"}
-    if square is not None:
-        return info | {"mgrs_grid": square}
-    place = zip(("latitude", "longitude", "altitude"), position_of(origin)[0].tolist(), strict=True)
-    return info | {"map_origin": dict(place)}

@@ -58,9 +58,8 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise MapFileError(
-            f"{path}: no map that can be read; give a file that ends in {' or '.join(_READERS)}"
-        )
+        endings = " or ".join(_READERS)
+        raise MapFileError(f"{path}: no map that can be read; give a file that ends in {endings}")
     return reader[0](path), reader[1](path)
 
 
@@ -174,10 +173,8 @@ class _Reader:
         if self._edited:
             named = ", ".join(str(ids[index]) for index in self._edited[:_NAMED])
             more = ", ..." if len(self._edited) > _NAMED else ""
-            _log.info(
-                "%s: %d features were edited and are taken as drawn: %s",
-                self._path, len(self._edited), named + more,
-            )  # fmt: skip
+            edited = f"{len(self._edited)} features were edited and are taken as drawn"
+            _log.info("%s: %s: %s", self._path, edited, named + more)
         new = sum(a != b for a, b in zip(before, ids, strict=True))
         if new:
             _log.info("%s: %d features had no id of their own and were given one", self._path, new)
@@ -266,9 +263,8 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     kind, parts = entry.get("type"), entry.get("coordinates")
     closed = kind in ("Polygon", "MultiPolygon")
     if not closed and kind not in ("LineString", "MultiLineString"):
-        raise MapFileError(
-            f"{where}: its geometry is a {kind}; draw markings as Polygons, lanes as LineStrings"
-        )
+        advice = "draw markings as Polygons, lanes as LineStrings"
+        raise MapFileError(f"{where}: its geometry is a {kind}; {advice}")
     for _ in range({"Polygon": 1, "MultiPolygon": 2, "MultiLineString": 1}.get(str(kind), 0)):
         if not isinstance(parts, list) or len(parts) != 1:
             raise MapFileError(f"{where}: its {kind} has holes or several parts; split it")

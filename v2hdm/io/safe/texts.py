@@ -43,9 +43,8 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
             kind = "a folder" if stat.S_ISDIR(about.st_mode) else "a pipe or a device"
             raise error(f"{path}: is {kind}, not a file; check the path")
         if about.st_size > most:
-            raise error(
-                f"{path}: has {about.st_size / 1e6:.0f} MB, {most / 1e6:.0f} MB at most; check the path"
-            )
+            size, largest = f"{about.st_size / 1e6:.0f} MB", f"{most / 1e6:.0f} MB"
+            raise error(f"{path}: has {size}, {largest} at most; check the path")
         note_input(path)
         data = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -125,9 +124,8 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
     except RecursionError:
         raise error(f"{where}: JSON nested too deep; mend it") from None
     except json.JSONDecodeError as failure:
-        raise error(
-            f"{where}: line {failure.lineno} JSON syntax error: {failure.msg}; mend that line"
-        ) from None
+        at = f"{where}: line {failure.lineno}"
+        raise error(f"{at} JSON syntax error: {failure.msg}; mend that line") from None
 
 
 def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
@@ -158,9 +156,8 @@ def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> st
     """``content`` as the name of a camera, which none of :data:`ALL_CAMERAS` is."""
     name = take_name(content, where, error)
     if name.lower() in ALL_CAMERAS:
-        raise error(
-            f"{where}: a camera is called {shown(name)}, as results of all of them are; choose another"
-        )
+        problem = f"a camera is called {shown(name)}, as results of all of them are"
+        raise error(f"{where}: {problem}; choose another")
     return name
 
 

@@ -71,8 +71,7 @@ def _pixels(fields: Any, where: str) -> np.ndarray:
         )
     data = np.zeros(step * height, dtype=np.uint8)
     data[: len(fields.data)] = fields.data[: len(data)]
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    pixels = data.reshape(height, step)[:, :row].reshape(shape)
+    pixels = data.reshape(height, step)[:, :row].reshape((height, width, channels)[: 2 + (channels > 1)])
     if to_bgr is not None:
         pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), to_bgr), dtype=np.uint8)
     return pixels

@@ -145,10 +145,8 @@ class Bag:
         if topic is None:
             raise DriveError(f"{where}: {self.path} has no topic {name}; of type {wanted} it has: {fitting}")
         if topic.kind not in kinds:
-            raise DriveError(
-                f"{where}: topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}; it has: "
-                f"{fitting}"
-            )
+            problem = f"topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}"
+            raise DriveError(f"{where}: {problem}; it has: {fitting}")
         if not topic.messages:
             raise DriveError(f"{where}: topic {name} of {self.path} holds no message; record it")
         return topic
