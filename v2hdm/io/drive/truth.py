@@ -50,14 +50,10 @@ def has_truth(drive: Drive) -> bool:
     folders = [visit.truth_dir for visit in drive.visits if visit.truth_dir is not None]
     if len(folders) < len(drive.visits):
         return False
-    first, *others = (read_geojson(folder / "map.geojson") for folder in folders)
-    corners = [one.corners_map for one in first.markings]
-    return all(
-        other.origin == first.origin
-        and len(other.markings) == len(corners)
-        and np.array_equal(corners, [one.corners_map for one in other.markings])
-        for other in others
-    )
+    maps = [read_geojson(folder / "map.geojson") for folder in folders]
+    corners = [[one.corners_map for one in hd_map.markings] for hd_map in maps]
+    same_origin = all(one.origin == maps[0].origin for one in maps)
+    return same_origin and all(np.array_equal(corners[0], one) for one in corners)
 
 
 def _joined_truth(drive: Drive) -> Truth:

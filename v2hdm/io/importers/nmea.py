@@ -113,10 +113,8 @@ class _Log:
             raise DriveError(f"{self._where}: no GGA sentence with a position; log GGA and HDT, THS or PASHR")
         day = self._first_date or first_day
         if day is None:
-            raise DriveError(
-                f"{self._where}: no RMC or ZDA sentence tells the date: add date, the day of the first "
-                "sentence"
-            )
+            advice = "add date, the day of the first sentence"
+            raise DriveError(f"{self._where}: no RMC or ZDA sentence tells the date: {advice}")
         if self._above_sea:
             _log.warning(
                 "%s: its heights count from the sea, and GGA does not say where that is; add geoid_m if the "

@@ -104,9 +104,8 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
         turn = _VEHICLE_FROM_CAMERA_AXES
         rotation, points = turn @ rotation @ turn.T, points @ turn.T
     elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
-        raise DriveError(
-            f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
-        )
+        advice = "say axes: camera if they are KITTI's own"
+        raise DriveError(f"{path}: the poses' z axis does not point up; {advice}")
     rows = in_order(stamp_s, str(path))
     return readings_of_poses(Trajectory(stamp_s[rows], make_transform(rotation[rows], points[rows])))
 
@@ -126,9 +125,8 @@ def _numbers(path: Path, columns: int) -> FloatArray:
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise DriveError(
-                f"{path}: line {number}: expected {columns} finite numbers, got '{line[:60]}'; mend it"
-            )
+            problem = f"expected {columns} finite numbers, got '{line[:60]}'"
+            raise DriveError(f"{path}: line {number}: {problem}; mend it")
         rows.append(row)
     if not rows:
         raise DriveError(f"{path}: holds no numbers; expected {columns} a line")
@@ -161,9 +159,8 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     geodetic = _GEODETIC[0] in columns
     coordinates = _GEODETIC if geodetic else _MAP
     if geodetic == (_MAP[0] in columns):
-        raise DriveError(
-            f"{path}: needs positions, as columns {', '.join(_MAP)} or {', '.join(_GEODETIC)}, one of the two"
-        )
+        either = f"{', '.join(_MAP)} or {', '.join(_GEODETIC)}"
+        raise DriveError(f"{path}: needs positions, as columns {either}, one of the two")
     _check_there(columns, coordinates[:2], path)
     count = len(rows)
     points = np.column_stack([columns.get(name, np.zeros(count)) for name in coordinates])
@@ -182,9 +179,8 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     header, rows = read_rows(path, ",;\t", "pose")
     for ours, theirs in names.items():
         if header.count(theirs) != 1:
-            raise DriveError(
-                f"{path}: has no column '{theirs}' for {ours}, or two; it has: {', '.join(header)}"
-            )
+            problem = f"has no column '{theirs}' for {ours}, or two"
+            raise DriveError(f"{path}: {problem}; it has: {', '.join(header)}")
     found = {ours: header.index(theirs) for ours, theirs in names.items()}
     for place, name in enumerate(header):
         if name in NAMES and place not in found.values() and name not in found:
@@ -219,9 +215,8 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
     rows = [(number, split(line)) for number, line in lines[1:]]
     for number, cells in rows:
         if len(cells) != len(header):
-            raise DriveError(
-                f"{path}: line {number}: {len(cells)} cells under {len(header)} columns; mend that line"
-            )
+            problem = f"{len(cells)} cells under {len(header)} columns"
+            raise DriveError(f"{path}: line {number}: {problem}; mend that line")
     return header, rows
 
 

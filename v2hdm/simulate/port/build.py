@@ -72,10 +72,8 @@ def calibrate(
     outside = (clicked_px < 0).any(axis=1) | (clicked_px > (info.width - 1, info.height - 1)).any(axis=1)
     if outside.any():
         first_ahead, first_left = config.points_ahead_m[int(np.argmax(outside))]
-        raise ConfigError(
-            f"calibration.points_ahead_m: [{first_ahead:g}, {first_left:g}] is outside camera "
-            f"'{info.name}'; move it or the mount"
-        )
+        problem = f"[{first_ahead:g}, {first_left:g}] is outside camera '{info.name}'"
+        raise ConfigError(f"calibration.points_ahead_m: {problem}; move it or the mount")
     # Solved towards pixels, where the larger and equal errors are.
     pinhole_from_vehicle, _ = cv2.findHomography(surveyed, undistort_points(info, clicked_px), 0)
     if pinhole_from_vehicle is None:
@@ -191,10 +189,8 @@ def build_port(config: PortConfig) -> Port:
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
-        raise ConfigError(
-            f"port '{config.name}', route.pieces: {route.length_m:g} m in all; "
-            f"give {_SHORTEST_ROUTE_M:g} m or more"
-        )
+        problem = f"{route.length_m:g} m in all; give {_SHORTEST_ROUTE_M:g} m or more"
+        raise ConfigError(f"port '{config.name}', route.pieces: {problem}")
     layout = build_layout(config.paint, route, streams[_LAYOUT])
     layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)

@@ -160,10 +160,8 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps
         write_truth(truth_dir, _truth(port, images), images)
         write_drive(folder, drive, port.driven.recorded)
     except OSError as failure:
-        raise DriveError(
-            f"{folder}: cannot write the rendered drive ({failure.strerror}); "
-            "free space or choose another cache"
-        ) from None
+        problem = f"cannot write the rendered drive ({failure.strerror})"
+        raise DriveError(f"{folder}: {problem}; free space or choose another cache") from None
 
 
 def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) -> None:

@@ -134,7 +134,7 @@ def drive_along(
     jitter = correlated_noise(stamp_s, sigma, disturbance.jitter_correlation_s, rng, 2)
     jitter += rng.normal(0.0, sigma, (len(stamp_s), 2))
     heave = correlated_noise(stamp_s, disturbance.heave_m, disturbance.jitter_correlation_s, rng)
-    true = _poses(route.points_at(station), heave[:, 0], *jitter.T, route.yaw_at(station))
+    true = _poses(route.points_at(station), heave[:, 0], jitter, route.yaw_at(station))
 
     station = route.station_at(recorded_s)
     points = route.points_at(station)
@@ -143,14 +143,14 @@ def drive_along(
     sigma = np.deg2rad(disturbance.heading_deg) / np.sqrt(2.0)
     yaw = route.yaw_at(station) + rng.normal(0.0, sigma, len(recorded_s))
     yaw += correlated_noise(recorded_s, sigma, disturbance.heading_correlation_s, rng)[:, 0]
-    level = np.zeros((3, len(recorded_s)))
-    return DrivenPoses(stamp_s, true, Trajectory(recorded_s, _poses(points, *level, yaw)))
+    level = np.zeros((len(recorded_s), 2))
+    return DrivenPoses(stamp_s, true, Trajectory(recorded_s, _poses(points, level[:, 0], level, yaw)))
 
 
-def _poses(
-    points: FloatArray, height: FloatArray, roll: FloatArray, pitch: FloatArray, yaw: FloatArray
-) -> FloatArray:
-    return make_transform(rotation_from_euler(roll, pitch, yaw), np.column_stack([points, height]))
+def _poses(points: FloatArray, height: FloatArray, tilt: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of points (N, 2), heights (N,), rolls and pitches (N, 2), and headings (N,)."""
+    rotation = rotation_from_euler(tilt[:, 0], tilt[:, 1], yaw)
+    return make_transform(rotation, np.column_stack([points, height]))
 
 
 def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:

@@ -154,8 +154,6 @@ def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
 
 def _clip(polygon: FloatArray, line: FloatArray, least: float) -> FloatArray:
     """The part (M, 3) of a homogeneous polygon (N, 3) where ``line . p >= least`` (Sutherland-Hodgman)."""
-    if len(polygon) == 0:
-        return polygon
     inside = polygon @ line - least
     if (inside >= 0).all():
         return polygon

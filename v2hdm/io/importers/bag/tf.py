@@ -63,8 +63,8 @@ class Frames:
         """
         path = self._path(dst, src)
         if path is None:
-            known = ", ".join(self.names)
-            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; there are: {known}")
+            names = ", ".join(self.names)
+            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; there are: {names}")
         tracks = [(self._edges[edge], forward) for edge, forward in path]
         busiest = max((track for track, _ in tracks), key=lambda track: len(track.stamp_s), default=None)
         if busiest is None or len(busiest.stamp_s) < 2:
