@@ -54,9 +54,8 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     """
     system = _system(crs, where, error)
     if not system.is_projected:
-        raise error(
-            f"{where}: {crs} is not projected; give latitude and longitude as such, or a projected one"
-        )
+        advice = "give latitude and longitude as such, or a projected one"
+        raise error(f"{where}: {crs} is not projected; {advice}")
     lon, lat = _inverse_of(crs).transform(points[:, 0], points[:, 1])
     geodetic = np.column_stack([lat, lon, points[:, 2]])
     if not np.isfinite(geodetic).all():

@@ -48,9 +48,8 @@ def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, wher
     """Refuse poses off the earth, or far from the map's ``origin`` on it."""
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
-        raise DriveError(
-            f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend the poses"
-        )
+        problem = f"a position is {farthest_m:.3g} m from zero, off the earth"
+        raise DriveError(f"{where}: {problem}; mend the poses")
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
@@ -154,9 +153,8 @@ def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
     if not len(stamp_s):
         raise DriveError(f"{where}: holds no pose; record some, or check what it is")
     if not np.isfinite(stamp_s).all():
-        raise DriveError(
-            f"{where}: {what} {int(np.argmin(np.isfinite(stamp_s))) + 1}: its time is not finite"
-        )
+        row = int(np.argmin(np.isfinite(stamp_s))) + 1
+        raise DriveError(f"{where}: {what} {row}: its time is not finite")
     late_s = np.maximum.accumulate(stamp_s) - stamp_s
     if late_s.max() >= _LATE_S:
         k = int(np.argmax(late_s >= _LATE_S))

@@ -70,9 +70,8 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     named among several, or its lens is beyond ours.
     """
     if path.suffix.lower() == ".bin":
-        raise DriveError(
-            f"{path}: is binary; write COLMAP's model as text (model_converter --output_type TXT)"
-        )
+        advice = "write COLMAP's model as text (model_converter --output_type TXT)"
+        raise DriveError(f"{path}: is binary; {advice}")
     document = _read_document(path)
     chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
     if chosen is None:
@@ -218,9 +217,9 @@ def _read_colmap(document: Document, name: str) -> CameraInfo:
         raise DriveError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS; restore the file")
     _, kind, width, height, *words = line.split()
     if kind not in COLMAP_MODELS:
+        known = ", ".join(COLMAP_MODELS)
         raise DriveError(
-            f"{where}: COLMAP's {kind} is beyond our lens models; calibrate with one of: "
-            f"{', '.join(COLMAP_MODELS)}"
+            f"{where}: COLMAP's {kind} is beyond our lens models; calibrate with one of: {known}"
         )
     focals, coefficients, model = COLMAP_MODELS[kind]
     try:

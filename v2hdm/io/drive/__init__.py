@@ -54,9 +54,8 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
     for name, (accepts, read) in READERS.items():
         if options.format == name or (options.format == "auto" and accepts(path)):
             return part_of(read(path, options), options)
-    raise DriveError(
-        f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
-    )
+    known = ", ".join(READERS)
+    raise DriveError(f"{path}: not a drive in any known format ({known}); see docs/drive-format.md")
 
 
 def drive_name(path: Path) -> str:

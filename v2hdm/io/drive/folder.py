@@ -162,9 +162,8 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
         if value < 0:
             raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; mend it")
         if key.endswith("_over_m") and value == 0:
-            raise DriveError(
-                f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
-            )
+            problem = "an error that fades over no distance is no drift"
+            raise DriveError(f"{where}, {key}: {problem}; leave it out")
     stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
     noise = PoseNoise.as_far_as_stated(**stated, **values)
     for total, drift in DRIFTS.items():

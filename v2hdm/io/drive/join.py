@@ -141,10 +141,8 @@ def _check(drives: Sequence[Drive]) -> None:
         raise DriveError(f"{again[0]}: given twice; name each drive once in drive.path")
     without = [drive.root for drive in drives if drive.origin is None]
     if without and len(without) < len(drives):
-        raise DriveError(
-            f"{without[0]}: has no origin, but other drives have: nobody knows how their frames lie to each "
-            "other; state its origin, or those of none"
-        )
+        problem = "has no origin, but other drives have: nobody knows how their frames lie to each other"
+        raise DriveError(f"{without[0]}: {problem}; state its origin, or those of none")
     if without:
         _log.warning("no drive has an origin: their coordinates are taken to be of one frame")
     datums = {drive.origin.datum: drive.root for drive in drives if drive.origin is not None}

@@ -197,9 +197,8 @@ def _read_stamps(path: Path) -> FloatArray:
             seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
             stamps.append(seconds + float(f"0.{fraction or 0}"))
         except ValueError:
-            raise DriveError(
-                f"{path}: line {number}: expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'; mend it"
-            ) from None
+            problem = f"expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'"
+            raise DriveError(f"{path}: line {number}: {problem}; mend it") from None
     return np.array(stamps)
 
 

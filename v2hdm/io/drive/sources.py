@@ -113,9 +113,8 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
             if key not in content:
-                raise DriveError(
-                    f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle"
-                )
+                advice = "frame of the map, vehicle of the vehicle"
+                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: {advice}")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
         transforms = streams.TfStream(True, where)
         tf_folder = sources.want(transforms)
@@ -207,9 +206,8 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
                     (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
-            raise DriveError(
-                f"{path}: not readable as a video ({reason}); convert or copy it again"
-            ) from None
+            problem = f"not readable as a video ({reason})"
+            raise DriveError(f"{path}: {problem}; convert or copy it again") from None
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
         write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
@@ -231,10 +229,8 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         listed = _of_list(camera, frames)
         stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
         if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
-            raise DriveError(
-                f"{where}: {len(listed.paths)} frames in {path} and {len(stamp_s)} stamps; give one a frame, "
-                "rising"
-            )
+            problem = f"{len(listed.paths)} frames in {path} and {len(stamp_s)} stamps"
+            raise DriveError(f"{where}: {problem}; give one a frame, rising")
         return replace(listed, stamp_s=stamp_s)
 
     return images

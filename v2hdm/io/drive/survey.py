@@ -286,10 +286,8 @@ def _frame(names: Sequence[str | None], crs: str | None, path: Path) -> Frame:
             "call the columns x_m, y_m if they are in the frame of the poses"
         )
     if frame is Frame.MAP and crs is not None:
-        raise DriveError(
-            f"{path}: x_m, y_m are in the frame of the poses, and mapping.survey.crs is {crs}; call them "
-            "east_m, north_m, or drop crs"
-        )
+        problem = f"x_m, y_m are in the frame of the poses, and mapping.survey.crs is {crs}"
+        raise DriveError(f"{path}: {problem}; call them east_m, north_m, or drop crs")
     if crs is not None and (frame is Frame.GEODETIC) != geodetic.is_geographic(crs, str(path), DriveError):
         kind = "latitudes and longitudes" if frame is Frame.GEODETIC else "east and north"
         raise DriveError(f"{path}: holds {kind}, which {crs} has not; mend mapping.survey.crs")

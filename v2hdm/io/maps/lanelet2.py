@@ -56,9 +56,8 @@ def write_lanelet2(
     if projector not in PROJECTORS:
         raise ConfigError(f"unknown projector '{projector}'; choose from: {', '.join(PROJECTORS)}")
     if hd_map.origin is None and projector != LOCAL:
-        raise ConfigError(
-            f"the map has no origin on the earth, which the projector {projector} needs: choose {LOCAL}"
-        )
+        problem = f"the map has no origin on the earth, which the projector {projector} needs"
+        raise ConfigError(f"{problem}: choose {LOCAL}")
     features = features_of(hd_map)
     for feature in features:
         if len(feature.points_map) >= _MOST_VERTICES:

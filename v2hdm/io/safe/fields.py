@@ -76,9 +76,8 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     """
     (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
     if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:
-        raise error(
-            f"{where}: camera_matrix: not of the form fx s cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it"
-        )
+        problem = "not of the form fx s cx, 0 fy cy, 0 0 1 with positive fx, fy"
+        raise error(f"{where}: camera_matrix: {problem}; mend it")
     if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
         raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; mend it")
     # The image's reach from the axis to a side, and up or down, in focal lengths.

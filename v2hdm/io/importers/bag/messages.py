@@ -58,9 +58,8 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
     if fields.encoding not in _ENCODINGS:
-        raise DriveError(
-            f"{where}: encoding '{fields.encoding}' is not known; record one of {', '.join(_ENCODINGS)}"
-        )
+        known = ", ".join(_ENCODINGS)
+        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {known}")
     channels, to_bgr = _ENCODINGS[fields.encoding]
     height, width, step = int(fields.height), int(fields.width), int(fields.step)
     row = width * channels
