@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from v2hdm.cli.compose import Job
 from v2hdm.errors import ConfigError
@@ -154,7 +153,7 @@ def test_a_url_where_only_paths_are_written_is_told_and_not_made_a_folder(
             write(Path("s3://bucket/results")),
         ):
             pass
-    job = Job(OmegaConf.create(), "0-a=b")
+    job = Job(None, "", "0-a=b")
     with pytest.raises(ConfigError, match="a sweep writes to folders of this machine"):
         job.folder("s3://bucket/results")
     assert not list(tmp_path.iterdir())

@@ -25,7 +25,6 @@ Usage: {command} [key=value ...] [--config-dir FOLDER] [--multirun]
                       '# @package _global_'
   --multirun          one job for each of several values: key=1,2,3; each has its own folder of results
   --cfg job           only prints the configuration
-  --hydra-help        what else Hydra knows
 """
 _OFTEN = {
     "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",
