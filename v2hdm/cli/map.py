@@ -6,8 +6,7 @@ import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.main import COMMANDS
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.cli.main import COMMANDS, exit_code
 
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
@@ -49,8 +48,10 @@ def _map(job: Job) -> int:
         console.print(results_table(result.metrics["name"], result.metrics["results"]))
     if "changes" in result.metrics:
         console.print(changes_table(result.metrics["changes"]))
-    status, (first, *lines) = result.verdict.status.value, result.verdict.lines
-    console.print(first, style=_STYLES[status], highlight=False, markup=False, soft_wrap=True)
+    first, *lines = result.verdict.lines
+    console.print(
+        first, style=_STYLES[result.verdict.status.value], highlight=False, markup=False, soft_wrap=True
+    )
     for line in [*lines, f"results in {result.place}: open report.html"]:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    return EXIT_FAILED_VERDICT if status == "FAIL" else 0
+    return exit_code(result.verdict)

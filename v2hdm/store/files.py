@@ -29,7 +29,6 @@ __all__ = [
     "check_keys",
     "dump_yaml",
     "file_digest",
-    "forget_stdout",
     "load_json",
     "load_yaml",
     "observed_writes",
@@ -205,8 +204,3 @@ def take_choice(content: object, choices: Collection[str], where: str, error: ty
     if not isinstance(content, str) or content not in choices:
         raise error(f"{where}: expected one of {', '.join(choices)}, got {shown(content)}")
     return content
-
-
-def forget_stdout() -> None:
-    """Keep Python from writing at its end what could not be written before."""
-    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
