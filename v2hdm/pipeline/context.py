@@ -43,17 +43,10 @@ class Viewer(Protocol):
 class Unwatched:
     """A :class:`Viewer` that shows nothing."""
 
-    def begun(self, folder: Path, drive: Drive) -> None:
+    def begun(self, *_: object) -> None:
         """Nothing."""
 
-    def detected(self, detections: Sequence[ImageDetections]) -> None:
-        """Nothing."""
-
-    def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
+    detected = mapped = close = begun
 
 
 @dataclass(frozen=True)

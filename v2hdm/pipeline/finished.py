@@ -179,12 +179,11 @@ def _take_or_upload(
 
 def _finished_at(place: RemoteFolder, config: RunConfig) -> RunResult | None:
     """The result that is at a store, where it is whole and made of the same."""
-    if not is_whole_at(place):
-        return None
     try:
-        entry = decode(place.read(_RECORD) or b"", _Finished)
-        if not _is_of(config, entry.key):
-            return None
+        if is_whole_at(place):
+            entry = decode(place.read(_RECORD) or b"", _Finished)
+            if _is_of(config, entry.key):
+                return _taken(replace(entry.result, url=place.url))
     except (CodecError, V2hdmError, OSError):  # the run that follows reports it
-        return None
-    return _taken(replace(entry.result, url=place.url))
+        pass
+    return None

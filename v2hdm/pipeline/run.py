@@ -43,10 +43,8 @@ def run(
         from v2hdm.detection.network import check_device
 
         check_device(config.detector.device)
-        context = Context(progress=progress)
-        return map_and_save(
-            config, cache, config_yaml, context if viewer is None else replace(context, viewer=viewer)
-        )
+        context = Context(progress=progress, **({} if viewer is None else {"viewer": viewer}))
+        return map_and_save(config, cache, config_yaml, context)
 
     return take_or_make(config, work, config.resume and viewer is None, progress)[0]
 
@@ -93,6 +91,6 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
         )
     from v2hdm.simulate import rendered_drive
 
-    folder, render = Path(config.cache), context.steps("render")
     with context.timed("render"):
-        return (rendered_drive(config.simulate, folder, context.processes, render),)
+        folder, steps = Path(config.cache), context.steps("render")
+        return (rendered_drive(config.simulate, folder, context.processes, steps),)
