@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from v2hdm.cli.main import run
-from v2hdm.store.cache import StageCache, entry_name
+from v2hdm.store.cache import StageCache
 from v2hdm.store.folders import LIST, note_use
 from v2hdm.store.lock import IN_USE, in_use
 from v2hdm.store.pruning import DRIVES, items_of, prune
-from v2hdm.store.remote import RemoteFolder
 
 KEYS = [f"{number:064x}" for number in range(4)]
 
@@ -172,21 +171,3 @@ def test_the_command_reports_in_one_line(
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
-
-
-def test_the_command_lists_verifies_and_prunes_a_store(
-    memory: RemoteFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for key in KEYS[:3]:
-        memory.write(entry_name("detect", key), b"no entry")
-    StageCache(tmp_path, memory).put("map", KEYS[0], bytes, bytes(1000))
-    memory.write("stages/detect/notes", b"mine")
-    memory.write("notes", b"mine")
-    assert run(["cache", "list", "--cache", str(memory)]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert [line.split()[:2] for line in printed[1:]] == [["detect", "3"], ["map", "1"], ["all", "4"]]
-    assert run(["cache", "verify", "--cache", str(memory)]) == 0
-    assert "read 4 entries, 3 of them damaged" in capsys.readouterr().out
-    assert run(["cache", "prune", "--cache", str(memory), "--gb", "0"]) == 0
-    assert "removed 1 entries" in capsys.readouterr().out
-    assert set(memory.listed()) == {"stages/detect/notes", "notes"}

@@ -26,17 +26,16 @@ def run(arguments: Sequence[str]) -> None:
     pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
     verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
     for action in (shown, pruned, verified):
-        action.add_argument("--cache", default="cache", help="the folder or URL (default: cache)")
+        action.add_argument("--cache", default=Path("cache"), type=Path, help="the folder (default: cache)")
     parsed = parser.parse_args(arguments)
     from v2hdm.errors import ConfigError
     from v2hdm.store.pruning import items_of, prune, remove_damaged
-    from v2hdm.store.remote import place_of
 
-    cache = place_of(parsed.cache, "--cache")
-    if isinstance(cache, Path) and not cache.is_dir():
+    cache = parsed.cache
+    if not cache.is_dir():
         raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
     if parsed.what == "list":
-        _show(items_of(cache), "last used" if isinstance(cache, Path) else "last written")
+        _show(items_of(cache))
     elif parsed.what == "prune":
         if not parsed.gb >= 0:
             raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
@@ -51,9 +50,9 @@ def run(arguments: Sequence[str]) -> None:
         print(f"read {len(items)} entries, {len(damaged)} of them damaged")
 
 
-def _show(items: Sequence[Item], when: str) -> None:
+def _show(items: Sequence[Item]) -> None:
     kinds = sorted({item.kind for item in items})
-    print(f"{'what':<20}{'entries':>8}{'size':>12}  {when}")
+    print(f"{'what':<20}{'entries':>8}{'size':>12}  last used")
     for kind in kinds:
         own = [item for item in items if item.kind == kind]
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))

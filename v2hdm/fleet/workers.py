@@ -92,7 +92,7 @@ class DetectorActor:
             if not root.exists():
                 raise DriveError(
                     f"{root}: is not on {os.uname().nodename}, which is to detect in its images; put drives, "
-                    "and local_cache for those that are copied, on a folder that all machines share"
+                    "and the cache for those that are copied, on a folder that all machines share"
                 )
         if known not in self._detectors:
             self._detectors = {known: Detector.load(options=options)}

@@ -69,8 +69,6 @@ class RunConfig:
         output: folder that takes the results, or the URL of one at an object store (docs/stores.md).
         cache: folder that keeps rendered drives, what is imported from bags and videos, and what each stage
             of a run has found, for the next one (docs/cache.md).
-        local_cache: folder of this machine that takes the place of ``cache`` where that is the URL of an
-            object store, which then keeps what stages have found (docs/stores.md).
         cache_gb: what the cache may hold, GB (10^9 bytes); what was not used for longest goes first.
         resume: whether what an earlier run has found is taken from the cache where nothing has changed
             that it was made from; false makes all anew.
@@ -91,7 +89,6 @@ class RunConfig:
     mapping: MappingOptions = field(default_factory=MappingOptions)
     output: str = "outputs"
     cache: str = "cache"
-    local_cache: str = "cache"
     cache_gb: float = 50.0
     resume: bool = True
     workers: int = 0

@@ -1,7 +1,7 @@
 """Finished results: one that nothing has changed for is taken as it is, in its folder or at its store.
 
-Runs whose drive, cache or results are at an object store work in folders of this machine: a drive is copied
-into the cache first; a result is written to a folder there, whole, and then uploaded.
+Runs whose drive or results are at an object store work in the cache: a drive is copied there first; a result
+is written to a folder there, whole, and then uploaded.
 """
 
 from __future__ import annotations
@@ -23,9 +23,17 @@ from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of
 from v2hdm.store.folders import note_use
 from v2hdm.store.lock import HOST
-from v2hdm.store.remote import RemoteFolder, download, is_url, place_of
+from v2hdm.store.remote import (
+    RemoteFolder,
+    contents_of,
+    download,
+    is_url,
+    is_whole_at,
+    place_of,
+    refuse_upload,
+    upload,
+)
 from v2hdm.store.results import drop_result, files_of_result, is_whole, locked_folder
-from v2hdm.store.upload import contents_of, is_whole_at, refuse_upload, upload
 from v2hdm.verdict.verdict import Verdict
 
 _log = logging.getLogger(__name__)
@@ -81,14 +89,12 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     Raises:
         V2hdmError: as ``work``; or a store does not work, or holds what is not ours.
     """
-    output, cache = place_of(config.output, "output="), place_of(config.cache, "cache=")
-    if is_url(config.local_cache):
-        raise ConfigError(f"local_cache={config.local_cache}: is a URL; give a folder of this machine")
-    for place in (output, cache):
-        if isinstance(place, RemoteFolder):
-            place.check()
-    folder, behind = (cache, None) if isinstance(cache, Path) else (Path(config.local_cache), cache)
-    local, stages = _local(config, folder, progress), StageCache(folder, behind, config.resume)
+    output, folder = place_of(config.output, "output="), place_of(config.cache, "cache=")
+    if isinstance(folder, RemoteFolder):
+        raise ConfigError(f"cache={config.cache}: is a URL; give a folder, on a disk that machines may share")
+    if isinstance(output, RemoteFolder):
+        output.check()
+    local, stages = _local(config, folder, progress), StageCache(folder, config.resume)
     if isinstance(output, RemoteFolder):
         return _take_or_upload(local, output, stages, work, take, progress)
     local.output = str(output)
@@ -99,7 +105,7 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
 def note_finished(result: RunResult, key: str, cache: StageCache) -> None:
     """Keep what is needed to know that nothing has changed since."""
     entry = _Finished(key, files_of_result(result.folder), result)
-    cache.local.put(_STAGE, key_of(result.folder.resolve()), _Finished, entry)
+    cache.put(_STAGE, key_of(result.folder.resolve()), _Finished, entry)
 
 
 def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
@@ -118,7 +124,7 @@ def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
 
 
 def _noted(folder: Path, cache: StageCache) -> _Finished | None:
-    return cache.local.get(_STAGE, key_of(folder.resolve()), _Finished)
+    return StageCache(cache.folder).get(_STAGE, key_of(folder.resolve()), _Finished)
 
 
 def _taken(result: RunResult) -> RunResult:

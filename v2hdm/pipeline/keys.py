@@ -52,7 +52,7 @@ def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
 def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
     """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
     asked = replace(
-        config, name=run_name(config), output="", cache="", local_cache="", cache_gb=0.0, resume=True,
+        config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True,
         workers=0, drive=replace(config.drive, path=None, cache=""),
     )  # fmt: skip
     files: list[Path] = []

@@ -96,8 +96,8 @@ def refuse_url(path: Path) -> None:
     """Raise ConfigError for a URL that was taken for a path: it would be a folder called ``s3:``."""
     if _URL.match(str(path)):
         raise ConfigError(
-            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm map and "
-            "v2hdm.fleet; give a path on this machine"
+            f"{path}: no URL is written to here, only as output= of v2hdm map and v2hdm fleet; "
+            "give a path on this machine"
         )
 
 
