@@ -112,14 +112,10 @@ class Catalogue:
         }
 
     def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
-        """This catalogue and a user's classes after it.
+        """This catalogue and a user's classes after it, by name as ``catalogue.yaml`` has them.
 
-        Args:
-            entries: by name, what ``catalogue.yaml`` says of a class.
-            where: they come from, for errors.
-
-        Raises:
-            ConfigError: an entry is wrong, or its name is taken.
+        Raises ConfigError, which says ``where`` they come from, where an entry is wrong, or its name is
+        taken.
         """
         taken = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
         for name in entries:
@@ -154,11 +150,7 @@ class Catalogue:
 
 
 def load_catalogue(path: Path | None = None) -> Catalogue:
-    """The shipped classes and, after them, those of a user's file.
-
-    Raises:
-        ConfigError: the file is missing, is no YAML, or an entry is wrong.
-    """
+    """The shipped classes and, after them, those of a user's file; raises ConfigError where that is wrong."""
     return SHIPPED if path is None else SHIPPED.with_own(_read_entries(path), str(path))
 
 

@@ -11,11 +11,7 @@ from v2hdm.errors import V2hdmError
 
 
 def need(module: str, extra: str, purpose: str, error: type[V2hdmError]) -> ModuleType:
-    """The optional ``module``, imported.
-
-    Raises:
-        V2hdmError: of type ``error``, when it is not installed; names the extra that brings it.
-    """
+    """The optional ``module``, imported; where it is absent, ``error`` names the ``extra`` that brings it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as missing:
@@ -28,11 +24,7 @@ def need(module: str, extra: str, purpose: str, error: type[V2hdmError]) -> Modu
 
 @contextmanager
 def of_extra(extra: str, purpose: str) -> Iterator[None]:
-    """Within, a library that is missing is one line that names the extra which brings it.
-
-    Raises:
-        ImportError: of the library.
-    """
+    """Within, a library that is missing is one line, an ImportError that names the extra which brings it."""
     try:
         yield
     except ModuleNotFoundError as missing:

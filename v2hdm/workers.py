@@ -40,18 +40,9 @@ def share_out(
 ) -> None:
     """Do jobs in several processes and take their results in the order of the jobs.
 
-    Processes are spawned: a fork would inherit the locks of other libraries' threads.
-
-    Args:
-        work: does one job; an exception of it is raised here, caused by one with the traceback there.
-        jobs: what to do.
-        processes: how many to start at most.
-        start: called in each process first, with ``arguments``.
-        arguments: of ``start``.
-        take: called here with each result.
-
-    Raises:
-        WorkerError: a process died.
+    Processes are spawned: a fork would inherit the locks of other libraries' threads. Each calls ``start``
+    with ``arguments`` first; an exception of ``work`` is raised here, caused by one with the traceback there.
+    Raises WorkerError where a process died.
     """
     others, spawn = set(multiprocessing.active_children()), multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(max(1, min(processes, len(jobs))), spawn, _begin, (start, arguments))

@@ -60,11 +60,7 @@ class Job:
     label: str | None
 
     def folder(self, output: str) -> str:
-        """The folder ``output``, of a sweep one within it for this job.
-
-        Raises:
-            ConfigError: a sweep is to write to a URL.
-        """
+        """The folder ``output``, of a sweep one within it for this job; raises ConfigError for a URL then."""
         if self.label is None:
             return output
         if "://" in output:
@@ -83,21 +79,11 @@ def work_on(
     arguments: Sequence[str],
     advice: str,
 ) -> int:
-    """Compose ``conf/<name>.yaml`` with the command line and work on it, once as a rule.
+    """Compose ``conf/<name>.yaml`` with the command line and work on it; returns the exit code.
 
     Nothing is done after ``--help``. A sweep (``--multirun``) works on each of its configurations in turn and
-    ends with the code of the first that failed.
-
-    Args:
-        command: whose work it is; a job of a sweep that fails is one line, as the command's own failure.
-        name: of the configuration.
-        schema: the dataclass that it builds on.
-        work: what to do; returns an exit code, or None for 0.
-        arguments: the command line.
-        advice: on values that are missing.
-
-    Raises:
-        ConfigError: A key or value is wrong.
+    ends with the code of the first that failed; a job that fails is one line, as the command's own failure.
+    ``advice`` is on values that are missing. Raises ConfigError where a key or value is wrong.
     """
     parser = argparse.ArgumentParser(command.name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
@@ -167,10 +153,8 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
     """Compose ``conf/<name>.yaml`` with a run file, as ``--config-dir`` and ``+run=`` do, and overrides.
 
     What the run file names in a ``defaults`` list of its own is looked for beside it, where its folder is
-    called ``run``, and among the shipped ones.
-
-    Raises:
-        ConfigError: the file is missing or damaged, or a key or value is wrong.
+    called ``run``, and among the shipped ones. Raises ConfigError where the file is missing or damaged, or a
+    key or value is wrong.
     """
     if not isinstance(read_yaml(path, ConfigError), dict):  # OmegaConf would expand whatever aliases repeat
         raise ConfigError(f"{path}: expected 'key: value' entries; write it as conf/run/*.yaml are")
@@ -216,8 +200,7 @@ def _refuse_headless(path: Path) -> None:
 def to_dataclass(composed: DictConfig, schema: type[_Schema], advice: str) -> _Schema:
     """The composed configuration as the dataclass ``schema``.
 
-    Raises:
-        ConfigError: A required value is missing, for which there is ``advice``, or one is wrong.
+    Raises ConfigError where a required value is missing, for which there is ``advice``, or one is wrong.
     """
     try:
         missing = sorted(OmegaConf.missing_keys(composed))

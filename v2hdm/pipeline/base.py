@@ -41,8 +41,8 @@ LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)
 def read_base(path: Path) -> Base:
     """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
 
-    Raises:
-        MapFileError: It is missing, damaged, of an older version or another method, or its verdict is FAIL.
+    Raises MapFileError where it is missing, damaged, of an older version or another method, or its verdict is
+    FAIL.
     """
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
@@ -63,11 +63,7 @@ def read_base(path: Path) -> Base:
 
 
 def check_together(base: Base, drive: Drive, path: str) -> None:
-    """Refuse a map that is not of the drive's frame or site.
-
-    Raises:
-        MapFileError: The message names both.
-    """
+    """Raise MapFileError, which names both, for a map that is not of the drive's frame or site."""
     if base.hd_map.origin != drive.origin:
         raise MapFileError(
             f"map.base: the origin of {path} is {base.hd_map.origin} and that of drive {drive.name} "

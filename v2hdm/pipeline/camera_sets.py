@@ -53,17 +53,9 @@ def map_camera_sets(
 ) -> dict[str, MappedSet]:
     """Map a drive with each set of cameras, where that is not known yet.
 
-    Args:
-        drive: what to map.
-        drive_key: of the drive and of what its images show.
-        detections: what was found in its images.
-        survey: control points for the mapping; check points, held against the finished map of all cameras.
-        base: an earlier map that is brought up to date with all cameras.
-        context: keeps the results, shows them, and maps the sets and what belongs to one visit of several.
-
-    Raises:
-        MappingError: no map can be made.
-        AdjustError: the adjustment fails.
+    ``drive_key`` is that of the drive and of what its images show. The check points of the survey are held
+    against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
+    no map can be made, AdjustError where the adjustment fails.
     """
     sets, cache, executor = camera_sets(drive), context.cache, context.executor or IN_PROCESS
     begun = cache.key(drive_key, list(detections), survey.mapping)

@@ -32,11 +32,7 @@ class DriveConfig(ReadOptions):
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The paths, none where the drive is rendered.
-
-        Raises:
-            ConfigError: ``path`` is neither a path nor a list of them.
-        """
+        """The paths, none where the drive is rendered; raises ConfigError where there is no path."""
         if not self.path:
             return ()
         listed = self.path if isinstance(self.path, list) else [self.path]
@@ -156,9 +152,7 @@ _RANGES = {
 def admit(config: RunConfig) -> str:
     """Refuse what cannot work before any long work; returns the run's name.
 
-    Raises:
-        ConfigError: The message names the key.
-        DetectorError: ``detector.model`` cannot be used.
+    Raises ConfigError, which names the key, or DetectorError where ``detector.model`` cannot be used.
     """
     from v2hdm.detection.detector import Detector
     from v2hdm.pipeline.survey import table_of
@@ -184,11 +178,7 @@ def admit(config: RunConfig) -> str:
 
 
 def check_choice(options: MappingOptions, drives: int, has_base: bool) -> None:
-    """Refuse settings of the mapping that do not go with so many drives, with an earlier map, or here.
-
-    Raises:
-        ConfigError: says which, and what to set.
-    """
+    """Raise ConfigError where settings do not go with so many drives, with an earlier map, or here."""
     if has_base and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if drives > 1 and options.mode == INCREMENTAL:
@@ -200,11 +190,7 @@ def check_choice(options: MappingOptions, drives: int, has_base: bool) -> None:
 
 
 def check_device(device: str) -> None:
-    """Refuse a device of torch that is not ``cpu`` or ``cuda``, or not there.
-
-    Raises:
-        ConfigError: says which.
-    """
+    """Raise ConfigError for a device of torch that is not ``cpu`` or ``cuda``, or not there."""
     import torch
 
     if device not in ("cpu", "cuda"):

@@ -80,14 +80,8 @@ Work = Callable[[RunConfig, StageCache], RunResult]
 def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) -> tuple[RunResult, bool]:
     """The result of a run in the place that its settings name, and whether it was there already.
 
-    Args:
-        config: of the run.
-        work: makes a result in folders of this machine.
-        take: whether a finished result of the same is taken.
-        progress: reports how far it is with its copies.
-
-    Raises:
-        V2hdmError: as ``work``; or a store does not work, or holds what is not ours.
+    ``work`` makes a result in folders of this machine; a finished one of the same is taken where ``take``
+    says so. Raises V2hdmError as ``work``; or a store does not work, or holds what is not ours.
     """
     output, folder = place_of(config.output, "output="), place_of(config.cache, "cache=")
     if isinstance(folder, RemoteFolder):

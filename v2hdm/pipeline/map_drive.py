@@ -120,11 +120,7 @@ def map_drive(
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
-    """Read several drives, each by the executor of ``context``, and join them.
-
-    Raises:
-        DriveError: one cannot be read, or they do not belong together.
-    """
+    """Read several drives, each by the executor of ``context``, and join them; raises DriveError."""
     executor = context.executor or IN_PROCESS
     with context.timed("read"):
         begun = [executor.begin(partial(_read_one, one, options)) for one in sources]

@@ -57,10 +57,7 @@ class CodecError(ValueError):
 def encode(value: Any) -> bytes:
     """The bytes of dataclasses, enumerations, paths, numpy arrays and plain values.
 
-    Equal values of one type and order have equal bytes.
-
-    Raises:
-        TypeError: it holds something that cannot be kept.
+    Equal values of one type and order have equal bytes. Raises TypeError for what cannot be kept.
     """
     data: bytes = _encoder().encode(value)
     return data
@@ -69,8 +66,7 @@ def encode(value: Any) -> bytes:
 def decode(data: bytes, kind: type[_Value]) -> _Value:
     """The value of type ``kind`` that :func:`encode` made ``data`` of; arrays are laid out row by row.
 
-    Raises:
-        CodecError: the bytes are of no such value.
+    Raises CodecError where the bytes are of no such value.
     """
     codec = _codec()
     try:

@@ -65,11 +65,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A hidden name beside ``path`` to write to, which takes its place when the block succeeds.
 
     Readers see the old file or the whole new one. After an error nothing new is left. The folder is created
-    when absent.
-
-    Raises:
-        ConfigError: ``path`` is an input of this command, or no plain file.
-        OSError: it cannot be written there; the error names ``path``.
+    when absent. Raises ConfigError where ``path`` is an input of this command, or no plain file, OSError,
+    which names it, where it cannot be written.
     """
     refuse_url(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,9 +113,8 @@ def file_digest(path: Path) -> str:
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.safe.texts.read_yaml`.
 
-    Raises:
-        V2hdmError: of type ``error``, when the file is missing, has a syntax error (with its line)
-            or holds anything but a mapping.
+    Raises ``error`` when the file is missing, has a syntax error (with its line) or holds anything but a
+    mapping.
     """
     content = read_yaml(path, error)
     if not isinstance(content, dict):

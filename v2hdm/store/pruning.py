@@ -31,15 +31,7 @@ LEFT = "left by killed runs"
 
 @dataclass(frozen=True)
 class Item:
-    """One thing that a cache keeps.
-
-    Attributes:
-        kind: a stage, or one of the kinds above.
-        path: of the file or folder.
-        size: in bytes.
-        used_s: its last use, s since 1970.
-        remove: its end; what is gone already is removed.
-    """
+    """One thing that a cache keeps: its kind, size in bytes, last use (s since 1970), and its end."""
 
     kind: str
     path: Path

@@ -62,8 +62,7 @@ def is_url(place: str) -> bool:
 def place_of(text: str, option: str) -> Path | RemoteFolder:
     """The folder or the store that the setting ``option`` names; ``file://`` names a folder.
 
-    Raises:
-        ConfigError: it is no place that we can write to.
+    Raises ConfigError where it is no place that we can write to.
     """
     if not is_url(text):
         return Path(text)
@@ -97,8 +96,7 @@ class RemoteFolder:
     def at(cls, url: str, option: str) -> RemoteFolder:
         """The objects below a URL.
 
-        Raises:
-            ConfigError: it names no store that we know, or what speaks to it is not installed.
+        Raises ConfigError where it names no store that we know, or what speaks to it is not installed.
         """
         protocol, rest = url.split("://", 1)
         if protocol not in _PACKAGES:
@@ -142,11 +140,7 @@ class RemoteFolder:
         return None
 
     def fetch(self, places: Mapping[str, Path]) -> None:
-        """Copy objects, by name, to files.
-
-        Raises:
-            ConfigError: one is not there, or the store failed.
-        """
+        """Copy objects, by name, to files; raises ConfigError where one is not there."""
         for path in places.values():
             path.parent.mkdir(parents=True, exist_ok=True)
         names = [f"{self._root}/{name}" for name in places]
@@ -181,11 +175,7 @@ class RemoteFolder:
                 self._files.put_file(str(content), f"{self._root}/{name}", mode=mode)
 
     def listed(self) -> dict[str, RemoteFile]:
-        """All objects, by name.
-
-        Raises:
-            ConfigError: there is no such bucket, or it cannot be listed.
-        """
+        """All objects, by name; raises ConfigError where there is no such bucket."""
         with self._asked(in_bucket=True):
             self._files.invalidate_cache()
             found = self._files.find(self._root, detail=True)
@@ -229,9 +219,8 @@ def _first_line(failure: Exception) -> str:
 def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
     """The folder in ``cache`` that holds what is below a URL now, copied once for each content it has had.
 
-    Raises:
-        DriveError: there is no drive, a name of it leads out of its folder, or the copy cannot be written.
-        ConfigError: the store failed.
+    Raises DriveError where there is no drive, a name of it leads out of its folder, or the copy cannot be
+    written.
     """
     there = {name: one for name, one in drive.listed().items() if not name.endswith("/")}
     if not there:
@@ -301,9 +290,8 @@ def is_whole_at(place: RemoteFolder) -> bool:
 def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
     """Our objects that are at a place where ``writer`` may put a result.
 
-    Raises:
-        ConfigError: there are objects and none is ours, one of ours was changed, another writer has begun to
-            put a result there, or the store failed.
+    Raises ConfigError where there are objects and none is ours, one of ours was changed, or another writer
+    has begun to put a result there.
     """
     there = place.listed()
     found = {name: _entries(place, name, place.read(name)) for name in (LIST, UNFINISHED) if name in there}
@@ -328,14 +316,9 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
 def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: str, report: Report) -> None:
     """Put a result in the place of an earlier one, whose objects that stay the same stay.
 
-    Args:
-        place: of the result.
-        contents: of objects by their names, as bytes or as files.
-        writer: who puts it; the same one may go on after it was stopped, another is refused.
-        report: called as it goes on.
-
-    Raises:
-        ConfigError: as :func:`refuse_upload`; or another's object has a name of ours.
+    ``contents`` are objects by name, as bytes or as files. The same ``writer`` may go on after it was
+    stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where another's object has a
+    name of ours.
     """
     new = {name: _Entry.of(name, content) for name, content in contents.items()}
     listing, ours = place.read(LIST), refuse_upload(place, writer)

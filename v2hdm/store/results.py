@@ -34,11 +34,8 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
     """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
 
     An earlier result stays untouched until then; after an error nothing new is left. Files of the user's in
-    an earlier result are kept. Errors name the ``option`` that says which folder it is.
-
-    Raises:
-        ConfigError: The folder cannot be written, holds something that is no earlier result of ours, or
-            another process is writing it.
+    an earlier result are kept. Raises ConfigError, which names the ``option`` of the folder, where it cannot
+    be written, holds something that is no earlier result of ours, or another process is writing it.
     """
     with locked_folder(folder, option) as target:
         unfinished, previous = _hidden(target, "part"), _hidden(target, "previous")
@@ -70,9 +67,8 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
 def added_to(folder: Path, option: str) -> Iterator[Path]:
     """A finished result to write further files into, each listed before it is there.
 
-    Raises:
-        ConfigError: the folder is no result of ours, a file that is to be replaced in it is not ours, it
-            cannot be written, or another process is writing it; the ``option`` says which folder it is.
+    Raises ConfigError where the folder is no result of ours, a file that is to be replaced in it is not ours,
+    it cannot be written, or another process is writing it.
     """
     with locked_folder(folder, option) as target:
         with _explained(folder, option):
@@ -86,10 +82,8 @@ def added_to(folder: Path, option: str) -> Iterator[Path]:
 def listed_files(folder: Path, option: str) -> Iterator[None]:
     """Within, each file that is written whole into a folder of ours is put on its list before it is there.
 
-    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well.
-
-    Raises:
-        ConfigError: a file that is to be replaced is not ours, or the folder cannot be written.
+    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well. Raises
+    ConfigError where a file that is to be replaced is not ours, or the folder cannot be written.
     """
     target = _resolved(folder, option)
     ours = _listed(target, folder, option) or {}
@@ -120,22 +114,14 @@ class GrowingFolder:
         return any((self._target / name).is_file() for name in files_of_result(self._target))
 
     def write(self, name: str, data: bytes) -> None:
-        """Write the file ``name``.
-
-        Raises:
-            ConfigError: it cannot be written, or there is a file of this name that is not ours.
-        """
+        """Write the file ``name``; raises ConfigError where that is not ours or cannot be."""
         with _explained(self._shown, self._option), whole_file(self._target / name) as partial:
             partial.write_bytes(data)
 
 
 @contextmanager
 def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
-    """``folder`` to write single files into, each listed before it is there.
-
-    Raises:
-        ConfigError: as :func:`result_folder`.
-    """
+    """``folder`` to write single files into, each listed first; errors as :func:`result_folder`."""
     with locked_folder(folder, option) as target:
         with _explained(folder, option):
             is_new = _listed(target, folder, option) is None
@@ -157,8 +143,7 @@ def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
 def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
     """Where ``folder`` leads, which no other process of ours writes within this block.
 
-    Raises:
-        ConfigError: one does already, which the message names; or it is nothing that can be replaced.
+    Raises ConfigError where one does already, which it names, or the folder is nothing that can be replaced.
     """
     target = _resolved(folder, option)
     with ExitStack() as stack:
@@ -283,11 +268,7 @@ def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> Non
 
 
 def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
-    """Digests of our files in ``target`` by their names, the last at the end; None if it is empty.
-
-    Raises:
-        ConfigError: it holds something and is not ours.
-    """
+    """Digests of our files in ``target`` by name, the last at the end; None if empty, an error if not ours."""
     if not target.exists() or not any(target.iterdir()):
         return None
     marker = target / LIST
