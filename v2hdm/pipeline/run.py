@@ -13,7 +13,7 @@ from pathlib import Path
 from v2hdm import __version__
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit
-from v2hdm.pipeline.context import Context, Viewer, log_file, logging_to
+from v2hdm.pipeline.context import Context, Unwatched, Viewer, log_file, logging_to
 from v2hdm.pipeline.finished import RunResult, note_finished, take_or_make
 from v2hdm.pipeline.keys import result_key
 from v2hdm.progress import Progress, silent
@@ -43,7 +43,7 @@ def run(
         from v2hdm.detection.network import check_device
 
         check_device(config.detector.device)
-        context = Context(progress=progress, **({} if viewer is None else {"viewer": viewer}))
+        context = Context(progress=progress, viewer=viewer or Unwatched())
         return map_and_save(config, cache, config_yaml, context)
 
     return take_or_make(config, work, config.resume and viewer is None, progress)[0]

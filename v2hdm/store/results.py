@@ -268,7 +268,7 @@ def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> Non
 
 
 def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
-    """Digests of our files in ``target`` by name, the last at the end; None if empty, an error if not ours."""
+    """Digests of our files in ``target`` by name, the last one last; None if empty, an error if not ours."""
     if not target.exists() or not any(target.iterdir()):
         return None
     marker = target / LIST
