@@ -21,27 +21,9 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.safe.texts import read_json, read_text, read_yaml, shown
+from v2hdm.io.safe.texts import read_json, read_yaml, shown
 from v2hdm.records import FloatArray
 from v2hdm.store.inputs import refuse_input
-
-__all__ = [
-    "check_keys",
-    "dump_yaml",
-    "file_digest",
-    "load_json",
-    "load_yaml",
-    "observed_writes",
-    "read_text",
-    "refuse_url",
-    "replace_text",
-    "take_array",
-    "take_choice",
-    "take_mapping",
-    "take_number",
-    "take_text",
-    "whole_file",
-]
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _LARGEST = sys.float_info.max
