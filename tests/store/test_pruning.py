@@ -143,18 +143,11 @@ def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path: Path) 
     assert not (folder / "drive.yaml").exists()
 
 
-def test_the_command_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_lists_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["cache", "list", "--cache", str(cache)]) == 0
     assert "detect" in capsys.readouterr().out
-    path = StageCache(cache).path("detect", KEYS[1])
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert run(["cache", "verify", "--cache", str(cache)]) == 0
-    printed = capsys.readouterr().out
-    assert str(path) in printed
-    assert "read 4 entries, 1 of them damaged" in printed
-    assert not path.exists()
     assert run(["cache", "prune", "--cache", str(cache), "--gb", "0"]) == 0
-    assert "removed 3 entries" in capsys.readouterr().out
+    assert "removed 4 entries" in capsys.readouterr().out
     assert not left(cache)
 
 

@@ -14,9 +14,9 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -258,23 +258,13 @@ def _advice(message: str, schema: type[Any]) -> str:
         return f"write {whole.group(1)}.0"
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
     if unknown:
-        known = _keys(schema)
+        from v2hdm.cli.keys_help import keys_of
+
+        leaves = [key.name.split(".") for key in keys_of(schema)]
+        known = dict.fromkeys(".".join(one[:end]) for one in leaves for end in range(1, len(one) + 1))
         leaf = unknown.group(1).split(".")[-1]
         near = difflib.get_close_matches(leaf, {key.split(".")[-1] for key in known}, n=1)
         names = [key for key in known if near and key.split(".")[-1] == near[0]]
         if names:
             return f"did you mean {' or '.join(names[:3])}?"
     return "--help lists the keys"
-
-
-def _keys(schema: type[Any], prefix: str = "") -> list[str]:
-    """All dotted keys below a dataclass."""
-    found = []
-    hints = get_type_hints(schema)
-    for item in fields(schema):
-        key = f"{prefix}{item.name}"
-        found.append(key)
-        for candidate in (hints[item.name], *get_args(hints[item.name])):
-            if is_dataclass(candidate) and isinstance(candidate, type):
-                found += _keys(candidate, f"{key}.")
-    return found

@@ -90,7 +90,7 @@ _SAYS = {
     "mosaic": "Show the ground of a result from above, before and after the optimisation.",
     "export": "Convert a map or a calibration to other formats.",
     "experiment": "Compare all methods on both ports, as the paper does.",
-    "cache": "List, verify or prune the cache of runs.",
+    "cache": "List or prune the cache of runs.",
     "fleet": "Map many drives, each described by a run file, on Ray.",
 }
 _EXTRAS = {"detect": None, "export": None, "cache": None, "fleet": "fleet"}

@@ -59,17 +59,15 @@ def map_camera_sets(
     """
     sets, cache, executor = camera_sets(drive), context.cache, context.executor or IN_PROCESS
     begun = cache.key(drive_key, list(detections), survey.mapping)
+    # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
+    elsewhere = executor if len(sets) > 1 and survey.mapping.device == "cpu" else IN_PROCESS
     jobs = []
-    for number, (name, cameras) in enumerate(sets.items()):
-        last = number == len(sets) - 1
-        of_last = (base, survey.check) if last else None
-        work = partial(
-            _map_set, drive, detections, name, cameras, survey, base if last else None, last, executor
-        )
-        # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
-        shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
-        begin = partial(executor.begin if shared_out else IN_PROCESS.begin, work)
-        jobs.append((cache.key(begun, name, cameras, of_last), begin))
+    for name, cameras in sets.items():
+        last = name == list(sets)[-1]
+        now = base if last else None
+        work = partial(_map_set, drive, detections, name, cameras, survey, now, last, executor)
+        key = cache.key(begun, name, cameras, (base, survey.check) if last else None)
+        jobs.append((key, partial(elsewhere.begin, work)))
     context.progress("map", 0, len(sets))
     found = {}
     for name, mapped in zip(sets, cache.get_or_make_each(STAGE, MappedSet, jobs), strict=True):

@@ -8,13 +8,13 @@ from __future__ import annotations
 import logging
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from v2hdm.store.cache import ENDING, checked
+from v2hdm.store.cache import ENDING
 from v2hdm.store.folders import LIST, is_stale, remove_ours, size_of
 from v2hdm.store.lock import STAGES, unused_before
 
@@ -90,14 +90,3 @@ def prune_to_limit(cache: Path, limit_gb: float) -> None:
             "%s: removed %d entries of %.1f GB that were not used for longest (cache_gb=%g)",
             cache, len(removed), size_gb, limit_gb,
         )  # fmt: skip
-
-
-def remove_damaged(items: Sequence[Item]) -> list[Item]:
-    """Read all entries among some items and remove those that are damaged; returns these."""
-    damaged = []
-    for item in items:
-        with suppress(OSError):
-            if item.kind not in (DRIVES, LEFT) and checked(item.path.read_bytes()) is None:
-                item.remove()
-                damaged.append(item)
-    return damaged
