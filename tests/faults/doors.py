@@ -17,11 +17,10 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration import write_camera_info
 from v2hdm.io.trajectory import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
-from v2hdm.store.cache import code_key
+from v2hdm.store.cache import checked, code_key
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text
 from v2hdm.store.inputs import LIST
 from v2hdm.store.lock import IN_USE, STAGES
-from v2hdm.store.cache import checked
 from v2hdm.store.pruning import DRIVES, LEFT, items_of
 
 IMAGES = 16
@@ -266,7 +265,7 @@ def cache_defects(cache: Path) -> list[str]:
     ]
     left = [item.path.name for item in items if item.kind == LEFT]
     entries = [item.path for item in items if item.kind not in (DRIVES, LEFT)]
-        damaged = [path.name for path in entries if checked(path.read_bytes()) is None]
+    damaged = [path.name for path in entries if checked(path.read_bytes()) is None]
     return [
         f"{what} in the cache: {names[:3]}"
         for what, names in (("half", left), ("damaged", damaged), ("strange", strange))

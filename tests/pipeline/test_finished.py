@@ -12,10 +12,10 @@ import pytest
 from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import finished
 from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
-from v2hdm.pipeline.finished import RunResult, note_finished, take_or_make
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
+from v2hdm.pipeline.run import RunResult, note_finished, take_or_make
+from v2hdm.store import remote
 from v2hdm.store.cache import StageCache, code_key, key_of
 from v2hdm.store.remote import RemoteFolder, download
 from v2hdm.store.results import result_folder
@@ -81,7 +81,7 @@ def test_a_result_whose_upload_failed_is_not_made_again(
         raise ConfigError("no network")
 
     with monkeypatch.context() as patch:
-        patch.setattr(finished, "upload", gone)
+        patch.setattr(remote, "upload", gone)
         with pytest.raises(ConfigError, match="no network"):
             take_or_make(config, work, True, quiet)
     assert not memory.below("results").listed()
@@ -107,15 +107,15 @@ def test_what_another_finishes_meanwhile_is_taken(config: RunConfig, tmp_path: P
 def test_two_processes_of_a_machine_do_not_upload_one_result_at_once(
     config: RunConfig, memory: RemoteFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    upload = finished.upload
+    upload = remote.upload
 
     def slowly(*arguments: Any) -> None:
-        monkeypatch.setattr(finished, "upload", upload)
+        monkeypatch.setattr(remote, "upload", upload)
         with pytest.raises(ConfigError, match="is being written by process"):
             take_or_make(config, Work(), True, quiet)
         upload(*arguments)
 
-    monkeypatch.setattr(finished, "upload", slowly)
+    monkeypatch.setattr(remote, "upload", slowly)
     assert not take_or_make(config, Work(), True, quiet)[1]
     assert memory.below("results/example").read("maps/map.geojson")
 

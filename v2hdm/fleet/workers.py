@@ -22,8 +22,7 @@ from v2hdm.fleet.cluster import DETECTORS_A_GPU
 from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.finished import RunResult, take_or_make
-from v2hdm.pipeline.run import map_and_save
+from v2hdm.pipeline.run import RunResult, map_and_save, take_or_make
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
 
