@@ -181,8 +181,8 @@ def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
         raise refuse("softness", "give a positive number")
     if not isinstance(said["group"], str):
         raise refuse("group", "give the name of a group")
-    ranges = [(float(low), float(high)) for low, high in (said["length_m"], said["width_m"])]
-    return MarkingClass(name, said["family"], *ranges, said["group"], float(said["softness"]))
+    length_m, width_m = ((float(low), float(high)) for low, high in (said["length_m"], said["width_m"]))
+    return MarkingClass(name, said["family"], length_m, width_m, said["group"], float(said["softness"]))
 
 
 def _is_number(value: object) -> bool:

@@ -137,10 +137,9 @@ def _clocks(drive: Drive, optimised: MethodResult, camera: str) -> dict[str, Any
     """A camera's clock offset and its sigma; of joined drives one a drive, by its name."""
     offsets: dict[str, dict[str, float | None]] = {"clock_offset_s": {}, "clock_sigma_s": {}}
     for visit, clocks in zip(drive.visits, optimised.clocks, strict=True):
-        if camera in clocks:
-            offsets["clock_offset_s"][visit.name] = clocks[camera].value_s
-            sigma_s = clocks[camera].sigma_s
-            offsets["clock_sigma_s"][visit.name] = sigma_s if np.isfinite(sigma_s) else None
+        if (clock := clocks.get(camera)) is not None:
+            offsets["clock_offset_s"][visit.name] = clock.value_s
+            offsets["clock_sigma_s"][visit.name] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
     if drive.joined:
         return dict(offsets)
     return {key: value for key, by_name in offsets.items() for value in by_name.values()}

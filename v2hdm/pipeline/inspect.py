@@ -110,10 +110,9 @@ def _started(drive: Drive, inspections: Sequence[Inspection]) -> dict[str, Camer
 def _has_moved(camera: str, before: Inspection, after: Inspection) -> bool:
     """Whether the ground of two drives says that a camera sits elsewhere, by the odds of the drift alarm."""
     found = [one.ground[0].get(camera) for one in (before, after)]
-    calibrations = [one.calibration for one in found if one is not None and one.status is GroundStatus.FOUND]
-    if len(calibrations) < 2 or any(one is None or one.covariance is None for one in calibrations):
-        return False
+    known = [one.calibration for one in found if one is not None and one.status is GroundStatus.FOUND]
+    sure = [one for one in known if one is not None and one.covariance is not None]
     try:
-        return movement(*(one for one in calibrations if one is not None)).moved
+        return len(sure) == 2 and movement(*sure).moved
     except MapFileError:  # the lenses differ, which the descriptions say as well
         return False
