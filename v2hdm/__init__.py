@@ -55,10 +55,13 @@ def __getattr__(name: str) -> Any:
     module = next((one for one, names in _HOMES.items() if name in names.split()), None)
     if module is None:
         raise AttributeError(f"module 'v2hdm' has no attribute '{name}'")
-    from v2hdm.extras import of_extra
-
-    with of_extra("map", f"v2hdm.{name}"):
+    try:
         home = importlib.import_module(f"v2hdm.{module}")
+    except ModuleNotFoundError as missing:
+        if (missing.name or "v2hdm").split(".")[0] == "v2hdm":
+            raise
+        line = f"v2hdm.{name} needs {missing.name}: install the map extra, pip install 'v2hdm[map]'"
+        raise ModuleNotFoundError(line, name=missing.name) from None
     globals()[name] = found = getattr(home, "HdMap" if name == "HDMap" else name)
     return found
 

@@ -166,6 +166,6 @@ def test_images_are_shown_as_they_are_looked_at(small_drive: Path, tmp_path: Pat
             shown.append([one.image for one in detections])
 
     for _ in range(2):
-        context = replace(Context.of(tmp_path, workers=1), viewer=Watching())
+        context = Context(StageCache(tmp_path), workers=1, viewer=Watching())
         detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), context)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

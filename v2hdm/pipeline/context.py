@@ -73,11 +73,6 @@ class Context:
     folder: Path = Path()
     seconds: dict[str, float] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, cache: str | Path | None, progress: Progress = silent, workers: int = 0) -> Context:
-        """The surroundings of a call from Python; without a ``cache`` folder nothing is kept."""
-        return cls(StageCache(None if cache is None else Path(cache)), progress, workers=workers)
-
     @property
     def processes(self) -> int:
         """The number of processes to work in."""

@@ -31,6 +31,7 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
+from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.solution import check_result
 from v2hdm.verdict.results.survey import check_known_sizes
@@ -94,7 +95,8 @@ def map_drive(
     >>> result.calibrations["front"].cam_from_vehicle.shape
     (4, 4)
     """
-    context = context or Context.of(cache, progress, workers)
+    kept = StageCache(None if cache is None else Path(cache))
+    context = context or Context(kept, progress, workers=workers)
     options, reading = options or MappingOptions(), reading or ReadOptions()
     settings = detector.options if isinstance(detector, Detector) else detector
     settings = settings or DetectorOptions.for_mapping()
