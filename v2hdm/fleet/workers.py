@@ -18,6 +18,7 @@ from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError, WorkerError, describe
+from v2hdm.executor import IN_PROCESS
 from v2hdm.fleet.cluster import DETECTORS_A_GPU
 from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline.config import RunConfig
@@ -193,6 +194,7 @@ def _mapped(
     # It loads torch, which a finished result does not need.
     from v2hdm.fleet.executor import RayExecutor
 
-    executor = RayExecutor(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
+    several = len(config.drive.paths) > 1
+    executor = RayExecutor(len(detectors), str(Path.cwd())) if several else IN_PROCESS
     context = Context(progress=report, detect=partial(detect_by, detectors), executor=executor)
     return map_and_save(config, cache, job.config_yaml, context)

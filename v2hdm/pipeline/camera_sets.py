@@ -57,7 +57,7 @@ def map_camera_sets(
     against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
     no map can be made, AdjustError where the adjustment fails.
     """
-    sets, cache, executor = camera_sets(drive), context.cache, context.executor or IN_PROCESS
+    sets, cache, executor = camera_sets(drive), context.cache, context.executor
     begun = cache.key(drive_key, list(detections), survey.mapping)
     # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
     elsewhere = executor if len(sets) > 1 and survey.mapping.device == "cpu" else IN_PROCESS

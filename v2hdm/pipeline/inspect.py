@@ -9,7 +9,6 @@ from functools import partial
 
 from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
-from v2hdm.executor import IN_PROCESS
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
@@ -63,11 +62,11 @@ def inspect_each(
     drives: Sequence[Drive], contents: Contents, max_gap_s: float, context: Context
 ) -> list[Inspection]:
     """As :func:`inspect` of each drive, or what it found before of the same, with the same log."""
-    jobs, executor, cache = [], context.executor or IN_PROCESS, context.cache
+    jobs, cache = [], context.cache
     for drive in drives:
         steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
         work = partial(inspect, drive, max_gap_s, context.processes, steps)
-        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(executor.begin, work)))
+        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(context.executor.begin, work)))
     return list(cache.get_or_make_each("check", Inspection, jobs))
 
 

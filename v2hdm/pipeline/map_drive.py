@@ -16,7 +16,6 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.executor import IN_PROCESS
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
@@ -131,9 +130,8 @@ def map_drive(
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
     """Read several drives, each by the executor of ``context``, and join them; raises DriveError."""
-    executor = context.executor or IN_PROCESS
     with context.timed("read"):
-        begun = [executor.begin(partial(_read_one, one, options)) for one in sources]
+        begun = [context.executor.begin(partial(_read_one, one, options)) for one in sources]
         found = [wait() for wait in begun]
     for drive, _ in found:
         _log.info(
