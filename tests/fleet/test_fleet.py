@@ -157,7 +157,7 @@ def test_a_drive_and_results_at_an_object_store_make_the_same_map(
     ray.kill(detectors[0])
 
     # Another drive's folder of the same content: what was detected is in the cache.
-    settings = [f"output={tmp_path / 'out'}", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'two'}"]
+    settings = [f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
     (job,) = plan([written(tmp_path, "good", drive)], settings).jobs
     row, trace = map_drive(job, [], progress, str(Path.cwd()))
     assert row.status == "PASS", (row, trace)
