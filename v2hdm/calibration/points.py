@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.safe.texts import read_text
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
+from v2hdm.store.files import read_text
 
 COLUMNS = ("u", "v", "x", "y")
 """Pixel (centre of the first at 0, 0) and place in the vehicle frame (x forward, y left, m)."""

@@ -13,9 +13,8 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion
-from v2hdm.io.safe.texts import read_text
 from v2hdm.records import FloatArray, GeodeticOrigin, IntArray, Trajectory
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import read_text, replace_text
 
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
 

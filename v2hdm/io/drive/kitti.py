@@ -22,7 +22,6 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.drive.images import ImageFiles, KittiOptions, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.safe.texts import read_text
 from v2hdm.io.trajectory import check_geodetic, pose_matrices
 from v2hdm.records import (
     Camera,
@@ -34,6 +33,7 @@ from v2hdm.records import (
     PoseNoise,
     Trajectory,
 )  # fmt: skip
+from v2hdm.store.files import read_text
 
 _log = logging.getLogger(__name__)
 

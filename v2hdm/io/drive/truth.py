@@ -13,10 +13,9 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.mounting import take_rigid
 from v2hdm.io.maps.reading import read_geojson
-from v2hdm.io.safe.texts import read_text
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth
-from v2hdm.store.files import check_keys, load_yaml, take_mapping, take_number
+from v2hdm.store.files import check_keys, load_yaml, read_text, take_mapping, take_number
 
 SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
 LANE_VISIBLE = ("lane", "vertex")

@@ -18,10 +18,9 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
-from v2hdm.io.safe.texts import read_text
 from v2hdm.io.trajectory import in_order, pose_matrices
 from v2hdm.records import FloatArray, Trajectory
-from v2hdm.store.files import check_keys, take_choice, take_mapping, take_text
+from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
 
 KITTI_KEYS, TABLE_KEYS = ("stamps", "axes"), ("columns",)
 

@@ -13,9 +13,16 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.features import ground_height_m
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
-from v2hdm.io.safe.texts import read_text
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Road
-from v2hdm.store.files import load_json, replace_text, take_array, take_mapping, take_number, take_text
+from v2hdm.store.files import (
+    load_json,
+    read_text,
+    replace_text,
+    take_array,
+    take_mapping,
+    take_number,
+    take_text,
+)
 
 FILE = "residuals.csv"  # in a result folder
 

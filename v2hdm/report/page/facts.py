@@ -21,11 +21,10 @@ from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of
-from v2hdm.io.safe.texts import read_text
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
 from v2hdm.report.metrics import way_along
-from v2hdm.store.files import load_json, load_yaml
+from v2hdm.store.files import load_json, load_yaml, read_text
 
 BEST = "Opt"
 """The method whose map is the run's result, as ``metrics.json`` names it."""
