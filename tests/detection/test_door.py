@@ -16,7 +16,6 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.cli import detect_files as watch
 from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
@@ -292,7 +291,6 @@ class FullDevice(io.StringIO):
 
 def test_a_full_standard_output_is_one_line(bench, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdout", FullDevice())
-    monkeypatch.setattr(watch, "forget_stdout", lambda: None)
     assert bench.run(bench.folder) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: standard output: cannot be written (No space left")

@@ -7,15 +7,12 @@ explains the points and by where cameras sit on vehicles. The likeliest one is n
 
 from __future__ import annotations
 
-import argparse
 import csv
-import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from scipy.spatial import ConvexHull
 
@@ -23,17 +20,15 @@ from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
 from v2hdm.calibration.picture import save_picture
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
-from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.calibration import Provenance, write_calibration, write_camera_info
-from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.records import Calibration, CameraInfo, FloatArray
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.store.files import dump_yaml
-from v2hdm.verdict.verdict import Status, Verdict
+from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
 POINTS_FILE = "points.csv"
@@ -108,9 +103,22 @@ def calibrate_from_points(
         pixel_sigma: standard deviation of clicking, px a coordinate.
         survey_sigma: standard deviation of surveying, m a coordinate.
 
+    Returns:
+        ``calibration.cam_from_vehicle`` (4, 4), its covariance (6, 6) in m and rad, and a verdict.
+
     Raises:
         DriveError: a point is impossible, or the points fit no mounting; the message names the cause.
+        ConfigError: a standard deviation is no number, negative, or both are 0.
+
+    >>> found = calibrate_from_points(points, port.cameras["front"].info)
+    >>> found.verdict.status.value, found.calibration.covariance.shape
+    ('PASS', (6, 6))
     """
+    for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
+        if not (np.isfinite(value) and value >= 0):
+            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
+    if pixel_sigma == survey_sigma == 0:
+        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
     table = points if isinstance(points, SurveyedPoints) else read_points(Path(points))
     check_points(table, info)
     fits = solve(table, info, Noise(pixel_sigma, survey_sigma))
@@ -201,63 +209,6 @@ def _readings(points: SurveyedPoints, info: CameraInfo) -> Iterator[tuple[str, F
     for scale in _SCALES:
         size = f"the pixels are of an image {1 / scale:.3g} times as large as that of the intrinsics"
         yield f"{size}; give both for one size", (px + 0.5) * scale - 0.5, ground
-
-
-def calibrate_camera(parsed: argparse.Namespace) -> bool:
-    """Calibrate, print the result with the verdict on it, and write it.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.calibrate`.
-
-    Returns:
-        Whether the verdict is FAIL.
-
-    Raises:
-        V2hdmError: the points or the intrinsics cannot be used, or the results cannot be written.
-    """
-    cv2.setNumThreads(1)
-    _check_sigmas(parsed.pixel_sigma, parsed.survey_sigma)
-    info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
-    info = replace(info, name=parsed.name or info.name)
-    if "/" in info.name or info.name in ("", ".", ".."):
-        raise ConfigError(f"the camera is called {info.name!r}, which is no file name; give another --name")
-    points = read_points(parsed.points)
-    image = None if parsed.image is None else _image(parsed.image, info)
-    sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
-    found = calibrate_from_points(points, info, **sigmas)
-    folder = parsed.output or Path("outputs") / f"{info.name}-calibrate"
-    with result_folder(folder) as unfinished:
-        settings = {
-            "points": str(parsed.points),
-            "intrinsics": str(parsed.intrinsics),
-            "image": None if parsed.image is None else str(parsed.image),
-            **sigmas,
-        }
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_point_calibration(found, unfinished, image)
-    for line in summary_lines(found):
-        print(line)
-    print(f"results in {folder}")
-    return found.verdict.status is Status.FAIL
-
-
-def _check_sigmas(pixel_sigma: float, survey_sigma: float) -> None:
-    for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
-        if not (np.isfinite(value) and value >= 0):
-            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
-    if pixel_sigma == survey_sigma == 0:
-        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
-
-
-def _image(path: Path, info: CameraInfo) -> np.ndarray:
-    image = read_bgr(path)
-    rows, columns = image.shape[:2]
-    if (columns, rows) != (info.width, info.height):
-        raise DriveError(
-            f"{path}: the image is {columns} x {rows}, but the intrinsics of '{info.name}' are for "
-            f"{info.width} x {info.height}; give both for one size"
-        )
-    return image
 
 
 _COLUMNS = (

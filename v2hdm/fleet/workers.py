@@ -18,12 +18,12 @@ from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError, WorkerError, describe
+from v2hdm.executor import IN_PROCESS
 from v2hdm.fleet.cluster import DETECTORS_A_GPU
 from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.finished import RunResult, take_or_make
-from v2hdm.pipeline.run import map_and_save
+from v2hdm.pipeline.run import RunResult, map_and_save, take_or_make
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
 
@@ -92,7 +92,7 @@ class DetectorActor:
             if not root.exists():
                 raise DriveError(
                     f"{root}: is not on {os.uname().nodename}, which is to detect in its images; put drives, "
-                    "and local_cache for those that are copied, on a folder that all machines share"
+                    "and the cache for those that are copied, on a folder that all machines share"
                 )
         if known not in self._detectors:
             self._detectors = {known: Detector.load(options=options)}
@@ -194,6 +194,7 @@ def _mapped(
     # It loads torch, which a finished result does not need.
     from v2hdm.fleet.executor import RayExecutor
 
-    executor = RayExecutor(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
+    several = len(config.drive.paths) > 1
+    executor = RayExecutor(len(detectors), str(Path.cwd())) if several else IN_PROCESS
     context = Context(progress=report, detect=partial(detect_by, detectors), executor=executor)
     return map_and_save(config, cache, job.config_yaml, context)

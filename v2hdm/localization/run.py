@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import logging
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -22,9 +17,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.io.calibration import trusted_calibrations
-from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
 from v2hdm.records import (
@@ -37,8 +30,7 @@ from v2hdm.records import (
     IntArray,
     Trajectory,
 )
-from v2hdm.report.outputs import result_folder, write_json
-from v2hdm.settings import check_workers
+from v2hdm.report.outputs import write_json
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
 _START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
@@ -129,27 +121,36 @@ class Localised:
 
 def localize(
     hd_map: HdMap,
-    drive: Drive,
+    drive: Drive | str | Path,
     calibrations: Mapping[str, Calibration],
     *,
     detections: Sequence[ImageDetections] | None = None,
-    workers: int = 1,
+    workers: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Localised:
-    """Follow the vehicle through a drive by the map's markings; of the recorded poses only the first is used.
+    """Follow the vehicle through a drive by a map's markings; only the first recorded pose is used.
 
     Args:
         hd_map: in the frame of the drive's poses.
-        drive: with the images.
-        calibrations: of the map's cameras, by name.
+        drive: the drive, or its folder.
+        calibrations: of its cameras, by name, as a result has them.
         detections: of the drive's images, made here if not given.
-        workers: processes that detect.
+        workers: processes that detect; 0 takes one per core.
         progress: called as ``progress(done, total)`` images.
+
+    Returns:
+        ``states`` at ``stamp_s`` (F,), ``error`` against the recorded poses and ``sigma`` (F, 3): ahead, m,
+        to the left, m, and heading, rad.
 
     Raises:
         MapFileError: map, calibrations and drive do not belong together.
         MappingError: the images hold no marking.
+
+    >>> found = localize(result.map, port, result.calibrations, detections=result.detections)
+    >>> found.error.shape == found.sigma.shape == (len(found.stamp_s), 3)
+    True
     """
+    drive, workers = as_drive(drive), workers or os.cpu_count() or 1
     check_together(hd_map, calibrations, drive)
     if detections is None:
         detections = detect_all(
@@ -243,38 +244,6 @@ def _in_view(
     return out
 
 
-def localise_drive(parsed: argparse.Namespace) -> bool:
-    """Localise a drive in a map, print the figures and write them with poses and picture.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.localize`.
-
-    Returns:
-        Whether the map explains the drive.
-
-    Raises:
-        V2hdmError: map, calibrations or drive cannot be read or do not belong together.
-    """
-    check_workers(parsed.workers)
-    logging.basicConfig(format="%(message)s")
-    cv2.setNumThreads(1)
-    hd_map = read_geojson(parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map)
-    calibrations = trusted_calibrations(parsed.map if parsed.map.is_dir() else parsed.map.parent)
-    drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
-    check_together(hd_map, calibrations, drive)
-    folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
-    with result_folder(folder, "--output") as unfinished:
-        workers = parsed.workers or os.cpu_count() or 1
-        found = localize(hd_map, drive, calibrations, workers=workers, progress=_report_progress)
-        settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_localised(found, drive, unfinished)
-    for line in summary_lines(found):
-        print(line)
-    print(f"results in {folder}")
-    return found.explained
-
-
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
     """Write figures, poses and the picture of the errors into a folder."""
     write_json(folder / "localization.json", found.figures())
@@ -299,11 +268,6 @@ def summary_lines(found: Localised) -> list[str]:
             "where its first pose says?"
         )
     return lines
-
-
-def _report_progress(done: int, total: int) -> None:
-    if done == total or done % 50 == 0:
-        print(f"looked at {done} of {total} images", file=sys.stderr, flush=True)
 
 
 def save_errors(path: Path, found: Localised, sigma: FloatArray) -> None:

@@ -15,9 +15,8 @@ from v2hdm.detection.batch import detect_images
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.errors import AdjustError, MappingError, V2hdmError
-from v2hdm.executor import IN_PROCESS
-from v2hdm.io.drive import ReadOptions, join_drives, read_drive
+from v2hdm.errors import AdjustError, MappingError
+from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
@@ -31,7 +30,7 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.site.changes import Base
+from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.solution import check_result
 from v2hdm.verdict.results.survey import check_known_sizes
@@ -95,39 +94,44 @@ def map_drive(
     >>> result.calibrations["front"].cam_from_vehicle.shape
     (4, 4)
     """
-    context = context or Context.of(cache, progress, workers)
+    kept = StageCache(None if cache is None else Path(cache))
+    context = context or Context(kept, progress, workers=workers)
     options, reading = options or MappingOptions(), reading or ReadOptions()
     settings = detector.options if isinstance(detector, Detector) else detector
     settings = settings or DetectorOptions.for_mapping()
     sources = [drive] if isinstance(drive, Source) else list(drive)
     check_choice(options, len(sources), base is not None)
     read = read_all(sources, reading, context)
-    earlier, survey = _given(read.whole, options, base)
-    checked = _check(read, reading, context)
-    about = describe_run(name or read.whole.name, read.whole, _paths(sources), reading)
+    earlier = None if base is None else read_base(Path(base))
+    if earlier is not None:
+        check_together(earlier, read.whole, str(base))
+    survey = take_survey(read.whole, options)
+    with context.timed("check"):
+        checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+    paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
+    about = describe_run(name or read.whole.name, read.whole, paths, reading)
     unjudged = Result(
         about, read.drives, read.contents, checked.drive_as_described, context.seconds, options.device
     )
     try:
         with closing(context.viewer):
             detections = _detect(checked.drive, read.contents, settings, context)
-            sets = _associate_and_adjust(checked.drive, read.contents, detections, survey, earlier, context)
+            with context.timed("map"):
+                key = read.contents.key(checked.drive)
+                sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
     except (MappingError, AdjustError) as failure:
         if not checked.has_failed:
             raise
-        return _without_map(unjudged, checked, failure)
+        failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
+        verdict = Verdict.of([*checked.findings, failed])
+        return replace(unjudged, verdict=verdict, figures={"results": {}})
     return _judge(unjudged, checked, detections, sets, survey, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
-    """Read several drives, each by the executor of ``context``, and join them.
-
-    Raises:
-        DriveError: one cannot be read, or they do not belong together.
-    """
-    executor = context.executor or IN_PROCESS
+    """Read several drives, each by the executor of ``context``, and join them; raises DriveError."""
     with context.timed("read"):
-        begun = [executor.begin(partial(_read_one, one, options)) for one in sources]
+        begun = [context.executor.begin(partial(_read_one, one, options)) for one in sources]
         found = [wait() for wait in begun]
     for drive, _ in found:
         _log.info(
@@ -139,25 +143,8 @@ def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) 
 
 
 def _read_one(source: Source, options: ReadOptions) -> tuple[Drive, Contents]:
-    drive = source if isinstance(source, Drive) else read_drive(Path(source), options)
+    drive = as_drive(source, options)
     return drive, Contents.of([drive])
-
-
-def _paths(sources: Sequence[Source]) -> list[Path]:
-    return [one.root if isinstance(one, Drive) else Path(one) for one in sources]
-
-
-def _given(drive: Drive, options: MappingOptions, base: Path | str | None) -> tuple[Base | None, Survey]:
-    """The earlier map and the survey: what does not belong to the drive is refused before any long work."""
-    earlier = None if base is None else read_base(Path(base))
-    if earlier is not None:
-        check_together(earlier, drive, str(base))
-    return earlier, take_survey(drive, options)
-
-
-def _check(read: Read, reading: ReadOptions, context: Context) -> Inspection:
-    with context.timed("check"):
-        return join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
 
 
 def _detect(
@@ -177,18 +164,6 @@ def _detect(
     return detections
 
 
-def _associate_and_adjust(
-    drive: Drive,
-    contents: Contents,
-    detections: Sequence[ImageDetections],
-    survey: Survey,
-    base: Base | None,
-    context: Context,
-) -> dict[str, MappedSet]:
-    with context.timed("map"):
-        return map_camera_sets(drive, contents.key(drive), detections, survey, base, context)
-
-
 def _judge(
     result: Result,
     checked: Inspection,
@@ -205,11 +180,8 @@ def _judge(
         verdict = Verdict.of([*checked.findings, *found, *unfit, *check_survey(survey, best, compared)])
     with context.timed("evaluate"):
         judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
-    figures = {
-        **judgement.metrics,
-        **({} if best.changes is None else {"changes": changes_json(best.changes)}),
-    }
-    figures["seconds"] = context.seconds
+    changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
+    figures = {**judgement.metrics, **changes, "seconds": context.seconds}
     headlines = tuple(judgement.headlines)
     if compared is not None:
         figures["check_points"] = compared.figures()
@@ -224,9 +196,3 @@ def _judge(
         judgement=judgement,
         check_points=compared,
     )
-
-
-def _without_map(result: Result, checked: Inspection, failure: V2hdmError) -> Result:
-    """The result of a drive whose checks failed and of which no map came."""
-    failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
-    return replace(result, verdict=Verdict.of([*checked.findings, failed]), figures={"results": {}})

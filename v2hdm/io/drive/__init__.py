@@ -36,14 +36,23 @@ READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions]
 """Formats by name: whether a path looks like one, and what makes a drive of it."""
 
 
-def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
-    """Read the drive at ``path`` in whatever format it is.
+def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
+    """Read a drive: a folder with ``drive.yaml``, KITTI raw, nuScenes or a bag.
 
-    Every image gets the vehicle's pose at its time: position linear, rotation slerp, never extrapolated, not
-    across a gap longer than ``options.max_gap_s``; images without a pose are dropped with a logged count. All
+    Every image gets the vehicle's pose at its time, ``map_from_vehicle`` (4, 4): position linear, rotation
+    slerp, never extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are
+    dropped with a logged count. The frame ``map`` is east, north, up, m; a sloping road is laid flat. All
     image files are checked for presence, completeness and size, then ``options.start_s``, ``end_s`` and
-    ``limit`` select some of them. Raises DriveError, with the place and the remedy.
+    ``limit`` select some of them.
+
+    Raises:
+        DriveError: names what is wrong, where, and what to do about it.
+
+    >>> drive = read_drive(port.root)
+    >>> list(drive.cameras), drive.images[0].map_from_vehicle.shape
+    (['front'], (4, 4))
     """
+    path = Path(path)
     options = options or ReadOptions()
     if not path.exists():
         raise DriveError(f"{path}: no such drive folder or bag; check drive.path")
@@ -56,6 +65,11 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
             return part_of(read(path, options), options)
     known = ", ".join(READERS)
     raise DriveError(f"{path}: not a drive in any known format ({known}); see docs/drive-format.md")
+
+
+def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> Drive:
+    """The drive itself, or that in a folder, read."""
+    return drive if isinstance(drive, Drive) else read_drive(drive, options)
 
 
 def drive_name(path: Path) -> str:
