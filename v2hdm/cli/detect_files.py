@@ -17,7 +17,7 @@ import numpy as np
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import as_record, draw_detections
-from v2hdm.detection.stopwatch import Stopwatch
+from v2hdm.detection.stopwatch import TOTAL, Stopwatch
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.pipeline.detect_images import Detected, detect_images
@@ -146,8 +146,8 @@ def _report(stopwatch: Stopwatch) -> None:
     stages = [stage for stage in _STAGES if stage in stopwatch.stages]
     stages += [stage for stage in stopwatch.stages if stage not in _STAGES]
     times_s = {stage: stopwatch.times_s(stage) for stage in stages}
-    times_s["other"] = stopwatch.total_s() - sum(times_s.values())
-    times_s["all"] = stopwatch.total_s()
+    times_s["other"] = stopwatch.times_s(TOTAL) - sum(times_s.values())
+    times_s[TOTAL] = stopwatch.times_s(TOTAL)
     for stage, seconds in times_s.items():
         p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
         print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)

@@ -46,40 +46,32 @@ _MARGIN_PX = 6
 """The network sees an edge this far from where it is."""
 
 
-def learn_own_vehicle(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:
+def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:
     """Where (height, width) a camera's images, in driving order, show its vehicle; None for nowhere."""
-    chosen = _spread_out(images)
-    if len(chosen) < _LEAST_IMAGES:
-        return None
-    total: np.ndarray | None = None
-    for image in chosen:
-        pixels = read_bgr(image.path)
-        if pixels.shape[:2] != (camera.info.height, camera.info.width):
-            return None
-        paint = detector.markings_paint(pixels, camera)
-        total = paint.astype(np.int32) if total is None else total + paint
-    assert total is not None
-    always = total >= _SHARE * len(chosen)
-    if not always.any():
-        return None
-    top, stride = detector.road_camera(camera).far_row, detector.network.info.paint_stride
-    mask = np.zeros((camera.info.height, camera.info.width), dtype=np.uint8)
-    grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
-    rows, columns = min(len(grown), len(mask) - top), min(grown.shape[1], mask.shape[1])
-    mask[top : top + rows, :columns] = grown[:rows, :columns]
-    size = 2 * _MARGIN_PX + 1
-    return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
-
-
-def _spread_out(images: Sequence[Image]) -> list[Image]:
-    """Up to :data:`_IMAGES` images, evenly spread over those taken far enough apart."""
     apart: list[Image] = []
     for image in images:
         place = image.map_from_vehicle[:2, 3]
         if not apart or np.linalg.norm(place - apart[-1].map_from_vehicle[:2, 3]) >= _APART_M:
             apart.append(image)
-    at = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
-    return [apart[k] for k in at.tolist()]
+    chosen = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
+    if len(chosen) < _LEAST_IMAGES:
+        return None
+    shape, painted = (camera.info.height, camera.info.width), []
+    for k in chosen.tolist():
+        pixels = read_bgr(apart[k].path)
+        if pixels.shape[:2] != shape:
+            return None
+        painted.append(detector.markings_paint(pixels, camera))
+    always = np.sum(painted, axis=0) >= _SHARE * len(chosen)
+    if not always.any():
+        return None
+    top, stride = detector.road_camera(camera).far_row, detector.network.info.paint_stride
+    mask = np.zeros(shape, dtype=np.uint8)
+    grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
+    rows, columns = min(len(grown), len(mask) - top), min(grown.shape[1], mask.shape[1])
+    mask[top : top + rows, :columns] = grown[:rows, :columns]
+    size = 2 * _MARGIN_PX + 1
+    return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
@@ -157,7 +149,7 @@ def own_vehicles(drive: Drive, detector: Detector) -> dict[str, BoolArray]:
     for name, camera in drive.cameras.items():
         if camera.own_vehicle is not None:
             continue
-        mask = learn_own_vehicle(detector, [image for image in drive.images if image.camera == name], camera)
+        mask = _learn(detector, [image for image in drive.images if image.camera == name], camera)
         if mask is not None:
             masks[name] = mask
             _log.info("camera %s: %.1f %% of the image is the vehicle itself", name, 100 * mask.mean())

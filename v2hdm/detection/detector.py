@@ -89,10 +89,10 @@ class Detector:
         mask = camera.own_vehicle
         if mask is None:
             return output
-        first, stride = np.array([output.top, 0]), output.stride
+        stride = output.stride
         rows, columns = (
-            np.minimum(stride * np.arange(count) + stride // 2 + start, last - 1)
-            for count, start, last in zip(output.paint.shape, first.tolist(), mask.shape, strict=True)
+            np.minimum(stride * np.arange(count) + stride // 2 + first, last - 1)
+            for count, first, last in zip(output.paint.shape, (output.top, 0), mask.shape, strict=True)
         )
         paint = np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), output.paint)
         return replace(output, paint=paint)

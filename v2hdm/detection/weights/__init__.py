@@ -43,9 +43,8 @@ def check_weights(folder: Path = FOLDER) -> None:
     Raises:
         DetectorError: a file is missing, is not the one of the manifest, or goes with another network.
     """
-    problem = None if _being_fitted else _problem(folder)
-    if problem is not None:
-        raise DetectorError(problem)
+    if not _being_fitted:
+        _check(folder)
 
 
 @contextmanager
@@ -100,19 +99,16 @@ def digest(path: Path) -> str:
 
 
 @cache
-def _problem(folder: Path) -> str | None:
-    """The defect of a folder's files, in one line; None if they belong together."""
+def _check(folder: Path) -> None:
     files = read_manifest(folder)["files"]
-    network = files[NETWORK_FILE.name]["sha256"]
     for name, command in COMMANDS.items():
-        path = folder / name
+        path, problem = folder / name, None
         if not path.is_file():
-            return f"{path}: no such file; install v2hdm again, or make it with `{command}`"
-        if digest(path) != files[name]["sha256"]:
-            return (
-                f"{path}: not the file of the manifest beside it; restore both from one commit, or make it "
-                f"with `{command}`"
-            )
-        if files[name]["network"] != network:
-            return f"{path}: was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
-    return None
+            problem = f"no such file; install v2hdm again, or make it with `{command}`"
+        elif digest(path) != files[name]["sha256"]:
+            problem = "not the file of the manifest beside it; restore both from one commit, or make it with "
+            problem += f"`{command}`"
+        elif files[name]["network"] != files[NETWORK_FILE.name]["sha256"]:
+            problem = f"was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
+        if problem:
+            raise DetectorError(f"{path}: {problem}")
