@@ -106,20 +106,13 @@ def blurred_coverage(
     # A wider blur is a smaller picture: each side comes nearer to the pixel in proportion to its distance.
     np.multiply(sides, across, out=share).sum(axis=1, out=derivative[:, 8])
     sides -= ends
-    return _coverage(placed), derivative
-
-
-def _coverage(placed: np.ndarray) -> np.ndarray:
-    """Coverage (M, N) from the pixels' distance, and the sides' starts and ends (3, M, 4, N), overwritten."""
-    pixels = placed.shape[-1]
-    across = placed[0]
     inside = (across < 0).all(axis=1)
     sign = np.copysign(np.float32(1), across)
     np.abs(across, out=across)
     placed[1:] += np.float32(_REACH)
     placed *= np.float32(_CELLS_PER_BLUR)
     np.clip(placed, 0, _LAST_CELL, out=placed)
-    row, start, end = placed.reshape(3, -1, pixels)
+    row, start, end = placed.reshape(3, -1, placed.shape[-1])
     # Borders are slow in OpenCV; the indices were kept inside.
     sign *= np.subtract(
         cv2.remap(owen_table(), end, row, cv2.INTER_LINEAR),
@@ -127,7 +120,7 @@ def _coverage(placed: np.ndarray) -> np.ndarray:
     ).reshape(sign.shape)
     coverage = sign.sum(axis=1)
     coverage += inside
-    return np.asarray(coverage)
+    return coverage, derivative
 
 
 @cache
