@@ -67,7 +67,13 @@ class RoadCamera:
         self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
         self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
         self.distorted = has_distortion(camera.info)
-        self._pinhole_lut = _build_pinhole_lut(camera.info) if self.distorted else None
+        # The pinhole pixel of every few recorded ones, one cell beyond the image's far border.
+        columns, rows = (
+            np.arange(0, last + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
+            for last in (self.info.width, self.info.height)
+        )
+        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
+        self._pinhole_lut = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
         self._ground_from_pinhole_px = facing_ipm(
             self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
         )
@@ -75,7 +81,9 @@ class RoadCamera:
         ahead, left, _ = cam_from_vehicle[2, :3]
         self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
         self.foot_vehicle = camera_centre(cam_from_vehicle)[:2]
-        self.top = self._top_row(multiple)
+        on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
+        height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
+        self.top = self.info.height - min(-(-height // multiple) * multiple, self.info.height)
         spare = max(self.first_row_within(FARTHEST_M) - _SURROUNDINGS_PX - self.top, 0)
         self.far_row = self.top + spare // multiple * multiple
         self.fine_row = self._fine_row()
@@ -83,7 +91,7 @@ class RoadCamera:
     def undistort(self, points_px: FloatArray) -> FloatArray:
         """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-2 px of the lens model."""
         points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
-        if self._pinhole_lut is None or not len(points):
+        if not self.distorted or not len(points):
             return points.copy()
         rows, columns = self._pinhole_lut.shape[:2]
         cell = points / _LUT_STEP_PX
@@ -183,28 +191,13 @@ class RoadCamera:
         rows = np.arange(self.info.height, dtype=np.float64)
         return self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
 
-    def _top_row(self, multiple: int) -> int:
-        on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
-        height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
-        return self.info.height - min(-(-height // multiple) * multiple, self.info.height)
-
     def _fine_row(self) -> int | None:
-        middle = (self.info.width - 1) / 2
         rows = np.arange(self.top, self.info.height, dtype=np.float64)
-        left, right = (
-            self.unproject(np.column_stack([np.full_like(rows, middle + side), rows])) for side in (-0.5, 0.5)
-        )
-        coarse = ~(np.linalg.norm(right - left, axis=1) <= FINE_ENOUGH_M)
+        columns = (self.info.width - 1) / 2 + np.array([-0.5, 0.5])
+        ends = self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
+        coarse = ~(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) <= FINE_ENOUGH_M)
         first = int(np.flatnonzero(coarse)[-1]) + 1 if coarse.any() else 0
         return self.top + first if first < len(rows) else None
-
-
-def _build_pinhole_lut(info: CameraInfo) -> FloatArray:
-    """Pinhole pixel of every ``_LUT_STEP_PX``-th recorded pixel, one cell beyond the image's far border."""
-    columns = np.arange(0, info.width + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
-    rows = np.arange(0, info.height + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
-    grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
-    return undistort_points(info, grid_px.reshape(-1, 2)).reshape(*grid_px.shape)
 
 
 @dataclass(frozen=True)
@@ -222,9 +215,8 @@ class GroundPoints:
 
     def __getitem__(self, part: slice) -> GroundPoints:
         """Some of the points."""
-        return GroundPoints(
-            self.points_vehicle[part], self.by_px[part], self.by_mounting[part], self.mounting_covariance
-        )
+        points = self.points_vehicle[part], self.by_px[part], self.by_mounting[part]
+        return GroundPoints(*points, self.mounting_covariance)
 
     def joint_covariance(self, covariance_px: FloatArray) -> FloatArray:
         """Covariance (2N, 2N), m^2, of the stacked points (x0, y0, x1, ...).
@@ -237,16 +229,14 @@ class GroundPoints:
         blocks[range(count), :, range(count)] = self.by_px
         jacobian = blocks.reshape(2 * count, 2 * count)
         stacked = self.by_mounting.reshape(2 * count, 6)
-        return np.asarray(
-            jacobian @ covariance_px @ jacobian.T + stacked @ self.mounting_covariance @ stacked.T
-        )
+        mounting = stacked @ self.mounting_covariance @ stacked.T
+        return np.asarray(jacobian @ covariance_px @ jacobian.T + mounting)
 
     def single_covariances(self, sigma_px: float | FloatArray) -> FloatArray:
         """Covariance (N, 2, 2), m^2, of points whose pixels are off by ``sigma_px``, one or (N,)."""
         covariance = np.square(sigma_px)[..., None, None] * self.by_px @ np.swapaxes(self.by_px, 1, 2)
-        return np.asarray(
-            covariance + self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
-        )
+        mounting = self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
+        return np.asarray(covariance + mounting)
 
 
 def _inverse(matrices: FloatArray) -> FloatArray:
@@ -319,18 +309,16 @@ def camera_from_calibration(calibration: Calibration, linear_response: bool = Fa
     Raises:
         MapFileError: the calibration cannot be that of a camera that looks at the ground.
     """
-    info = calibration.info
+    info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
     problem = _problem(calibration)
+    if not problem:
+        below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
+        lowest = apply_in_front(ground_from_pinhole_px(info.intrinsic, cam_from_vehicle), below_px)[0]
+        if not np.isfinite(lowest).all():
+            problem = "the image's lowest row is above the horizon; mend cam_from_vehicle"
     if problem:
         raise MapFileError(f"calibration of camera '{info.name}': {problem}")
-    ipm = ipm_from_extrinsic(info, calibration.cam_from_vehicle)
-    below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
-    lowest = apply_in_front(ground_from_pinhole_px(info.intrinsic, calibration.cam_from_vehicle), below_px)[0]
-    if not np.isfinite(lowest).all():
-        raise MapFileError(
-            f"calibration of camera '{info.name}': the image's lowest row is above the horizon; "
-            "mend cam_from_vehicle"
-        )
+    ipm = ipm_from_extrinsic(info, cam_from_vehicle)
     roi_vehicle = lowest + _BELOW_M * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     return Camera(info, {"calibrated": ipm}, "calibrated", roi_vehicle, linear_response=linear_response)
 
@@ -366,11 +354,8 @@ def _problem(calibration: Calibration) -> str | None:
         return "image size and focal lengths must be positive; mend them"
     if np.abs(cam_from_vehicle).max() > _FARTHEST_MOUNT_M:
         return f"cam_from_vehicle puts the camera beyond {_FARTHEST_MOUNT_M:g} m from the vehicle; mend it"
-    if (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or np.linalg.det(rotation) < 0
-        or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1])
-    ):
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ROTATION_TOLERANCE
+    if not rigid or np.linalg.det(rotation) < 0 or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1]):
         return "cam_from_vehicle is no rotation and translation; write it again with `python -m v2hdm.map`"
     if camera_centre(cam_from_vehicle)[2] <= 0:
         return "cam_from_vehicle puts the camera on or under the ground; mend it"

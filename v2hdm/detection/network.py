@@ -246,7 +246,7 @@ def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     kinds = (one.kinds + other.kinds[..., ::-1]) / 2
     (odds, offset), (odds_too, offset_too) = one.lanes, other.lanes[..., ::-1] * _MIRRORED
     # Where a line crosses a cell only that output knows that sees it cross.
-    weight = 1 / (1 + np.exp(np.clip(odds_too - odds, -30, 30)))
+    weight = as_probability(odds - odds_too)
     lanes = np.stack([(odds + odds_too) / 2, weight * offset + (1 - weight) * offset_too])
     columns = [-(-width // stride) for stride in info.strides]
     return RawOutput(*(a[..., :n] for a, n in zip((paint, kinds, lanes), columns, strict=True)))
@@ -328,13 +328,11 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
     options.log_severity_level = 3
     try:
         provider, settings = _PROVIDERS[device]
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=[(provider, settings), *_FALLBACK[device]]
-        )
+        providers = [(provider, settings), *_FALLBACK[device]]
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
-        raise DetectorError(
-            f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
-        ) from error
+        problem = f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
+        raise DetectorError(problem) from error
     # Where the driver or cuDNN fails, onnxruntime goes on without a word on the CPU.
     if provider not in session.get_providers():
         raise DetectorError(
@@ -356,9 +354,9 @@ def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
 def _read_info(session: Any, path: Path) -> NetworkInfo:
     try:
         metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
-        paint, kinds, lanes = (int(metadata["strides"][name]) for name in _OUTPUTS)
+        strides = [int(metadata["strides"][name]) for name in _OUTPUTS]
         classes = tuple(str(name) for name in metadata["classes"])
-        info = NetworkInfo(classes, int(metadata["multiple"]), paint, kinds, lanes, read_catalogue(metadata))
+        info = NetworkInfo(classes, int(metadata["multiple"]), *strides, read_catalogue(metadata))
     except ConfigError as error:
         raise DetectorError(f"{path}: {error}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -366,26 +364,21 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
             f"{path}: no usable '{METADATA_KEY}' metadata ({_one_line(error)}); "
             "this is not a model written by `python -m export`"
         ) from error
+    problem = None
     unknown = [name for name in info.classes if name not in info.catalogue.classes]
-    if unknown or not info.classes:
-        raise DetectorError(
-            f"{path}: unknown classes {unknown}, known are {', '.join(info.catalogue.names)}; "
-            "use another model"
-        )
-    if min(info.strides) < 1 or any(info.multiple % stride for stride in info.strides):
-        raise DetectorError(
-            f"{path}: strides {info.strides} do not divide multiple {info.multiple}; export it again"
-        )
-    if info.kind_stride % info.paint_stride:
-        raise DetectorError(
-            f"{path}: the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "
-            f"{info.paint_stride}; export it again"
-        )
     names = ([node.name for node in session.get_inputs()], [node.name for node in session.get_outputs()])
-    if names != (["image"], _OUTPUTS):
-        raise DetectorError(
-            f"{path}: inputs and outputs are {names}, not ['image'] and {_OUTPUTS}; export it again"
-        )
+    if unknown or not info.classes:
+        known = ", ".join(info.catalogue.names)
+        problem = f"unknown classes {unknown}, known are {known}; use another model"
+    elif min(info.strides) < 1 or any(info.multiple % stride for stride in info.strides):
+        problem = f"strides {info.strides} do not divide multiple {info.multiple}; export it again"
+    elif info.kind_stride % info.paint_stride:
+        problem = f"the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "
+        problem += f"{info.paint_stride}; export it again"
+    elif names != (["image"], _OUTPUTS):
+        problem = f"inputs and outputs are {names}, not ['image'] and {_OUTPUTS}; export it again"
+    if problem:
+        raise DetectorError(f"{path}: {problem}")
     return info
 
 
