@@ -176,11 +176,7 @@ def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
 
 
 def easy_views(
-    views: Views,
-    rig: Rig,
-    cameras: Sequence[Camera],
-    corners_map: FloatArray,
-    within_m: float | None = None,
+    views: Views, rig: Rig, cameras: Sequence[Camera], corners_map: FloatArray, within_m: float | None = None
 ) -> tuple[IntArray, IntArray]:
     """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
 

@@ -68,12 +68,10 @@ class RoadCamera:
         self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
         self.distorted = has_distortion(camera.info)
         # The pinhole pixel of every few recorded ones, one cell beyond the image's far border.
-        columns, rows = (
-            np.arange(0, last + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
-            for last in (self.info.width, self.info.height)
-        )
+        columns = np.arange(0.0, self.info.width + _LUT_STEP_PX, _LUT_STEP_PX)
+        rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
         grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
-        self._pinhole_lut = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
+        self._pinhole_lut: FloatArray = undistort_points(self.info, grid_px.reshape(-1, 2))
         self._ground_from_pinhole_px = facing_ipm(
             self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
         )
@@ -93,12 +91,13 @@ class RoadCamera:
         points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
         if not self.distorted or not len(points):
             return points.copy()
-        rows, columns = self._pinhole_lut.shape[:2]
+        columns = (self.info.width - 1) // _LUT_STEP_PX + 2
+        rows = (self.info.height - 1) // _LUT_STEP_PX + 2
         cell = points / _LUT_STEP_PX
         first = np.minimum(np.maximum(np.floor(cell).astype(np.intp), 0), (columns - 2, rows - 2))
         right, down = np.hsplit(cell - first, 2)
+        lut = self._pinhole_lut
         at = first[:, 0] + columns * first[:, 1]
-        lut = self._pinhole_lut.reshape(-1, 2)
         upper = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
         at += columns
         lower = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right

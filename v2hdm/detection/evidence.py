@@ -160,8 +160,8 @@ def rectified_views(
     names = catalogue.of_family(SYMBOL, OTHER)
     symbols = shares[:, [k for k, name in enumerate(output.classes) if name in names]].sum(axis=1)
     own = shares[of_reading, [output.classes.index(kind) for _, kind in readings]]
-    planes = (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds, lines, symbols)
-    planes = [plane[of_reading] for plane in (*planes, patches.outside(points))]
+    shared = (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds, lines, symbols)
+    planes = [plane[of_reading] for plane in (*shared, patches.outside(points))]
     planes.insert(CHANNELS.index("own_share"), own)
     first_side = np.where(lengthwise, 0, 1)[marking][of_reading]
     return np.stack(planes, axis=1).astype(np.float32), first_side

@@ -188,7 +188,8 @@ class Fit:
 
 def _ends(by_side: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Variances (M, 4) of each side's start and end, and their covariance."""
-    return tuple(by_side[:, _CORNER + i, _CORNER + j] for i, j in ((0, 0), (4, 4), (0, 4)))
+    start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
+    return start, end, by_side[:, _CORNER, _CORNER + 4]
 
 
 def fit_quadrilaterals(

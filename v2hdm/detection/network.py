@@ -354,9 +354,9 @@ def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
 def _read_info(session: Any, path: Path) -> NetworkInfo:
     try:
         metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
-        strides = [int(metadata["strides"][name]) for name in _OUTPUTS]
+        paint, kinds, lanes = (int(metadata["strides"][name]) for name in _OUTPUTS)
         classes = tuple(str(name) for name in metadata["classes"])
-        info = NetworkInfo(classes, int(metadata["multiple"]), *strides, read_catalogue(metadata))
+        info = NetworkInfo(classes, int(metadata["multiple"]), paint, kinds, lanes, read_catalogue(metadata))
     except ConfigError as error:
         raise DetectorError(f"{path}: {error}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:

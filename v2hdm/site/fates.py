@@ -163,8 +163,7 @@ def decide(
         alone_new = np.setdiff1d(np.arange(len(new)), candidates.new[chosen])
         counts = [(1 - moved[chosen]).sum(), moved[chosen].sum(), gone[alone_old].sum()]
         rates = _rates(
-            _PRIOR_COUNT + counts,
-            (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen)),
+            _PRIOR_COUNT + counts, (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen))
         )
     numbers = zip(candidates.old[chosen], candidates.new[chosen], candidates.turn[chosen], strict=True)
     return Decision(

@@ -15,12 +15,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of
-from v2hdm.geometry.ipm import (
-    direction_covariance,
-    facing_ipm,
-    flat_motion,
-    ground_from_pinhole_px,
-)
+from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
@@ -115,7 +110,6 @@ def collect_lane_points(
     drive: Drive,
     detections: Sequence[ImageDetections],
     ground: ImageGround,
-    *,
     max_range_m: float,
     jitter_rad: float,
 ) -> LaneCloud:
