@@ -117,7 +117,10 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
     known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
-    centre, points = corners_map.mean(axis=1), _middle_line(corners_map)
+    centre, sides = corners_map.mean(axis=1), (corners_map + np.roll(corners_map, -1, axis=1)) / 2
+    across = sides[:, 2:] - sides[:, :2]
+    way = across[np.arange(len(across)), np.argmax(np.linalg.norm(across, axis=2), axis=1)]
+    points = centre[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None]
     for ground in outlines_on_ground(symbols, rig):
         if ground is None:
             continue
@@ -129,15 +132,6 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
             ]
             count[group] += 2 * sum(inside) > len(inside)
     return count
-
-
-def _middle_line(corners_map: FloatArray) -> FloatArray:
-    """Five points (G, 5, 2) spread evenly over the longer middle lines of quadrilaterals (G, 4, 2)."""
-    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
-    across = np.stack([sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1]], axis=1)
-    longer = np.argmax(np.linalg.norm(across, axis=2), axis=1)
-    way = across[np.arange(len(across)), longer]
-    return np.asarray(corners_map.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None])
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
