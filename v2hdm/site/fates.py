@@ -165,14 +165,11 @@ def decide(
         rates = _rates(
             _PRIOR_COUNT + counts, (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen))
         )
-    numbers = zip(candidates.old[chosen], candidates.new[chosen], candidates.turn[chosen], strict=True)
+    columns = candidates.old, candidates.new, candidates.turn, moved
     return Decision(
-        pairs=tuple(
-            Pair(int(a), int(b), int(turn), float(probability))
-            for (a, b, turn), probability in zip(numbers, moved[chosen], strict=True)
-        ),
-        gone={int(k): float(gone[k]) for k in alone_old},
-        fresh={int(k): float(fresh[k]) for k in alone_new},
+        pairs=tuple(Pair(*row) for row in zip(*(one[chosen].tolist() for one in columns), strict=True)),
+        gone={k: float(gone[k]) for k in alone_old.tolist()},
+        fresh={k: float(fresh[k]) for k in alone_new.tolist()},
         shift=shift,
     )
 
@@ -257,18 +254,15 @@ def _read(off: FloatArray, noise: FloatArray) -> float:
 def _normal(off: FloatArray, covariance: FloatArray) -> float:
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, off)
-    count = len(off)
-    return float(-0.5 * (whitened @ whitened + count * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
+    return float(-0.5 * (whitened @ whitened + len(off) * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
 
 
 def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
     """Log density (P,) of each pair's new marking, in its basis, if it is another one anywhere."""
     off = (candidates.basis @ candidates.off[..., None])[..., 0]
     noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
-    shape = [
-        _normal(one[3:], own[3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5))
-        for one, own in zip(off, noise, strict=True)
-    ]
+    noise = noise[:, 3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5)
+    shape = [_normal(*one) for one in zip(off[:, 3:], noise, strict=True)]
     return np.asarray(density - np.log(4) - np.log(np.pi * candidates.arm_m) + np.array(shape))
 
 
@@ -282,13 +276,13 @@ def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
     size = count + int(news.max()) + 1
     graph = coo_array((np.ones(len(better)), (olds, count + news)), shape=(size, size))
     _, group = connected_components(graph, directed=False)
-    chosen: list[int] = []
+    chosen = []
     for one in np.unique(group[olds]):
         own = better[group[olds] == one]
         a, rows = np.unique(candidates.old[own], return_inverse=True)
         b, columns = np.unique(candidates.new[own], return_inverse=True)
-        gain = np.zeros((len(a), len(b)))
+        gain, taken = np.zeros((len(a), len(b))), np.zeros((len(a), len(b)), dtype=bool)
         gain[rows, columns] = score[own]
-        taken = {(int(r), int(c)) for r, c in zip(*linear_sum_assignment(-gain), strict=True)}
-        chosen += [int(p) for p, r, c in zip(own, rows, columns, strict=True) if (int(r), int(c)) in taken]
-    return np.array(sorted(chosen), dtype=np.int64)
+        taken[linear_sum_assignment(-gain)] = True
+        chosen.append(own[taken[rows, columns]])
+    return np.sort(np.concatenate(chosen))

@@ -63,7 +63,7 @@ class Support:
         group, image = self.group[self.accepted], self.sightings.image[self.row[self.accepted]]
         shown = np.unique(np.stack([group, image]), axis=1)
         easy = np.stack(easy_views(self.views, self.rig, list(self.cameras), corners_map))
-        found = np.isin(_pair_keys(easy), _pair_keys(shown))
+        found = np.isin(*(pairs[0] * (1 << 32) + pairs[1] for pairs in (easy, shown)))
         return Counts(
             images=np.bincount(shown[0], minlength=count),
             observations=np.bincount(self.group, minlength=count),
@@ -95,7 +95,12 @@ class Classified:
             MappingError: there is none.
         """
         if not len(self.accepted):
-            raise MappingError(_no_marking_message(self.exclusions()))
+            reasons = [exclusion.reason for exclusion in self.exclusions()]
+            commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
+            raise MappingError(
+                f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); "
+                "check the camera's IPM, the detector and that the drive passes its markings closely."
+            )
         return tuple(
             Marking(
                 kind=self.kind[group],
@@ -130,8 +135,10 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
     counts = seen.counts(first.candidates.corners_map)
     found = posterior(solved, seen.kind, counts)
     least = np.log(options.min_probability / (1 - options.min_probability))
+    part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
     verdict: list[str | None] = [
-        None if odds >= least else _reason(found, group) for group, odds in enumerate(found.log_odds)
+        None if odds >= least else OF_SYMBOL if part[group] else CLUTTER_BY[found.evidence[group].argmin()]
+        for group, odds in enumerate(found.log_odds)
     ]
     sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
     # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
@@ -141,13 +148,6 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
     return Classified(seen.names(), found.candidates, counts.images, verdict)
-
-
-def _reason(found: Posterior, group: int) -> str:
-    """The hypothesis that has won against a marking, in words."""
-    if found.probability[group, PART_OF_SYMBOL] > found.probability[group, CLUTTER]:
-        return OF_SYMBOL
-    return CLUTTER_BY[int(np.argmin(found.evidence[group]))]
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:
@@ -169,21 +169,6 @@ def _overlap(a: FloatArray, b: FloatArray) -> float:
     """Common area of two convex quadrilaterals as a share of the smaller one's."""
     common = abs(float(signed_area(clip_convex(a, b))))
     return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)
-
-
-def _pair_keys(pairs: IntArray) -> IntArray:
-    """One number per column of ``pairs`` (2, P)."""
-    return np.asarray(pairs[0] * (1 << 32) + pairs[1])
-
-
-def _no_marking_message(excluded: tuple[Exclusion, ...]) -> str:
-    """The error message where no candidate was accepted."""
-    reasons = [exclusion.reason for exclusion in excluded]
-    commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
-    return (
-        f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); check the "
-        "camera's IPM, the detector and that the drive passes its markings closely."
-    )
 
 
 JointCovariance = Callable[[IntArray], FloatArray]
@@ -218,7 +203,8 @@ def with_relative_sigma(
     covariance = joint(np.concatenate([diagonal[first], diagonal[second]], axis=1))
     apart = _CENTRES @ covariance @ _CENTRES.T
     formal = _CENTRES[:, :4] @ covariance[:, :4, :4] @ _CENTRES[:, :4].T
-    stated = np.array([_centre_variance_m2(chosen[k]) for k in first])
+    stated_m2 = np.array([chosen[k].covariance_m2 for k in first]).reshape(-1, 4, 2, 4, 2)
+    stated = np.array([np.einsum("iaja->", one) for one in stated_m2]) / 32
     own = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
     # The difference of two centres has the errors of both.
     sigma_m = np.sqrt(np.trace(apart, axis1=1, axis2=2) / 4 + own)
@@ -226,12 +212,6 @@ def with_relative_sigma(
     for marking, sigma in zip(seen[first].tolist(), sigma_m.tolist(), strict=True):
         out[marking] = replace(markings[marking], relative_sigma_m=sigma)
     return tuple(out)
-
-
-def _centre_variance_m2(marking: Marking) -> float:
-    """Variance of a coordinate of the mean of its corners."""
-    assert marking.covariance_m2 is not None
-    return float(np.einsum("iaja->", marking.covariance_m2.reshape(4, 2, 4, 2)) / 32)
 
 
 def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
