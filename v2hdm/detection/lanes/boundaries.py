@@ -135,7 +135,8 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     if not lines:
         return []
     camera, horizon = image.camera, image.horizon
-    corners = np.array([[0.0, camera.info.height - 1.0], [camera.info.width - 1.0, camera.info.height - 1.0]])
+    corners = (camera.info.height - 1.0) * np.array([[0.0, 1.0], [0.0, 1.0]])
+    corners[1, 0] = camera.info.width - 1.0
     lowest = float(horizon.coordinates(camera.undistort(corners))[1].max())
     below = np.arange(horizon.below_px(FARTHEST_M), lowest + DRAWN_STEP_PX, DRAWN_STEP_PX)
     along = np.array([line.curve.parameters for line in lines]) @ horizon.basis(below).T
@@ -143,8 +144,7 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     step_m = np.hypot(np.diff(horizon.depth_m(below)), np.diff(beside_m, axis=1))
     half_px = np.maximum(_HALF_WIDTH_M * horizon.px_per_m * below, _LEAST_HALF_WIDTH_PX)
     across = along[..., None] + half_px[:, None] * _ACROSS
-    rows = np.broadcast_to(below[:, None], across.shape)
-    places_px = camera.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(*across.shape, 2)
+    places_px = _places_px(image, across, below[:, None])
     likelihood = np.zeros((*along.shape, _STATES))
     crossing = _crossings(lines, points, image, below)
     likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
@@ -159,6 +159,13 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     present, painted = 1 - states[..., _ENDED], states[..., _SOLID:].sum(axis=2)
     each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
     return [replace(line, span=Span(below, *rest)) for line, *rest in each]
+
+
+def _places_px(image: LaneImage, along: FloatArray, below: FloatArray) -> FloatArray:
+    """Recorded px (..., 2) of places along and below the horizon, which broadcast."""
+    rows = np.broadcast_to(below, along.shape)
+    pinhole_px = image.horizon.pinhole_px(along.ravel(), rows.ravel())
+    return image.camera.distort(pinhole_px).reshape(*along.shape, 2)
 
 
 def _evidence(odds: FloatArray, weight: float, even: float, bounds: tuple[float, float]) -> FloatArray:
@@ -247,7 +254,7 @@ def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> 
     phi, px_per_m = image.horizon.basis(line.span.below), image.horizon.px_per_m * line.span.below
     sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
-    known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
+    known = np.maximum(sigma_m, other_sigma_m) < _CERTAIN_SIGMA_M
     shown, other_shown = (_shown(each, points, line.span.below) for each in (line, other))
     from_row = max(int(np.argmax(shown)), int(np.argmax(other_shown)))
     crossed = offset_m[from_row:][(known & (shown | other_shown))[from_row:]]
@@ -332,11 +339,9 @@ def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
     """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
     if not lines:
         return np.empty((0, len(AMONG)))
-    far = [points.below[line.members].min() for line in lines]
+    far = np.log([points.below[line.members].min() for line in lines])
     spans = [_span_features(line, points) for line in lines]
-    return np.column_stack(
-        [[line.log_odds for line in lines], np.log(far), spans, _company(points, lines, image)]
-    )
+    return np.column_stack([[line.log_odds for line in lines], far, spans, _company(points, lines, image)])
 
 
 def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
@@ -397,10 +402,7 @@ def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) ->
     phi = horizon.basis(below.ravel()).reshape(len(lines), _PLACES, 3)
     along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
     across = along[..., None] + horizon.px_per_m * below[..., None] * _ON_M
-    rows = np.broadcast_to(below[..., None], across.shape)
-    places_px = image.camera.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(
-        *across.shape, 2
-    )
+    places_px = _places_px(image, across, below[..., None])
     paint = output.odds_at(places_px).max(axis=2)
     weight = as_probability(paint) + _LEAST_WEIGHT
     dashes = output.shares_at(places_px[:, :, len(_ON_M) // 2])[:, output.classes.index(LANE_DASH)]
