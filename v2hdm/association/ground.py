@@ -30,8 +30,7 @@ _HORIZON_M2 = 1e4
 _SYMBOL_RANGE_M = 16.0
 """Distance from the vehicle, m, beyond which a symbol's place is too vague to speak against a neighbour."""
 
-_BORDER_PX = 10.0
-"""Width of the image's border, px, within which a marking may be cut."""
+_BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,8 @@ _LEAST_DEPTH_M = 1.0
 LEAST_TOLERANCE_M = 0.05
 """How far corners of one shape may deviate, m, however small the marking is."""
 
-_CORNER_FLOOR_M = 0.001
-"""Floor of a corner's sigma where groups are fused, m."""
-
-_HUBER_SIGMAS = 2.0
-"""Residual in sigmas from which a sighting's weight in its group falls."""
+_CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
+_HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls
 
 OPEN_END_M = 10.0
 """Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
@@ -255,8 +252,7 @@ _REACH_M = 4.0
 _MOST_SQUARED = 16.0
 """Squared distance, in sigmas, up to which a sighting fits: four corners on lines have as many freedoms."""
 
-_CLEARER_BY = 9.0
-"""How much worse any other marking, or order of corners, must fit, in squared sigmas."""
+_CLEARER_BY = 9.0  # how much worse any other marking, or order of corners, must fit, in squared sigmas
 
 
 def attach(

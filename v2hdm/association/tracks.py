@@ -22,9 +22,7 @@ from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_REFUSED = 1e9
-"""Cost of a pair that the assignment must not make."""
-
+_REFUSED = 1e9  # cost of a pair that the assignment must not make
 _POSITION_FLOOR_M = 0.02
 """Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
 

@@ -23,27 +23,19 @@ from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
 _worker: tuple[Detector, Drive] | None = None
-_WORKERS_A_GPU = 8
-"""Processes that share one: each takes memory of its own there."""
+_WORKERS_A_GPU = 8  # processes that share one: each takes memory of its own there
 
 Detect = Callable[[Drive, DetectorOptions, Sequence[int], int, Callable[[ImageDetections], None]], None]
 """A function that does what :func:`detect_images` does."""
 
-_FEW_IMAGES = 8
-"""Fewer are looked at before a process has started."""
-
-_IMAGES = 24
-"""Images that are looked at: a second and a half of work."""
-
+_FEW_IMAGES = 8  # fewer are looked at before a process has started
+_IMAGES = 24  # images that are looked at: a second and a half of work
 _LEAST_IMAGES = 10
-_APART_M = 2.0
-"""They are at least this far apart, m, so that markings have moved on."""
-
+_APART_M = 2.0  # they are at least this far apart, m, so that markings have moved on
 _SHARE = 0.7
 """Paint at one place in this share of images is the vehicle: fields of diamonds cover it in a third."""
 
-_MARGIN_PX = 6
-"""The network sees an edge this far from where it is."""
+_MARGIN_PX = 6  # the network sees an edge this far from where it is
 
 
 def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:

@@ -27,8 +27,7 @@ _HORIZON_MARGIN_PX = 16
 FARTHEST_M = 60.0
 """Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
 
-_SURROUNDINGS_PX = 24
-"""So far above the farthest ground what is there helps to classify what lies on it."""
+_SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
 FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
@@ -36,8 +35,7 @@ FINE_ENOUGH_M = 0.007
 ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 
-_LEAST_BELOW_PX = 4.0
-"""Nearer to the horizon than this nothing is known of the ground."""
+_LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
 
 CURVE_UNIT_PX = 100.0
 """Unit of the distance below the horizon in the basis of lanes' curves: their parameters are alike."""

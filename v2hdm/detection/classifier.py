@@ -55,15 +55,9 @@ _LOG_SIZE_SIGMA = 0.2
 _DIRECTION_SIGMA = 0.15
 """Markings of one stencil, as a single image shows them, differ by so much in log size and by so many rad."""
 
-_BEND_RADIUS_M = 20.0
-"""And by the angle that a bend of this radius turns by between them."""
-
-_MOST = 3.0
-"""More company than this adds nothing."""
-
-_APART_M = 0.3
-"""Nearer quadrilaterals are readings of the same paint."""
-
+_BEND_RADIUS_M = 20.0  # and by the angle that a bend of this radius turns by between them
+_MOST = 3.0  # more company than this adds nothing
+_APART_M = 0.3  # nearer quadrilaterals are readings of the same paint
 _LEAST_GAP = 0.5
 _LONGEST_GAP_M = 15.0
 """Dashes of a line are at least so many times their own length apart, and at most so far."""

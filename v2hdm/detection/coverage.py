@@ -153,20 +153,11 @@ def variance_inflation(first: np.ndarray, second: np.ndarray, weight: np.ndarray
     return np.asarray((1 + r) / (1 - r), dtype=np.float64)
 
 
-_PAINT_SIGMA = 0.25
-"""How far the network's probability of paint is from the coverage."""
-
-_MIN_SCATTER = 0.01
-"""Least scatter of log grey: quantisation and noise of the best sensor."""
-
-_SHARED_PIXELS = 20.0
-"""A side's variance is drawn to that of all sides as if by so many pixels."""
-
-_CAUCHY = 2.385
-"""Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)."""
-
-_MAX_CORRELATION = 0.7
-"""Of the residuals of neighbouring pixels; beyond it few pixels would settle all."""
+_PAINT_SIGMA = 0.25  # how far the network's probability of paint is from the coverage
+_MIN_SCATTER = 0.01  # least scatter of log grey: quantisation and noise of the best sensor
+_SHARED_PIXELS = 20.0  # a side's variance is drawn to that of all sides as if by so many pixels
+_CAUCHY = 2.385  # Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)
+_MAX_CORRELATION = 0.7  # of the residuals of neighbouring pixels; beyond it few pixels would settle all
 
 
 def pixel_weights(

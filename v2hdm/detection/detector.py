@@ -23,8 +23,7 @@ from v2hdm.errors import DetectorError
 from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 
-_NO_PAINT = -20.0
-"""Log odds of paint where the vehicle itself is."""
+_NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
 
 
 class Detector:

@@ -61,20 +61,12 @@ _BEFORE, _BESIDE = 0.3, 1.0
 """How far a picture reaches beyond the corners, in parts of the sides: of a diamond; of all else along its
 longer sides and across them."""
 
-_FINER = 2
-"""So many samples of the image per element, in each direction."""
-
-_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN = 2.0, 2.0, 1 / 3
-"""Bring the channels to about one."""
-
+_FINER = 2  # so many samples of the image per element, in each direction
+_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN = 2.0, 2.0, 1 / 3  # bring the channels to about one
 _GRID = (np.arange(6) + 0.5) / 6
 _INNER = tuple(part.reshape(-1) for part in np.meshgrid(_GRID, _GRID))
-_SUREST = -4
-"""Place of the ninth decile among 36, in order."""
-
-_BESIDE_PX = 2.5
-"""Paint beside a side is looked for so far outside."""
-
+_SUREST = -4  # place of the ninth decile among 36, in order
+_BESIDE_PX = 2.5  # paint beside a side is looked for so far outside
 _SIZE_LIMITS_M = (0.01, 100.0)
 
 

@@ -30,9 +30,7 @@ from v2hdm.records import BoolArray, FloatArray
 TYPICAL_BLUR_PX = 0.75
 """Point spread of a focused camera, px, pixel aperture included."""
 
-_BLUR_SIGMA_PX = 0.2
-"""How far one marking's blur is from the typical one, px: motion, focus, frayed paint."""
-
+_BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
 _BLUR_LIMITS_PX = (0.35, 3.0)
 _SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
 """Blur of the first steps, in distances of the grid's points and px: a wide one sees sides from far away."""
@@ -56,18 +54,14 @@ _MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
 _OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
 
-_OPEN_SIGMA = 3.0
-"""A side cut by the image's border is unknown within this many lengths of the marking."""
-
+_OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
 _BEYOND_PX = 6.0
 """How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
 
 _CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
 """Log contrast of paint over ground, as measured on asphalt, widened for worn and for fresh paint."""
 
-_MOST_CONTRAST = 4.0
-"""Log contrast of white paint on the blackest ground."""
-
+_MOST_CONTRAST = 4.0  # log contrast of white paint on the blackest ground
 _LIGHT_STEP = 0.4
 """By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
 
@@ -80,12 +74,8 @@ _MODEL_SIGMA_PX = 0.04
 aperture."""
 
 _SEARCH_STEPS, _STEPS = 4, 8
-_MAX_STEP = 2.0
-"""Longest step of a side, in blurs."""
-
-_SETTLED_PX, _FOUND_PX = 0.05, 0.3
-"""Steps of fit and of search that are shorter than this are the last, px."""
-
+_MAX_STEP = 2.0  # longest step of a side, in blurs
+_SETTLED_PX, _FOUND_PX = 0.05, 0.3  # steps of fit and of search that are shorter than this are the last, px
 _BLUR, _K = 8, 9
 _LIGHT = 10
 _SLOPE = _LIGHT + KNOTS
@@ -117,9 +107,7 @@ _ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
 _DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
 _ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
 
-_TILT_SHARE = 0.5
-"""A side that is off as a whole is askew by this share of that."""
-
+_TILT_SHARE = 0.5  # a side that is off as a whole is askew by this share of that
 _WHOLE_SIDES = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron(
     [[1.0, -1.0], [-1.0, 1.0]], np.eye(4)
 )

@@ -18,8 +18,7 @@ from v2hdm.io.safe.pixels import read_pixels
 
 _log = logging.getLogger(__name__)
 
-_MOST_CAMERAS = 1 << 16
-"""OpenCV takes a larger index for something else."""
+_MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Suffixes of images in a folder."""

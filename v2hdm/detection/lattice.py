@@ -18,17 +18,13 @@ _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
-_MOST_PIXELS = 600
-"""A band of more pixels is thinned: all markings of an image are padded to the most."""
-
+_MOST_PIXELS = 600  # a band of more pixels is thinned: all markings of an image are padded to the most
 _MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
 """Ends of at most this share of the length make a quadrilateral slim; they reach that far past corners."""
 
-_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12
-"""Rows and columns of the coarse grid on which a fit begins."""
-
+_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12  # rows and columns of the coarse grid on which a fit begins
 _MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
 """How far it reaches beyond a quadrilateral, in its lengths and widths."""
 

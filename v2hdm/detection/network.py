@@ -37,21 +37,15 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
 _FALLBACK = {"cpu": [], "cuda": ["CPUExecutionProvider"]}
 """For the few operations that a device does not have."""
 
-_OVERLAP_PX = 64
-"""Overlap of the two resolutions, so that either has its surroundings where they are joined."""
-
-_GRID_PX = 16
-"""The seam is on the grid of all outputs; the network's own multiple may be larger."""
-
+_OVERLAP_PX = 64  # overlap of the two resolutions, so that either has its surroundings where they are joined
+_GRID_PX = 16  # the seam is on the grid of all outputs; the network's own multiple may be larger
 _MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
 """Factors of a lane output (2, h, w), log odds and offset, in the mirror."""
 
 _LEAST_LOG_ODDS = -3.0
 """Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
 
-_MOST_ODDS = 6.0
-"""Log odds beyond this differ by chance only."""
-
+_MOST_ODDS = 6.0  # log odds beyond this differ by chance only
 _MOST_EXPONENT = 30.0
 
 

@@ -14,12 +14,8 @@ from v2hdm.detection.network import NetworkOutput
 from v2hdm.geometry.quadrilateral import Quad, block_diagonal, following
 from v2hdm.records import BoolArray, FloatArray
 
-_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
-"""Weights of ITU-R BT.601."""
-
-_CLIPPED = 250
-"""Codes from here on are those of a sensor at its limit, noise and white balance allowed for."""
-
+_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)  # weights of ITU-R BT.601
+_CLIPPED = 250  # codes from here on are those of a sensor at its limit, noise and white balance allowed for
 _DARK = 0.01
 """Added to radiance before taking logarithms: in shade a step is as large as in the sun, noise is not."""
 
@@ -33,8 +29,7 @@ Edges fitted to coded values lie outwards of those of a bright marking by about 
 _AROUND, _SPARE_PX = np.array([[-1.0, 2.0, 2.0, -1.0], [-2.0, -2.0, 3.0, 3.0]]), 16
 """Corners of a patch, in longer and shorter sides of its marking's outline, and the px beyond."""
 
-_BOW_PX = 0.25
-"""A lens that bows the sides of a quadrilateral by less is as good as none."""
+_BOW_PX = 0.25  # a lens that bows the sides of a quadrilateral by less is as good as none
 
 
 def linear_bgr(coded: np.ndarray, linear_response: bool) -> np.ndarray:

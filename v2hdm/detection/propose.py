@@ -21,9 +21,7 @@ from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.quadrilateral import following, is_convex_px, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_MIN_CELLS = 5
-"""Blobs of fewer cells are noise: their outline is not worth four corners."""
-
+_MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners
 _LEAST_SHARE, _LEAST_SYMBOL_SHARE = 0.15, 0.25
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
@@ -36,26 +34,16 @@ Markings that nearly touch come apart in sure paint; doubtful paint joins parts 
 _LEAST_SURE, _MOST_SURE = 0.2, 0.6
 """A piece of doubtful paint is of use if this much of it is likely, and news if no more than that."""
 
-_MOST_PARTS = 12
-"""Parts that are looked at of one piece: more are the grains of bad light."""
-
+_MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
 _OUTLINE_SCALE = 4
 
-_LEAST_CERTAINTY = 0.3
-"""Least mean probability of paint of a piece; below it one in fifty is a marking."""
-
-_LEAST_CLASS_SHARE = 0.02
-"""Least share of a class, by network and size, with which it is proposed."""
-
-_CLASS_DOUBT = 0.05
-"""Share of its certainty about classes that the network may give to wrong ones."""
-
+_LEAST_CERTAINTY = 0.3  # least mean probability of paint of a piece; below it one in fifty is a marking
+_LEAST_CLASS_SHARE = 0.02  # least share of a class, by network and size, with which it is proposed
+_CLASS_DOUBT = 0.05  # share of its certainty about classes that the network may give to wrong ones
 _GROUP_DOUBT = 0.1
 """Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
 
-_LEAST_FILL = 0.5
-"""Least share of a quadrilateral that its piece of paint fills: a triangle fills half."""
-
+_LEAST_FILL = 0.5  # least share of a quadrilateral that its piece of paint fills: a triangle fills half
 _BORDER_PX = 3.0
 """A side this near to the image's border is cut by it: the network's outline is coarser than this."""
 

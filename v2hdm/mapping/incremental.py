@@ -34,9 +34,7 @@ Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 Solve = Callable[[Association, BoolArray, Rig], Rig]
 """The rig that groups of sightings lead to, of usable corners (S, 4), from another."""
 
-_FIRST_LINK_MARKINGS = 12
-"""From so many the extrinsics are better than the IPM that they began with."""
-
+_FIRST_LINK_MARKINGS = 12  # from so many the extrinsics are better than the IPM that they began with
 _LINK_GROWTH = 4
 """How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
 more than the last time alone."""
@@ -44,8 +42,7 @@ more than the last time alone."""
 _RECORD_GROWTH = 1.6
 """How many times as large the map is whenever its markings are kept for the figure of its growth."""
 
-_LEAST_CORNERS = 3
-"""Corners that fix a marking: all are parallelograms."""
+_LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
 
 @dataclass(frozen=True)

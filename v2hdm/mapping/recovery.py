@@ -74,8 +74,7 @@ MOST_CORRECTIONS = 4
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
 
-_CELL_OBSERVATIONS = 40
-"""Observations of a cell from which its median residual counts."""
+_CELL_OBSERVATIONS = 40  # observations of a cell from which its median residual counts
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ _CORRELATION = 0.2
 """Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
 small."""
 
-_KNOWN_SIGMA_M = 0.5
-"""Sigma, m, below which a corner counts as known: a fraction of any marking's length."""
+_KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
 
 
 @dataclass(frozen=True)

@@ -101,8 +101,7 @@ LIKELY = 0.5
 _LEAST_PAIRED = 0.3
 """Share of the markings that a drive looked at which it finds again at least, if the site is the same."""
 
-_LOOKED = 3
-"""Easy views from which a drive has looked at a place for that share."""
+_LOOKED = 3  # easy views from which a drive has looked at a place for that share
 
 
 @dataclass(frozen=True)

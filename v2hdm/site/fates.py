@@ -29,26 +29,19 @@ MOVED_SIGMA_M = 0.5
 TURNED_SIGMA_RAD = 0.2
 """Sigma of how far it is turned then, rad."""
 
-_REACH_M = 4 * MOVED_SIGMA_M
-"""Markings farther apart are never one, m."""
-
+_REACH_M = 4 * MOVED_SIGMA_M  # markings farther apart are never one, m
 _OTHER_SHAPE_M = 0.1
 """Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
 
 _MISREAD_M = 0.3
 """Sigma of an end or corner that one of two drives has taken from another edge, m, as in the site model."""
 
-_MISREAD_SHARE = 0.05
-"""Share of markings of which one of two drives has misread an end or a corner."""
-
+_MISREAD_SHARE = 0.05  # share of markings of which one of two drives has misread an end or a corner
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
 """Dirichlet prior: of fifty markings about so many stay, are painted elsewhere, are gone."""
 
-_PRIOR_NEW = (1.0, 50.0)
-"""Gamma prior: one new marking where there were fifty."""
-
-_PASSES = 4
-"""Rounds of shift, odds and assignment; the assignment settles within three."""
+_PRIOR_NEW = (1.0, 50.0)  # Gamma prior: one new marking where there were fifty
+_PASSES = 4  # rounds of shift, odds and assignment; the assignment settles within three
 
 STAYED, MOVED = range(2)
 

@@ -36,9 +36,7 @@ _CENTRE_SIGMA_PX = 1.0
 _OWN_SIGMA_M = 0.01
 """Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
 
-_TANGENT_REACH = 2
-"""Points to either side whose difference gives a point's direction."""
-
+_TANGENT_REACH = 2  # points to either side whose difference gives a point's direction
 _GUIDE_RANGE = 1.8
 """Whole lines are followed so many times farther than paint is mapped: they only say what is one line."""
 
@@ -211,20 +209,11 @@ def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
         return np.asarray(difference / np.linalg.norm(difference, axis=1, keepdims=True))
 
 
-_SEED_CELL_M = 0.25
-"""Side of the cells that each give a seed, m."""
-
-_DIRECTION_BINS = 8
-"""Number of directions distinguished within a cell, over half a circle."""
-
-_SAME_DIRECTION = np.cos(np.deg2rad(20.0))
-"""Cosine from which points are of one line: a crossing one is not."""
-
-_ITERATIONS = 4
-"""Mean shifts of each seed."""
-
-_THIN_SPACINGS = 0.7
-"""Spacings of nodes within which the best supported one suppresses others of its line."""
+_SEED_CELL_M = 0.25  # side of the cells that each give a seed, m
+_DIRECTION_BINS = 8  # number of directions distinguished within a cell, over half a circle
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
+_ITERATIONS = 4  # mean shifts of each seed
+_THIN_SPACINGS = 0.7  # spacings of nodes within which the best supported one suppresses others of its line
 
 
 @dataclass(frozen=True)

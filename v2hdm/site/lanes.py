@@ -19,20 +19,13 @@ from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
 
-_SAME_DIRECTION = np.cos(np.deg2rad(25.0))
-"""Cosine from which two nodes are of one line."""
-
-_MAX_LINK_SPACINGS = 2.5
-"""Longest link of two nodes, in spacings of nodes."""
-
+_SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # cosine from which two nodes are of one line
+_MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings of nodes
 _MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
 """Largest angle of a gap's chord and an end's tangent, and difference of the angles at both ends, rad."""
 
-_END_SIGMA_M = 0.05
-"""Lateral error of an end, m, which short gaps must allow for in angles."""
-
-_END_LENGTH_M = 2.0
-"""Length, m, over which an end's direction is taken."""
+_END_SIGMA_M = 0.05  # lateral error of an end, m, which short gaps must allow for in angles
+_END_LENGTH_M = 2.0  # length, m, over which an end's direction is taken
 
 
 @dataclass(frozen=True)
@@ -207,18 +200,11 @@ def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArr
     )
 
 
-_MAX_BRIDGE_M = 25.0
-"""Longest gap that images' whole lines bridge, m."""
-
-_PASSES_M = 0.4
-"""A line that comes so near the end of a piece passes it."""
-
-_LEAST_COSINE = np.cos(np.deg2rad(30.0))
-"""Cosine of a gap's way and the directions of its ends at least."""
-
+_MAX_BRIDGE_M = 25.0  # longest gap that images' whole lines bridge, m
+_PASSES_M = 0.4  # a line that comes so near the end of a piece passes it
+_LEAST_COSINE = np.cos(np.deg2rad(30.0))  # cosine of a gap's way and the directions of its ends at least
 _FIRST, _LAST = 0, 1
-_DIRECTION_LENGTH_M = 5.0
-"""A bridge leaves a piece in about the direction of so much of its end."""
+_DIRECTION_LENGTH_M = 5.0  # a bridge leaves a piece in about the direction of so much of its end
 
 
 def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> list[Path]:

@@ -32,35 +32,20 @@ Grey = Callable[[int], NDArray[np.float32]]
 _INSIDE = np.linspace(0.2, 0.8, 7)
 """Where along either side an outline's inside is sampled: off its edges, which a pose's error blurs."""
 
-_BESIDE_M = (0.12, 0.25)
-"""How far beside its edges the ground is sampled, m."""
-
-_MOST_VIEWS = 6
-"""Near views of a place that are looked at: the errors of more repeat themselves."""
-
-_MOST_LEARNED = 40
-"""Markings of a drive that its paint and its ground are learned from."""
-
-_ASIDE_M = 1.3
-"""How far beside a marking bare ground is looked for, m."""
-
-_CLEAR_M = 1.0
-"""Distance from all known paint that makes ground bare, m."""
-
-_LEAST_LEARNED = 8
-"""Places from which the drive's own paint or ground is known; with fewer nothing is said."""
-
+_BESIDE_M = (0.12, 0.25)  # how far beside its edges the ground is sampled, m
+_MOST_VIEWS = 6  # near views of a place that are looked at: the errors of more repeat themselves
+_MOST_LEARNED = 40  # markings of a drive that its paint and its ground are learned from
+_ASIDE_M = 1.3  # how far beside a marking bare ground is looked for, m
+_CLEAR_M = 1.0  # distance from all known paint that makes ground bare, m
+_LEAST_LEARNED = 8  # places from which the drive's own paint or ground is known; with fewer nothing is said
 _HIDDEN_SIGMA = 0.5
 """Sigma of the contrast, log ratio of grey values, of whatever else stands before the ground."""
 
 _HIDDEN_SHARE = 0.5
 """Share of the markings which are there and not found that are hidden; the others are worn."""
 
-_STRANGE_SHARE = 0.05
-"""Share of bare places that are not: a stain, the edge of a shadow."""
-
-_LEAST_SIGMA = 0.02
-"""Floor of the sigma of bare ground's contrast: the grain of an image."""
+_STRANGE_SHARE = 0.05  # share of bare places that are not: a stain, the edge of a shadow
+_LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
 
 
 @dataclass(frozen=True)
@@ -144,9 +129,7 @@ _MOST_SQUARED = 25.0
 _NEAR_M = 12.0
 """Distance from the camera, m, within which markings are found at about one rate, as those of a map say."""
 
-_SAME_PLACE_M = 0.05
-"""A marking that has one of its class nearer than this is there, m."""
-
+_SAME_PLACE_M = 0.05  # a marking that has one of its class nearer than this is there, m
 _REACH_M = 2.0
 """How far the middle of a sighting may be from a place's centre, m: of a dash one may see an end only."""
 

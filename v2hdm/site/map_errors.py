@@ -23,8 +23,7 @@ from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 UNKNOWN_SIGMA_M = 0.02
 """Sigma of a corner of a map that states none, m a coordinate: a marking drawn by hand over an image."""
 
-_LEAST_SIGMA_M = 1e-4
-"""Floor of the sigmas of a marking's own error, m: the rounding of a survey."""
+_LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
 
 SHIFT = np.tile(np.eye(2), (4, 1))
 """How the stacked corners (8,) move with a shift (2,)."""
@@ -166,8 +165,7 @@ class Shift:
 _SAME_LINE_M = 0.3
 """Distance of two maps' lines up to which they are one, m: two lines side by side lie twice as far apart."""
 
-_LEAST_SHARED = 0.5
-"""Share of a new line's vertices that lie on an earlier line, from which it is that line."""
+_LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier line, from which it is that line
 
 
 def updated_lanes(

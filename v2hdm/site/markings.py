@@ -177,9 +177,7 @@ JointCovariance = Callable[[IntArray], FloatArray]
 NEIGHBOUR_M = 10.0
 """How far apart markings are compared, m: about a vehicle's length, over which it manoeuvres."""
 
-_FARTHEST_M = 15.0
-"""A marking without another one within so many metres has no relative standard deviation."""
-
+_FARTHEST_M = 15.0  # a marking without another one within so many metres has no relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
 
 

@@ -28,11 +28,8 @@ from v2hdm.records import FloatArray, IntArray, Marking, Symbol
 _CELL_M = 0.01
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
 
-_COARSE_M = 0.05
-"""Cells, m, of the raster that overlaps are measured on."""
-
-_COMMON = 0.5
-"""Outlines are of one symbol if they share this part of the smaller one's area."""
+_COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
+_COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
 
 
 def map_symbols(

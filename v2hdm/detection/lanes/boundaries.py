@@ -61,22 +61,12 @@ _CROSSING_M = 0.3
 _DOUBLE_M = 0.75
 """Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
 
-_LEAST_ABREAST_M = 1.0
-"""Both strands of a double line show paint on so much ground abreast."""
-
-_ONE_LINE_M = 0.12
-"""Lines nearer to each other than this are one."""
-
-_CERTAIN_SIGMA_M = 0.3
-"""Rows on which a line is known worse than this do not show its place beside others."""
-
-_EVEN = 0.5
-"""A line is where it is present rather than not."""
-
+_LEAST_ABREAST_M = 1.0  # both strands of a double line show paint on so much ground abreast
+_ONE_LINE_M = 0.12  # lines nearer to each other than this are one
+_CERTAIN_SIGMA_M = 0.3  # rows on which a line is known worse than this do not show its place beside others
+_EVEN = 0.5  # a line is where it is present rather than not
 _SMOOTH_PX = 24.0
-_FREEDOM_M = 0.03
-"""A line follows its points within such a distance, and by so much."""
-
+_FREEDOM_M = 0.03  # a line follows its points within such a distance, and by so much
 _EXTENSION_SIGMA = 0.03
 """Beyond its own points a line is drawn while it is known within this share of the image's width."""
 
@@ -104,9 +94,7 @@ AMONG = ("alone", "near_horizon", *SPAN, "a_lane_apart", "too_near")
 the others that run beside it, weighed by their probability, the likest one a lane away and the number of
 those nearer than a lane can be."""
 
-_NO_PAINT = -3.0
-"""Log odds of the surest paint of a line that shows none."""
-
+_NO_PAINT = -3.0  # log odds of the surest paint of a line that shows none
 _BEST = 3
 _MOST_LOG_RATIO = 6.0
 _UNKNOWN = (2.3, 0.4)
@@ -116,16 +104,10 @@ _PLACES = 24
 _ON_M = np.linspace(-0.25, 0.25, 7)
 """Paint of a line, be it a double one, is within such a distance of where it is drawn."""
 
-_LEAST_WEIGHT = 0.05
-"""Places without paint have this weight, that of paint being one."""
-
-_LANE_M, _LANE_SIGMA_M = 3.2, 0.65
-"""Lanes of roads are 2.5 to 4 m wide."""
-
+_LEAST_WEIGHT = 0.05  # places without paint have this weight, that of paint being one
+_LANE_M, _LANE_SIGMA_M = 3.2, 0.65  # lanes of roads are 2.5 to 4 m wide
 _TOO_NEAR_M = 1.8
-_MOST_NEAR = 2.0
-"""More lines than this add nothing."""
-
+_MOST_NEAR = 2.0  # more lines than this add nothing
 _CHANGE_M, _CHANGE_SHARE = 0.15, 0.06
 """The distance between lines that run beside each other changes by so much and by this share of it."""
 
