@@ -207,13 +207,10 @@ def _sees(
 ) -> NDArray[np.bool_]:
     """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
     corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners_map)
-    if within_m is None:
-        inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
-    else:
-        away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
-        inside = np.asarray(away_m <= within_m).all(axis=1)
+    away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
+    near = inside_convex(camera.roi_vehicle, corners_vehicle) if within_m is None else away_m <= within_m
     pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
     limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
     with np.errstate(invalid="ignore"):
         on_image = ((pixel > _BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
-    return np.asarray(inside & on_image)
+    return np.asarray(near.all(axis=1) & on_image)

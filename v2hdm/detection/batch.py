@@ -139,10 +139,8 @@ def own_vehicles(drive: Drive, detector: Detector) -> dict[str, BoolArray]:
     """Masks (height, width) of the vehicle itself, learnt for those cameras that have none and show it."""
     masks = {}
     for name, camera in drive.cameras.items():
-        if camera.own_vehicle is not None:
-            continue
-        mask = _learn(detector, [image for image in drive.images if image.camera == name], camera)
-        if mask is not None:
+        images = [image for image in drive.images if image.camera == name]
+        if camera.own_vehicle is None and (mask := _learn(detector, images, camera)) is not None:
             masks[name] = mask
             _log.info("camera %s: %.1f %% of the image is the vehicle itself", name, 100 * mask.mean())
     return masks

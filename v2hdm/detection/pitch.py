@@ -53,7 +53,6 @@ def estimate_pitch(lanes: Sequence[LaneDetection], camera: RoadCamera) -> Pitch 
         return None
     place, slope, covariance = (np.array(column) for column in zip(*lines, strict=True))
     x, y = float(np.median(place + slope * guess_px)), guess_px
-    weight = np.ones(len(lines))
     for _ in range(_STEPS):
         design = np.column_stack([np.ones(len(lines)), -slope])
         gradient = np.array([1.0, y])

@@ -69,20 +69,14 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
     out = []
     for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
-        clocks = {}
+        here, clocks = [one for one in score_tests if one.about in ("", f"in {place.name}")], {}
         for name in outcome.inputs.sightings.cameras:
-            if (visit, name) not in applied_s:
-                continue
-            beyond_s, sigma_s = estimated.get(name, (0.0, 0.0))
-            if name not in estimated:
-                # Of each camera, and of all of them together: a clock of its own may differ by both.
-                tested = [
-                    one.sigma**2
-                    for one in score_tests
-                    if name in one.cameras and one.about in ("", f"in {place.name}")
-                ]
-                sigma_s = float(np.sqrt(sum(tested))) if tested else float("inf")
-            clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
+            # Of each camera, and of all of them together: a clock of its own may differ by both.
+            tested = [one.sigma**2 for one in here if name in one.cameras]
+            unobserved = 0.0, float(np.sqrt(sum(tested))) if tested else float("inf")
+            beyond_s, sigma_s = estimated.get(name, unobserved)
+            if (visit, name) in applied_s:
+                clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
         out.append(clocks)
     return tuple(out)
 

@@ -168,9 +168,7 @@ def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
     if one.fault not in (Fault.SURVEY, Fault.LEVER):
         return True
-    names = list(bundle.camera_index)
-    own = names if one.camera < 0 else [names[one.camera]]
-    return all(drive.cameras[name].centre_prior is not None for name in own)
+    return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
 
 
 def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
@@ -243,14 +241,12 @@ def is_contradicted(one: ScoreTest | Contradiction) -> bool:
 
 
 def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
-    offset_s = bundle.solution.clock_offset_s
+    offset_s = bundle.solution.clock_offset_s.T.tolist()
     if not bundle.model.solver.clock_offset:
-        return tuple({} for _ in offset_s.T)
-    sigma = np.sqrt(bundle.solution.covariance.clock_s2())
-    return tuple(
-        {name: (float(offset_s[c, v]), float(sigma[c, v])) for name, c in bundle.camera_index.items()}
-        for v in range(offset_s.shape[1])
-    )
+        return tuple({} for _ in offset_s)
+    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()
+    index, visits = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
+    return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in visits)
 
 
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
@@ -262,19 +258,19 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
         if worst.sigma > CENTRE_OBSERVABLE_M:
             return None
-        names = tuple(settled.camera_index)
-        return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
+        return _without_axis(inputs, _cameras_of(settled, worst), worst.axis)
     options = inputs.options
     if worst.fault is Fault.SIZE:
         # One wrong size says that the paint is of another standard; the others' corners may only look like
         # outliers, which a robust loss hides from the tests.
-        sizes = replace(options.known_sizes, by_class_m={})
-        return replace(inputs, options=replace(options, known_sizes=sizes))
-    if worst.fault in (Fault.CONTROL, Fault.DATUM):
-        point = _point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
-        survey = options.survey.only([]) if point is None else options.survey.without(point)
-        return replace(inputs, options=replace(options, survey=survey))
-    return None
+        options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
+    elif worst.fault is Fault.CONTROL:
+        options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
+    elif worst.fault is Fault.DATUM:
+        options = replace(options, survey=options.survey.only([]))
+    else:
+        return None
+    return replace(inputs, options=options)
 
 
 def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
@@ -313,19 +309,23 @@ def _contradictions(
     bundle: Bundle, found: Sequence[ScoreTest], visits: Sequence[str] = ()
 ) -> tuple[Contradiction, ...]:
     """``found`` in the bundle's problem, in the words of the user's inputs; several ``visits`` are named."""
-    names = tuple(bundle.camera_index)
     return tuple(
         Contradiction(
-            one.fault,
-            names if one.camera < 0 else (names[one.camera],),
-            one.axis,
-            _about(bundle, one, visits),
-            one.value,
-            one.sigma,
-            one.sigmas,
+            fault=one.fault,
+            cameras=_cameras_of(bundle, one),
+            axis=one.axis,
+            about=_about(bundle, one, visits),
+            value=one.value,
+            sigma=one.sigma,
+            sigmas=one.sigmas,
         )
         for one in found
     )
+
+
+def _cameras_of(bundle: Bundle, test: ScoreTest) -> tuple[str, ...]:
+    names = tuple(bundle.camera_index)
+    return names if test.camera < 0 else (names[test.camera],)
 
 
 def _point_of(bundle: Bundle, item: int) -> str:
