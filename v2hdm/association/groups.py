@@ -32,7 +32,7 @@ LEAST_TOLERANCE_M = 0.05
 _CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
 _HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls
 
-OPEN_END_M = 10.0
+_OPEN_END_M = 10.0
 """Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
 
 
@@ -129,7 +129,7 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     point = association.in_group_order(located.valid) & grouped
     noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
     on_line = known_elsewhere(association, located.valid, located.informs)
-    noise[on_line] = line_only(noise[on_line], OPEN_END_M)
+    noise[on_line] = line_only(noise[on_line], _OPEN_END_M)
     covariance = association.in_group_order(noise) + _CORNER_FLOOR_M**2 * np.eye(2)
     information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
     corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)

@@ -74,11 +74,10 @@ def collect_symbols(
     )
 
 
-SIDE_SIGMA_PX = 3.0
+_SIDE_SIGMA_PX = 3.0
 """Largest sigma across, px, of a corner that is known to lie on a line; a vaguer one says next to nothing."""
 
-POINT_SIGMA_PX = 10.0
-"""Largest sigma, px, that a detector states for a corner that it takes for a point."""
+_POINT_SIGMA_PX = 10.0  # largest sigma, px, that a detector states for a corner that it takes for a point
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Sightings:
         finite = np.asarray(np.isfinite(self.covariance_px).all(axis=(2, 3)))
         finite &= np.isfinite(self.corners_pinhole_px).all(axis=2)
         variance = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance_px, np.eye(2)))
-        line = (variance[..., 0] <= SIDE_SIGMA_PX**2) & (variance[..., 1] > POINT_SIGMA_PX**2)
+        line = (variance[..., 0] <= _SIDE_SIGMA_PX**2) & (variance[..., 1] > _POINT_SIGMA_PX**2)
         return np.asarray(finite & (self.valid | line))
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:

@@ -29,7 +29,7 @@ FARTHEST_M = 60.0
 
 _SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
-FINE_ENOUGH_M = 0.007
+_FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
 
 ASIDE_RAD = np.deg2rad(60)
@@ -37,7 +37,7 @@ ASIDE_RAD = np.deg2rad(60)
 
 _LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
 
-CURVE_UNIT_PX = 100.0
+_CURVE_UNIT_PX = 100.0
 """Unit of the distance below the horizon in the basis of lanes' curves: their parameters are alike."""
 
 _PROBE_PX = 50.0
@@ -54,7 +54,7 @@ class RoadCamera:
     the image rows below the horizon of the camera's initial IPM (with a margin, since that IPM is coarse; the
     rows from there on are a multiple of ``multiple`` where the image is tall enough). ``far_row``, by a
     multiple of ``multiple`` below ``top``, is the one from which on ground within :data:`FARTHEST_M` shows.
-    From ``fine_row`` on (None if there is no such row) a pixel is less than :data:`FINE_ENOUGH_M` of ground
+    From ``fine_row`` on (None if there is no such row) a pixel is less than ``_FINE_ENOUGH_M`` of ground
     wide. ``aside`` cameras look across the way that the vehicle drives. ``foot_vehicle`` (2,) lies below the
     camera. Points far from any lens singularity are assumed.
     """
@@ -192,7 +192,7 @@ class RoadCamera:
         rows = np.arange(self.top, self.info.height, dtype=np.float64)
         columns = (self.info.width - 1) / 2 + np.array([-0.5, 0.5])
         ends = self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
-        coarse = ~(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) <= FINE_ENOUGH_M)
+        coarse = ~(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) <= _FINE_ENOUGH_M)
         first = int(np.flatnonzero(coarse)[-1]) + 1 if coarse.any() else 0
         return self.top + first if first < len(rows) else None
 
@@ -266,8 +266,8 @@ class Horizon:
         probe_px_per_m = 1.0 / max(float(np.linalg.norm(ground[1] - ground[0])), 1e-9)
         self.px_per_m = probe_px_per_m / _PROBE_PX
         range_m = float(camera.range_m(ground.mean(axis=0)))
-        by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / CURVE_UNIT_PX
-        self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * CURVE_UNIT_PX, by_curvature])
+        by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / _CURVE_UNIT_PX
+        self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * _CURVE_UNIT_PX, by_curvature])
 
     def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
         """The a, b and c (3,) of a line's direction, place beside the camera and curvature, 1/m.
@@ -278,7 +278,7 @@ class Horizon:
 
     def basis(self, below: FloatArray) -> FloatArray:
         """The factors (N, 3) of a curve's a, b and c at distances (N,) below the horizon, px."""
-        v = np.maximum(below, _LEAST_BELOW_PX) / CURVE_UNIT_PX
+        v = np.maximum(below, _LEAST_BELOW_PX) / _CURVE_UNIT_PX
         phi = np.ones((len(v), 3))
         phi[:, 1], phi[:, 2] = v, 1.0 / v
         return phi

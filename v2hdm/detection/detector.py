@@ -159,14 +159,11 @@ class Detector:
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
-    expected = (camera.info.height, camera.info.width, 3)
+    expected, problem = (camera.info.height, camera.info.width, 3), None
     if not isinstance(image_bgr, np.ndarray):
-        raise DetectorError(
-            f"camera '{camera.info.name}': got no image but {shown(image_bgr)}; cv2.imread gives None where "
-            "there is no file"
-        )
-    if image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
-        raise DetectorError(
-            f"camera '{camera.info.name}': got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
-            f"says {expected} uint8; mend the camera_info or pick the images that belong to it"
-        )
+        problem = f"no image but {shown(image_bgr)}; cv2.imread gives None where there is no file"
+    elif image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
+        problem = f"an image {image_bgr.shape} {image_bgr.dtype}, its camera_info says {expected} uint8; "
+        problem += "mend the camera_info or pick the images that belong to it"
+    if problem:
+        raise DetectorError(f"camera '{camera.info.name}': got {problem}")

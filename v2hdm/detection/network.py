@@ -34,8 +34,6 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
     # float32 as on the CPU, and one algorithm each time: detections do not depend on the process.
     "cuda": ("CUDAExecutionProvider", {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}),
 }
-_FALLBACK = {"cpu": [], "cuda": ["CPUExecutionProvider"]}
-"""For the few operations that a device does not have."""
 
 _OVERLAP_PX = 64  # overlap of the two resolutions, so that either has its surroundings where they are joined
 _GRID_PX = 16  # the seam is on the grid of all outputs; the network's own multiple may be larger
@@ -321,13 +319,14 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
-        provider, settings = _PROVIDERS[device]
-        providers = [(provider, settings), *_FALLBACK[device]]
-        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+        # The CPU does the few operations that a device does not have.
+        providers = [_PROVIDERS[name] for name in dict.fromkeys((device, "cpu"))]
+        session = onnxruntime.InferenceSession(str(path), options, providers)
     except Exception as error:
         problem = f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
         raise DetectorError(problem) from error
     # Where the driver or cuDNN fails, onnxruntime goes on without a word on the CPU.
+    provider = _PROVIDERS[device][0]
     if provider not in session.get_providers():
         raise DetectorError(
             f"detector.device is {device}, but onnxruntime could not start {provider}: check the driver, "

@@ -42,7 +42,7 @@ from v2hdm.records import (
     MarkingDetection,
 )
 
-LANE_SIGMA_PX = 1.0
+_LANE_SIGMA_PX = 1.0
 """Standard deviation of a point of a lane's paint; points of whole lines have a sigma of their own."""
 
 _PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
@@ -178,7 +178,7 @@ def _marking(image: MarkingDetection, ground: GroundPoints) -> RoadMarking:
 
 
 def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
-    sigma_px = LANE_SIGMA_PX if image.sigma_px is None else image.sigma_px
+    sigma_px = _LANE_SIGMA_PX if image.sigma_px is None else image.sigma_px
     return RoadLane(image, ground.points_vehicle, ground.single_covariances(sigma_px))
 
 

@@ -51,7 +51,7 @@ def vehicle_twists(
     return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
 
 
-UNSURVEYED_CENTRE_SIGMA_M = 0.3
+_UNSURVEYED_CENTRE_SIGMA_M = 0.3
 """How well, m, a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
 
 HEAVE_SIGMA_M = 0.01
@@ -62,7 +62,7 @@ Solve = Callable[[Problem, SolveOptions], Solution]
 LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
 
-OPEN_END_PX = 1000.0
+_OPEN_END_PX = 1000.0
 """Sigma, px, of where along its side a corner lies that is no point: anywhere in the image."""
 
 VARIANCE_FACTORS = (0.05, 20.0)
@@ -190,7 +190,7 @@ def solve_bundle(
     own_corner = association.corner_order()[row, corner]
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
-    covariance_px[on_line] = line_only(covariance_px[on_line], OPEN_END_PX)
+    covariance_px[on_line] = line_only(covariance_px[on_line], _OPEN_END_PX)
     observations = Observations(
         camera=used.camera.astype(np.int64),
         frame=used.frame.astype(np.int64),
@@ -234,7 +234,7 @@ def _problem(
     """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
     # Camera centres are surveyed, or else implied by the starting extrinsic.
     centre = camera_centre(rig.cam_from_vehicle[used.cameras])
-    sigma = np.full_like(centre, UNSURVEYED_CENTRE_SIGMA_M)
+    sigma = np.full_like(centre, _UNSURVEYED_CENTRE_SIGMA_M)
     for c, camera in enumerate(cameras):
         if camera.centre_prior is not None:
             centre[c], sigma[c] = camera.centre_prior.centre_vehicle, camera.centre_prior.sigma_m

@@ -38,13 +38,13 @@ from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, lar
 
 _log = logging.getLogger(__name__)
 
-SETTLED_MODEL = "heave"
+_SETTLED_MODEL = "heave"
 """Pose model of the solves between which associations still change: it leaves no error of a pose out."""
 
-STEEP_SINE = 0.15
+_STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
 
-LOOSE_CLOCK_SIGMA_S = 0.3
+_LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 
@@ -70,7 +70,7 @@ class Optimiser:
         self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)
         self._options = options
-        self.pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
@@ -120,7 +120,7 @@ class Optimiser:
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
         model = full_model(self._noise_of_visits, self._options, "clock", bundle.model.variance_factor)
-        model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
+        model = replace(model, clock_sigma_s=_LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
@@ -205,7 +205,7 @@ class Optimiser:
     def _solve_steep(self, tracks: Association) -> Bundle:
         located = self._locate(self.initial_rig)
         sine = np.where(located.valid, located.sine_depression, np.nan)
-        threshold = min(STEEP_SINE, float(np.nanmedian(sine)))
+        threshold = min(_STEEP_SINE, float(np.nanmedian(sine)))
         with np.errstate(invalid="ignore"):
             steep = located.valid & (sine >= threshold)
         return self._solve(tracks, steep, self.initial_rig, coarse=True)
@@ -235,8 +235,8 @@ class Optimiser:
         try:
             selection = select_model(start, bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the pose model stays %r, since none could be chosen: %s", SETTLED_MODEL, failure)
-            return SETTLED_MODEL
+            _log.warning("the pose model stays %r, since none could be chosen: %s", _SETTLED_MODEL, failure)
+            return _SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name

@@ -54,20 +54,20 @@ be, and takes up what is left of other errors: of k1 on a straight street (.04),
 OBSERVABLE_SIGMA = {fault: sigma for fault, (_, sigma) in _LIMITS.items()}
 """Sigma, in the fault's unit, up to which a drive observes it."""
 
-LOOSE_CENTRE_SIGMA_M = 10.0
+_LOOSE_CENTRE_SIGMA_M = 10.0
 """Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
 
-AMBIGUOUS_SHARE = 0.8
+_AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
 CLOCK_OBSERVABLE_S = 0.004
 """Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
 
-CENTRE_OBSERVABLE_M = 0.1
+_CENTRE_OBSERVABLE_M = 0.1
 """Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
 
-MOST_CORRECTIONS = 4
+_MOST_CORRECTIONS = 4
 """Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
 
 
@@ -139,7 +139,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         worst = next((one for one in found if is_contradicted(one)), None)
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
         left = None
-        if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
+        if worst is not None and len(corrected) < _MOST_CORRECTIONS and not _is_ambiguous(worst, found):
             left = _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
@@ -231,7 +231,7 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
         and min(one.camera, worst.camera) >= 0
         and one.camera != worst.camera
     ]
-    return max(rivals, default=0.0) > AMBIGUOUS_SHARE * worst.sigmas
+    return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
 
 
 def is_contradicted(one: ScoreTest | Contradiction) -> bool:
@@ -256,7 +256,7 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
             return None
         return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
-        if worst.sigma > CENTRE_OBSERVABLE_M:
+        if worst.sigma > _CENTRE_OBSERVABLE_M:
             return None
         return _without_axis(inputs, _cameras_of(settled, worst), worst.axis)
     options = inputs.options
@@ -297,10 +297,10 @@ def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | N
     cameras = dict(inputs.drive.cameras)
     for name in names:
         prior = cameras[name].centre_prior
-        if prior is None or prior.sigma_m[axis] >= LOOSE_CENTRE_SIGMA_M:
+        if prior is None or prior.sigma_m[axis] >= _LOOSE_CENTRE_SIGMA_M:
             return None
         sigma_m = prior.sigma_m.copy()
-        sigma_m[axis] = LOOSE_CENTRE_SIGMA_M
+        sigma_m[axis] = _LOOSE_CENTRE_SIGMA_M
         cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
     return replace(inputs, drive=replace(inputs.drive, cameras=cameras))
 

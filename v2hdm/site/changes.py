@@ -92,10 +92,10 @@ def _repainted(old: Marking, new: Marking, turn: int) -> Marking:
     )
 
 
-DRIFT_OVER_M = 30.0
+_DRIFT_OVER_M = 30.0
 """Distance over which the error that a map's markings share fades, m, where the map does not say."""
 
-LIKELY = 0.5
+_LIKELY = 0.5
 """Probability from which a marking is reported as moved, gone or new paint: the likelier of the two."""
 
 _LEAST_PAIRED = 0.3
@@ -144,7 +144,7 @@ def update_map(
         MappingError: the drive finds too little of the map again to be of its site.
     """
     old, new = base.hd_map.markings, made.markings
-    of_old = Errors.of(old, base.hd_map.drift_over_m or DRIFT_OVER_M)
+    of_old = Errors.of(old, base.hd_map.drift_over_m or _DRIFT_OVER_M)
     of_new = Errors.of(new, drift_over_m)
     rates = find_rates(observer, new)
     now, before = observer.looks(old, ~mapped), _looks_of(base, new, observer)
@@ -165,7 +165,7 @@ def update_map(
     known = [one.id or 0 for some in (old, base.hd_map.lanes, base.hd_map.symbols) for one in some]
     number = itertools.count(1 + max([base.hd_map.largest_id, *known])).__next__
     fresh = {k: replace(one, id=number()) for k, one in by_new.items()}
-    gone = {k for k, probability in decision.gone.items() if probability > LIKELY}
+    gone = {k for k, probability in decision.gone.items() if probability > _LIKELY}
     updated = replace(
         base.hd_map,
         markings=(*(one for k, one in by_old.items() if k not in gone), *fresh.values()),
@@ -180,7 +180,7 @@ def update_map(
     for pair in decision.pairs:
         names.id[pair.new] = by_old[pair.old].id or 0
         names.corner[pair.new] = np.argsort(SHIFTS[pair.turn])
-    same = sum(pair.moved <= LIKELY for pair in decision.pairs)
+    same = sum(pair.moved <= _LIKELY for pair in decision.pairs)
     shift_m = decision.shift.off_map.mean(axis=0) if len(decision.shift.old) else np.zeros(2)
     changes = _changes(decision, old, by_old, fresh, now, before)
     return updated, Changes(tuple(changes), same, shift_m), names
@@ -210,7 +210,7 @@ def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Look
 def _check_site(decision: Decision, now: Looks, count: int) -> None:
     """Refuse a map of which the drive finds nearly nothing where it looked."""
     paired = np.zeros(count, dtype=bool)
-    paired[[pair.old for pair in decision.pairs if pair.moved <= LIKELY]] = True
+    paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
     looked = (now.views >= _LOOKED) | paired
     if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
         raise MappingError(
@@ -230,7 +230,7 @@ def _changes(
     """What has moved, what is missing and what is new, by the looks at the old places and at the new."""
     shift, out = decision.shift, []
     for pair in decision.pairs:
-        if pair.moved <= LIKELY:
+        if pair.moved <= _LIKELY:
             continue
         k, after = pair.old, by_old[pair.old]
         mean, spread = shift.of_old_at(shift.of_old.centres_map[[k]], shift.of_old.shared_m2[[k]])
@@ -242,13 +242,13 @@ def _changes(
         course = placed, after.corners_map, moved, sigma, *numbers
         out.append(Change(old[k].id or 0, old[k].kind, Fate.MOVED, *course))
     for k, gone in decision.gone.items():
-        fate, corners = Fate.VANISHED if gone > LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
+        fate, corners = Fate.VANISHED if gone > _LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
         numbers = max(gone, 1 - gone), int(now.views[k]), int(now.found[k]), old[k].sightings
-        left = None if gone > LIKELY else corners
+        left = None if gone > _LIKELY else corners
         out.append(Change(old[k].id or 0, old[k].kind, fate, corners, left, None, None, *numbers))
     for k, one in fresh.items():
         new = decision.fresh[k]
-        fate = Fate.NEW if new > LIKELY else Fate.FIRST_SEEN
+        fate = Fate.NEW if new > _LIKELY else Fate.FIRST_SEEN
         numbers = max(new, 1 - new), int(before.views[k]), int(before.found[k]), one.sightings
         out.append(Change(one.id or 0, one.kind, fate, None, one.corners_map, None, None, *numbers))
     return out

@@ -23,13 +23,11 @@ from v2hdm.geometry.quadrilateral import SHIFTS, align
 from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
 
-MOVED_SIGMA_M = 0.5
+_MOVED_SIGMA_M = 0.5
 """Sigma of how far a marking is painted from where it was, m a coordinate: a new line of the same bay."""
 
-TURNED_SIGMA_RAD = 0.2
-"""Sigma of how far it is turned then, rad."""
-
-_REACH_M = 4 * MOVED_SIGMA_M  # markings farther apart are never one, m
+_TURNED_SIGMA_RAD = 0.2  # sigma of how far it is turned then, rad
+_REACH_M = 4 * _MOVED_SIGMA_M  # markings farther apart are never one, m
 _OTHER_SHAPE_M = 0.1
 """Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
 
@@ -231,7 +229,7 @@ def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates:
         noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
         # In the basis a shift counts twice its length, a turn by its arm.
         free = np.zeros(8)
-        free[:2], free[2] = (2 * MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * TURNED_SIGMA_RAD) ** 2
+        free[:2], free[2] = (2 * _MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * _TURNED_SIGMA_RAD) ** 2
         out[p, STAYED] = rates.stayed + _read(off, noise)
         out[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
     return out

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
-UNKNOWN_SIGMA_M = 0.02
+_UNKNOWN_SIGMA_M = 0.02
 """Sigma of a corner of a map that states none, m a coordinate: a marking drawn by hand over an image."""
 
 _LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
@@ -46,7 +46,7 @@ class Errors:
     def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
         """The errors that ``markings`` state: covariance in all, relative sigma alone."""
         centres = np.array([one.corners_map.mean(axis=0) for one in markings]).reshape(-1, 2)
-        unknown = np.eye(8) * UNKNOWN_SIGMA_M**2
+        unknown = np.eye(8) * _UNKNOWN_SIGMA_M**2
         stated = [unknown if one.covariance_m2 is None else one.covariance_m2 for one in markings]
         relative_m = [np.nan if one.relative_sigma_m is None else one.relative_sigma_m for one in markings]
         whole, own_m2 = np.array(stated).reshape(-1, 8, 8), np.array(relative_m) ** 2

@@ -24,7 +24,7 @@ OF_SYMBOL = "part of a symbol, such as an arrow"
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 COVERED = "lies on a better supported marking"
-CLUTTER_BY = (
+_CLUTTER_BY = (
     "not shaped like a marking of its class",
     "seen in too few images",
     "found in too few of its images",
@@ -137,7 +137,7 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
     least = np.log(options.min_probability / (1 - options.min_probability))
     part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
     verdict: list[str | None] = [
-        None if odds >= least else OF_SYMBOL if part[group] else CLUTTER_BY[found.evidence[group].argmin()]
+        None if odds >= least else OF_SYMBOL if part[group] else _CLUTTER_BY[found.evidence[group].argmin()]
         for group, odds in enumerate(found.log_odds)
     ]
     sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
@@ -174,7 +174,7 @@ def _overlap(a: FloatArray, b: FloatArray) -> float:
 JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""
 
-NEIGHBOUR_M = 10.0
+_NEIGHBOUR_M = 10.0
 """How far apart markings are compared, m: about a vehicle's length, over which it manoeuvres."""
 
 _FARTHEST_M = 15.0  # a marking without another one within so many metres has no relative standard deviation
@@ -194,7 +194,9 @@ def with_relative_sigma(
     if not len(seen):
         return tuple(markings)
     chosen = [markings[m] for m in seen.tolist()]
-    diagonal = _diagonals(corner_index[seen])
+    # Two corners that are opposite each other: of a marking at least three are known.
+    even, odd = corner_index[seen][:, [0, 2]], corner_index[seen][:, [1, 3]]
+    diagonal = np.where((even >= 0).all(axis=1, keepdims=True), even, odd)
     first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
     if not len(first):
         return tuple(markings)
@@ -221,11 +223,5 @@ def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
         if len(others):
             distance_m = np.linalg.norm(centres_map[others] - centres_map[own], axis=1)
             first.append(own)
-            second.append(int(others[np.argmin(np.abs(distance_m - NEIGHBOUR_M))]))
+            second.append(int(others[np.argmin(np.abs(distance_m - _NEIGHBOUR_M))]))
     return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
-
-
-def _diagonals(corner_index: IntArray) -> IntArray:
-    """Of markings (M, 4) of which three corners are known, two (M, 2) that are opposite each other."""
-    even = np.asarray((corner_index[:, [0, 2]] >= 0).all(axis=1, keepdims=True))
-    return np.where(even, corner_index[:, [0, 2]], corner_index[:, [1, 3]])

@@ -29,9 +29,7 @@ from v2hdm.detection.network import as_probability
 from v2hdm.detection.weights import LANE_SCORE_FILE
 from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, FloatArray, IntArray, LaneDetection
 
-DRAWN_STEP_PX = 8.0
-"""Rows of the image from one point of a line to the next, px."""
-
+_DRAWN_STEP_PX = 8.0  # rows of the image from one point of a line to the next, px
 _ENDED, _GAP, _SOLID, _DASH = range(4)
 _DASH_STAGES = 3
 """Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
@@ -85,11 +83,11 @@ image and down the image (upright things are as tall as they are long); the log 
 road; the log odds of its surest paint; the mean log odds of paint along it, and the share of that which the
 network takes for dashes."""
 
-SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
+_SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
 """Features of a line's span: the root of its log likelihood, the length of ground on which it is present,
 that on which it shows paint between its points, and the share of rows there that do."""
 
-AMONG = ("alone", "near_horizon", *SPAN, "a_lane_apart", "too_near")
+AMONG = ("alone", "near_horizon", *_SPAN, "a_lane_apart", "too_near")
 """Features of a line among others: its log odds alone, how far from the horizon it begins, its span; and of
 the others that run beside it, weighed by their probability, the likest one a lane away and the number of
 those nearer than a lane can be."""
@@ -120,7 +118,7 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     corners = (camera.info.height - 1.0) * np.array([[0.0, 1.0], [0.0, 1.0]])
     corners[1, 0] = camera.info.width - 1.0
     lowest = float(horizon.coordinates(camera.undistort(corners))[1].max())
-    below = np.arange(horizon.below_px(FARTHEST_M), lowest + DRAWN_STEP_PX, DRAWN_STEP_PX)
+    below = np.arange(horizon.below_px(FARTHEST_M), lowest + _DRAWN_STEP_PX, _DRAWN_STEP_PX)
     along = np.array([line.curve.parameters for line in lines]) @ horizon.basis(below).T
     beside_m = (along - horizon.centre_px) / (horizon.px_per_m * below)
     step_m = np.hypot(np.diff(horizon.depth_m(below)), np.diff(beside_m, axis=1))
@@ -279,7 +277,7 @@ def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | No
         return None
     points_px = camera.distort(image.horizon.pinhole_px(along, below))
     own = points.below[line.members]
-    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -DRAWN_STEP_PX)
+    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -_DRAWN_STEP_PX)
     kept &= (sigma < _EXTENSION_SIGMA * camera.info.width) | ((below >= own.min()) & (below <= own.max()))
     if kept.sum() < 2:
         return None
