@@ -43,8 +43,9 @@ def check_weights(folder: Path = FOLDER) -> None:
     Raises:
         DetectorError: a file is missing, is not the one of the manifest, or goes with another network.
     """
-    if not _being_fitted:
-        _check(folder)
+    problem = None if _being_fitted else _problem(folder)
+    if problem is not None:
+        raise DetectorError(problem)
 
 
 @contextmanager
@@ -99,7 +100,8 @@ def digest(path: Path) -> str:
 
 
 @cache
-def _check(folder: Path) -> None:
+def _problem(folder: Path) -> str | None:
+    """The defect of a folder's files, in one line; None if they belong together."""
     files = read_manifest(folder)["files"]
     for name, command in COMMANDS.items():
         path, problem = folder / name, None
@@ -111,4 +113,5 @@ def _check(folder: Path) -> None:
         elif files[name]["network"] != files[NETWORK_FILE.name]["sha256"]:
             problem = f"was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
         if problem:
-            raise DetectorError(f"{path}: {problem}")
+            return f"{path}: {problem}"
+    return None
