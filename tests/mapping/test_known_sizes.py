@@ -57,7 +57,7 @@ def test_a_joint_solve_keeps_to_the_sizes() -> None:
     sightings = collect_sightings(scene.drive, scene.detections, ("front", "rear"))
     views = views_of(scene.drive, ("front", "rear"))
     options = MappingOptions(pose_model="heave")
-    optimiser = Optimiser(sightings, views, scene.drive.cameras, scene.drive.pose_noise, options)
+    optimiser = Optimiser(sightings, views, scene.drive.cameras, scene.drive.noises, options)
     bundle = optimiser.run(optimiser.initial_tracks()).bundle
     spread = []
     for sizes in (SizeOptions(), SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)):
@@ -81,7 +81,7 @@ def test_a_map_that_grows_marking_by_marking_keeps_to_the_sizes() -> None:
     views, noise = views_of(scene.drive, ("front", "rear")), scene.drive.pose_noise
     sizes = SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)
     options = MappingOptions(mode="incremental", pose_model="heave", known_sizes=sizes)
-    solved = Optimiser(sightings, views, scene.drive.cameras, noise, options).grow()
+    solved = Optimiser(sightings, views, scene.drive.cameras, (noise,), options).grow()
     assert solved.problem.lengths is not None
     long_m = np.array([_diagonals(c)[0] for c in solved.corners_map if np.isfinite(c).all()])
     near = long_m[np.abs(long_m - true[0]) < 0.15 * true[0]]

@@ -149,6 +149,8 @@ def _report(stopwatch: Stopwatch) -> None:
     """How long it took, on stderr."""
     import numpy as np
 
+    from v2hdm.detection.stopwatch import TOTAL
+
     if not stopwatch.images:
         print("no images", file=sys.stderr)
         return
@@ -156,8 +158,8 @@ def _report(stopwatch: Stopwatch) -> None:
     print(f"{'latency, ms':12s} {'p50':>7s} {'p90':>7s} {'p99':>7s}", file=sys.stderr)
     first = [stage for stage in _STAGES if stage in stopwatch.stages]
     times_s = {stage: stopwatch.times_s(stage) for stage in dict.fromkeys([*first, *stopwatch.stages])}
-    times_s["other"] = stopwatch.total_s() - sum(times_s.values())
-    times_s["all"] = stopwatch.total_s()
+    times_s["other"] = stopwatch.times_s(TOTAL) - sum(times_s.values())
+    times_s[TOTAL] = stopwatch.times_s(TOTAL)
     for stage, seconds in times_s.items():
         p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
         print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)

@@ -38,13 +38,13 @@ from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, lar
 
 _log = logging.getLogger(__name__)
 
-SETTLED_MODEL = "heave"
+_SETTLED_MODEL = "heave"
 """Pose model of the solves between which associations still change: it leaves no error of a pose out."""
 
-STEEP_SINE = 0.15
+_STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
 
-LOOSE_CLOCK_SIGMA_S = 0.3
+_LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 
@@ -60,32 +60,23 @@ class Optimiser:
         sightings: Sightings,
         views: Views,
         cameras: Mapping[str, Camera],
-        pose_noise: PoseNoise | Sequence[PoseNoise],
+        pose_noise: Sequence[PoseNoise],
         options: MappingOptions,
         executor: Executor = IN_PROCESS,
     ) -> None:
-        """``pose_noise`` is that of all visits, or of each; gates take the largest of each kind."""
-        self._executor = executor
-        self._sightings = sightings
-        self._views = views
+        """``pose_noise`` is that of each visit; gates take the largest of each kind."""
+        self._executor, self._sightings, self._views = executor, sightings, views
         self._cameras = {name: cameras[name] for name in sightings.cameras}
-        visits = int(sightings.visit.max(initial=0)) + 1
-        self._noise_of_visits = (
-            visits * (pose_noise,) if isinstance(pose_noise, PoseNoise) else tuple(pose_noise)
-        )
+        self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)
         self._options = options
-        self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
         self.growth: tuple[tuple[Marking, ...], ...] = ()
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
-
-    @property
-    def pose_model(self) -> str:
-        """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
-        return self._pose_model
 
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
@@ -114,9 +105,10 @@ class Optimiser:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
-            self._pose_model = self._choose_pose_model(bundle)
+            self.pose_model = self._choose_pose_model(bundle)
         progress("final solve")
-        usable, inlier = self._gate(bundle)
+        inlier, usable = bundle.inliers, np.zeros_like(self._sightings.valid)
+        usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         final = self._solve(bundle.association, usable, bundle.rig)
         return conclude(
             Evidence(self._sightings, self._views, self._cameras, final, bundle, inlier, usable),
@@ -128,7 +120,7 @@ class Optimiser:
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
         model = full_model(self._noise_of_visits, self._options, "clock", bundle.model.variance_factor)
-        model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
+        model = replace(model, clock_sigma_s=_LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
@@ -213,22 +205,19 @@ class Optimiser:
     def _solve_steep(self, tracks: Association) -> Bundle:
         located = self._locate(self.initial_rig)
         sine = np.where(located.valid, located.sine_depression, np.nan)
-        threshold = min(STEEP_SINE, float(np.nanmedian(sine)))
+        threshold = min(_STEEP_SINE, float(np.nanmedian(sine)))
         with np.errstate(invalid="ignore"):
             steep = located.valid & (sine >= threshold)
         return self._solve(tracks, steep, self.initial_rig, coarse=True)
 
     def _solve(self, association: Association, usable: BoolArray, rig: Rig, coarse: bool = False) -> Bundle:
-        bundle = solve_bundle(
-            self._sightings,
-            association,
-            usable,
-            rig,
-            self._cameras,
-            coarse_model(rig, self._noise_of_visits, self._options)
+        noises, options = self._noise_of_visits, self._options
+        model = (
+            coarse_model(rig, noises, options)
             if coarse
-            else full_model(self._noise_of_visits, self._options, self._pose_model, self._variance_factor),
+            else full_model(noises, options, self.pose_model, self._variance_factor)
         )
+        bundle = solve_bundle(self._sightings, association, usable, rig, self._cameras, model)
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
@@ -246,18 +235,11 @@ class Optimiser:
         try:
             selection = select_model(start, bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the pose model stays %r, since none could be chosen: %s", SETTLED_MODEL, failure)
-            return SETTLED_MODEL
+            _log.warning("the pose model stays %r, since none could be chosen: %s", _SETTLED_MODEL, failure)
+            return _SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
-
-    def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:
-        """Corners (S, 4) of accepted observations, and the verdict on each observation (K,)."""
-        inlier = bundle.inliers
-        usable = np.zeros_like(self._sightings.valid)
-        usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
-        return usable, inlier
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
