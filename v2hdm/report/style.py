@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -84,6 +85,20 @@ def set_map_axes(axes: Axes) -> None:
 def set_image_axes(axes: Axes, left: float, right: float, bottom: float, top: float) -> None:
     """Axes of an image, whose rows rise downwards."""
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)")
+
+
+def draw_arrows(
+    axes: Axes, places: FloatArray, arrows: FloatArray, longest: float, span: float, **look: Any
+) -> None:
+    """Draw arrows (N, 2) at places (N, 2) so that the ``longest`` spans ``span``, with a key in px above."""
+    if not len(places):  # matplotlib cannot draw the key of no arrows
+        return
+    longest = max(longest, 1e-3)
+    drawn = axes.quiver(*places.T, *arrows.T, angles="xy", scale_units="xy", scale=longest / span, **look)
+    power = 10.0 ** np.floor(np.log10(longest))
+    key_px = max(step for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9)) * power
+    size = {"size": mpl.rcParams["font.size"] - 1}
+    axes.quiverkey(drawn, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", fontproperties=size)
 
 
 def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
