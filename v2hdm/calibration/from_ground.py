@@ -18,8 +18,9 @@ from v2hdm.io.calibration import Provenance, write_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.safe.pixels import png
 from v2hdm.records import Calibration, Drive
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.settings import check_workers
+from v2hdm.store.results import result_folder
 from v2hdm.verdict import Status, Verdict, check_drive
 
 

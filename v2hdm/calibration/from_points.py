@@ -31,8 +31,9 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.calibration import Provenance, write_calibration, write_camera_info
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.records import Calibration, CameraInfo, FloatArray
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.store.files import dump_yaml
+from v2hdm.store.results import result_folder
 from v2hdm.verdict.verdict import Status, Verdict
 
 ENTRY_FILE = "drive_camera.yaml"

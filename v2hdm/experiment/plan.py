@@ -107,11 +107,11 @@ def jobs(config: ExperimentConfig) -> list[Job]:
                 found.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
             elif seed == config.seeds[0]:
                 found.append((port, None, site))
-    jobs = []
-    for port, number, site in found:
-        own = folder / (port if number is None else f"{port}-{number}")
-        jobs.append(Job(port, number, site, config.detector, options, Path(config.cache), own))
-    return jobs
+    return [
+        Job(port, number, site, config.detector, options, Path(config.cache), folder / own)
+        for port, number, site in found
+        for own in [port if number is None else f"{port}-{number}"]
+    ]
 
 
 def _options(given: MappingOptions, recipe: str) -> MappingOptions:

@@ -13,8 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
@@ -37,8 +35,10 @@ from v2hdm.records import (
     IntArray,
     Trajectory,
 )
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report import style
+from v2hdm.report.outputs import write_json
 from v2hdm.settings import check_workers
+from v2hdm.store.results import result_folder
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
 _START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
@@ -97,13 +97,12 @@ class Localised:
     @property
     def sigma(self) -> FloatArray:
         """Standard deviations (F, 3) of ahead, left and heading, the map's own shift included."""
-        out = []
-        for state in self.states:
-            c, s = np.cos(state.mean[2]), np.sin(state.mean[2])
-            turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-            variance = np.diag(turn @ state.covariance[:3, :3] @ turn.T)
-            out.append(np.sqrt(variance + self.shared))
-        return np.stack(out)
+        heading = np.array([state.mean[2] for state in self.states])
+        ahead = np.column_stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)])
+        left = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros_like(heading)])
+        axes = np.stack([ahead, left, np.tile([0.0, 0.0, 1.0], (len(heading), 1))], axis=1)
+        covariance = np.stack([state.covariance[:3, :3] for state in self.states])
+        return np.asarray(np.sqrt(np.einsum("fki,fij,fkj->fk", axes, covariance, axes) + self.shared))
 
     @property
     def explained(self) -> bool:
@@ -312,22 +311,20 @@ def save_errors(path: Path, found: Localised, sigma: FloatArray) -> None:
     Bands are two standard deviations (F, 3) of estimate and recorded pose together; frames in which the
     vehicle does not know where it is are crosses.
     """
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
-    axes = figure.subplots(3, 1, sharex=True)
-    for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
-        band = 2 * factor * sigma[:, k]
-        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
-        axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
-        if not known.all():
-            axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
-        limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
-        limit = max(limit, 2 * float(np.median(band)))
-        axis.set_ylim(-limit, limit)
-        axis.set_ylabel(f"{name}, {unit}")
-        axis.grid(alpha=0.3)
-    axes[0].legend(loc="upper right", ncols=3, fontsize=8)
-    axes[0].set_title("Localised by the map's markings, less the recorded pose")
-    axes[-1].set_xlabel("time, s")
-    figure.savefig(path, dpi=110)
+    with style.figure(path, 9, 6) as figure:
+        axes = figure.subplots(3, 1, sharex=True)
+        for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
+            band = 2 * factor * sigma[:, k]
+            axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
+            axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
+            if not known.all():
+                axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+            limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
+            limit = max(limit, 2 * float(np.median(band)))
+            axis.set_ylim(-limit, limit)
+            axis.set_ylabel(f"{name}, {unit}")
+            axis.grid(alpha=0.3)
+        axes[0].legend(loc="upper right", ncols=3, fontsize=8)
+        axes[0].set_title("Localised by the map's markings, less the recorded pose")
+        axes[-1].set_xlabel("time, s")

@@ -36,10 +36,11 @@ from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory, Visit
 from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.figures import save_birdseye, save_growth
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
 from v2hdm.store.files import replace_text
+from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
 
 

@@ -19,9 +19,10 @@ from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Drive
 from v2hdm.report.figures import save_route
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_grid
 from v2hdm.settings import check_workers
+from v2hdm.store.results import result_folder
 from v2hdm.verdict.inputs.drive import check_drive
 from v2hdm.verdict.verdict import Status
 
