@@ -70,14 +70,13 @@ class RerunViewer:
         route = [np.array([image.map_from_vehicle[:3, 3] for image in drive.images])]
         self._log("map/route_recorded", rr.LineStrips3D(route, colors=[_ROUTE]))
         for name, camera in drive.cameras.items():
-            self._log_camera(name, camera, _guess(camera))
+            self._log_camera(name, camera, extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]))
 
     def detected(self, detections: Sequence[ImageDetections]) -> None:
         """Add images and what was found in them."""
-        if self._stream is None or self._drive is None:
-            return
-        for found in detections:
-            self._show_image(self._drive, found)
+        if self._stream is not None and self._drive is not None:
+            for found in detections:
+                self._show_image(self._drive, found)
 
     def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
         """Add the map of a set of cameras; the vehicle and its cameras move to where it has them."""
@@ -112,11 +111,8 @@ class RerunViewer:
     def _log_camera(self, name: str, camera: Camera, cam_from_vehicle: FloatArray) -> None:
         rr, info = self._rr, camera.info
         self._log(f"map/vehicle/{name}", self._pose(inverse(cam_from_vehicle)))
-        lens = rr.Pinhole(
-            image_from_camera=info.intrinsic,
-            resolution=[info.width, info.height],
-            image_plane_distance=_FRUSTUM_M,
-        )
+        size, matrix = [info.width, info.height], info.intrinsic
+        lens = rr.Pinhole(image_from_camera=matrix, resolution=size, image_plane_distance=_FRUSTUM_M)
         self._log(f"map/vehicle/{name}/image", lens)
 
     def _show_image(self, drive: Drive, found: ImageDetections) -> None:
@@ -129,10 +125,8 @@ class RerunViewer:
         self._stream.log(path, rr.EncodedImage(contents=coded, media_type=kind))
         outlines = [one.outline_px if len(one.outline_px) else one.corners_px for one in found.markings]
         kinds = [f"{one.kind} {one.score:.2f}" for one in found.markings]
-        self._stream.log(
-            f"{path}/markings",
-            rr.LineStrips2D(_closed(outlines), labels=kinds, colors=[_MARKING] * len(kinds)),
-        )
+        drawn = rr.LineStrips2D(_closed(outlines), labels=kinds, colors=[_MARKING] * len(kinds))
+        self._stream.log(f"{path}/markings", drawn)
         lines = [one.points_px for one in found.lanes]
         self._stream.log(f"{path}/lanes", rr.LineStrips2D(lines, colors=[_LANE] * len(lines)))
 
@@ -180,13 +174,8 @@ def check_viewer(name: str) -> bool:
 
 def has_display() -> bool:
     """Whether a window can be opened here."""
-    if sys.platform.startswith(("win", "darwin")):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _guess(camera: Camera) -> FloatArray:
-    return extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+    windows = sys.platform.startswith(("win", "darwin"))
+    return windows or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _closed(outlines: Iterable[FloatArray]) -> list[FloatArray]:

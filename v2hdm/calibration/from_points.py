@@ -125,7 +125,7 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     Raises:
         DriveError: none does: they lie on a line, or the table is written otherwise than its columns say.
     """
-    fits = fit_mountings(Seen.of(points, info, noise))
+    fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
         cause = _misreading(points, info, noise, fits[0] if fits else None)
         if cause is not None:
@@ -162,7 +162,7 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise, given: F
     """The cause under which the points make sense, if they make none as they are."""
     cause, highest = None, -np.inf
     for words, points_px, points_vehicle in _readings(points, info):
-        seen = Seen.of_pixels(points_px, points_vehicle, info, noise)
+        seen = Seen.of(points_px, points_vehicle, info, noise)
         for fit in fit_mountings(seen, _STARTS, _ROUNDS):
             if _score(fit) > highest:
                 cause, highest = words, _score(fit)
@@ -176,9 +176,8 @@ def _unit_of(fit: Fit) -> str | None:
     def log_odds(metres: float, prior: float) -> float:
         return float(-0.5 * (np.log(_height_m(fit) * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
 
-    scores = {unit: log_odds(metres, _MISREAD) for unit, metres in UNITS.items()}
-    best = max(scores, key=lambda unit: scores[unit])
-    return best if scores[best] > log_odds(1.0, 1.0) else None
+    best = max(UNITS, key=lambda unit: log_odds(UNITS[unit], _MISREAD))
+    return best if log_odds(UNITS[best], _MISREAD) > log_odds(1.0, 1.0) else None
 
 
 def _score(fit: Fit) -> float:
@@ -217,14 +216,19 @@ def calibrate_camera(parsed: argparse.Namespace) -> bool:
         V2hdmError: the points or the intrinsics cannot be used, or the results cannot be written.
     """
     cv2.setNumThreads(1)
-    _check_sigmas(parsed.pixel_sigma, parsed.survey_sigma)
+    sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
+    for name, value in sigmas.items():
+        if not (np.isfinite(value) and value >= 0):
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
+    if not any(sigmas.values()):
+        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
     info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
     info = replace(info, name=parsed.name or info.name)
     if "/" in info.name or info.name in ("", ".", ".."):
         raise ConfigError(f"the camera is called {info.name!r}, which is no file name; give another --name")
     points = read_points(parsed.points)
     image = None if parsed.image is None else _image(parsed.image, info)
-    sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
     found = calibrate_from_points(points, info, **sigmas)
     folder = parsed.output or Path("outputs") / f"{info.name}-calibrate"
     with result_folder(folder) as unfinished:
@@ -240,14 +244,6 @@ def calibrate_camera(parsed: argparse.Namespace) -> bool:
         print(line)
     print(f"results in {folder}")
     return found.verdict.status is Status.FAIL
-
-
-def _check_sigmas(pixel_sigma: float, survey_sigma: float) -> None:
-    for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
-        if not (np.isfinite(value) and value >= 0):
-            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
-    if pixel_sigma == survey_sigma == 0:
-        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
 
 
 def _image(path: Path, info: CameraInfo) -> np.ndarray:
@@ -283,26 +279,18 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
     with (folder / POINTS_FILE).open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
-        table.writerows(_rows(found))
+        points, off = found.points, found.residuals
+        for k, name in enumerate(points.names):
+            shift = [
+                *(f"{value:.3f}" for value in off.off_px[k]),
+                *(f"{value:.4f}" for value in off.off_m[k]),
+            ]
+            known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
+            table.writerow(
+                [name, *points.points_px[k].tolist(), *points.points_vehicle[k].tolist(), *shift, *known]
+            )
     labels = found.points.labels
     save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
-
-
-def _rows(found: PointCalibration) -> list[list[object]]:
-    points, off = found.points, found.residuals
-    return [
-        [
-            points.names[k],
-            *points.points_px[k].tolist(),
-            *points.points_vehicle[k].tolist(),
-            *(f"{value:.3f}" for value in off.off_px[k]),
-            *(f"{value:.4f}" for value in off.off_m[k]),
-            f"{off.sigmas[k]:.2f}",
-            f"{found.fit.right[k]:.3g}",
-            f"{off.known_m[k]:.4f}",
-        ]
-        for k in range(len(points.names))
-    ]
 
 
 def summary_lines(found: PointCalibration) -> list[str]:

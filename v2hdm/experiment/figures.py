@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.options import INCREMENTAL
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.report import style
-from v2hdm.report.photos import project_line
+from v2hdm.report.photos import project_outline
 
 Caption = Mapping[str, Any]
 """The values in a figure's caption, by their names in the template ``figures.md``."""
@@ -47,21 +46,22 @@ def save_figures(
         firsts.setdefault(one.port, number)
     work: dict[str, tuple[str, Callable[[Path], Caption | None]]] = {}
     for port, n in firsts.items():
-        for kind, draw in (
-            ("map", partial(_save_map, record=records[n], measured=measured[n])),
-            ("eni_oni", partial(_save_shift, record=records[n], measured=measured[n])),
-            ("calibration", partial(_save_calibration, record=records[n], pictures=todo[n].folder)),
-            ("reprojection", partial(_save_fields, record=records[n])),
-        ):
-            work[f"{kind}_{port}.png"] = kind, draw
+        record, one = records[n], measured[n]
+        of_port = {
+            "map": partial(_save_map, record=record, measured=one),
+            "eni_oni": partial(_save_shift, record=record, measured=one),
+            "calibration": partial(_save_calibration, record=record, pictures=todo[n].folder),
+            "reprojection": partial(_save_fields, record=record),
+        }
+        work |= {f"{kind}_{port}.png": (kind, draw) for kind, draw in of_port.items()}
     work["corners.png"] = "corners", partial(_save_boxes, firsts=[measured[n] for n in firsts.values()])
     work["growth.png"] = "growth", partial(_save_growth, records=records)
     work["range.png"] = "range", partial(_save_ranges, records=records)
     work["bias_spread.png"] = "bias_spread", partial(_save_balance, measured=measured)
     captions = {}
-    for done, (name, (kind, draw)) in enumerate(work.items()):
+    for done, (name, (kind, save)) in enumerate(work.items()):
         progress(done, len(work))
-        caption = draw(folder / name)
+        caption = save(folder / name)
         if caption is None:
             (folder / name).unlink(missing_ok=True)
         else:
@@ -222,7 +222,7 @@ def _axes(fig: Figure, record: Mapping[str, Any], insets: int) -> tuple[Axes, li
 
 
 def _draw_truth(axes: Axes, record: Mapping[str, Any]) -> None:
-    paint = {"facecolors": style.PAINT, "edgecolors": style.TRUTH, "lw": 0.4}
+    paint: dict[str, Any] = {"facecolors": style.PAINT, "edgecolors": style.TRUTH, "lw": 0.4}
     axes.add_collection(PolyCollection(list(_true_corners(record)), zorder=1, **paint))
     lanes = [np.array(line) for line in record["true_lanes"]]
     axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2, zorder=0.5))
@@ -265,10 +265,8 @@ def _draw_image(axes: Axes, camera: Mapping[str, Any], pictures: Path) -> None:
     info = _info_of(camera)
     if image is not None:
         axes.imshow(image[..., ::-1])
-    roi = np.array(camera["roi_vehicle"])
-    closed = np.vstack([roi, roi[:1]])
-    dense = np.concatenate([np.linspace(a, b, 40) for a, b in itertools.pairwise(closed)])
-    for piece in project_line(info, np.array(camera["true_cam_from_vehicle"]), dense):
+    mounting, roi = (np.array(camera[key]) for key in ("true_cam_from_vehicle", "roi_vehicle"))
+    for piece in project_outline(info, mounting, roi):
         axes.plot(*piece.T, color=_ROI, lw=2.5)
     if camera["clicked_px"] is not None:
         clicked = np.array(camera["clicked_px"])
@@ -405,13 +403,13 @@ def _save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> Caption | 
                 if record["port"] == port:
                     for method, points in record["growth"].get(INCREMENTAL, {}).items():
                         counts, errors = np.array(points, dtype=np.float64).reshape(-1, 2).T
-                        axes.plot(counts, 100 * errors, ms=5, lw=1.3, **_line(method))
+                        axes.plot(counts, 100 * errors, ms=5, lw=1.3, **style.line_of(method))
             style.set_logarithmic(axes, "y")
             style.set_logarithmic(axes, "x")
             axes.set(xlabel="markings mapped so far", ylabel="corner RMSE (cm)", axisbelow=True)
             axes.set_title(f"{port}: the error while the map grows")
         methods = dict.fromkeys(name for one in records for name in one["growth"].get(INCREMENTAL, {}))
-        fig.legend(handles=_samples(methods, _line), loc="outside lower center", ncols=5)
+        fig.legend(handles=_samples(methods, style.line_of), loc="outside lower center", ncols=5)
     return {}
 
 
@@ -434,7 +432,7 @@ def _save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> Caption | 
                 style.set_logarithmic(axes, "y")
                 axes.set(xlabel="distance of the corner from the camera (m)", axisbelow=True)
                 axes.set(ylabel="error on the ground (cm)", title=f"{port}, {camera}")
-        fig.legend(handles=_samples(style.MARKER, _line), loc="outside lower center", ncols=4)
+        fig.legend(handles=_samples(style.MARKER, style.line_of), loc="outside lower center", ncols=4)
     return {}
 
 
@@ -448,7 +446,7 @@ def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
             continue
         middle = np.array(sorted(bins))
         lower, median, upper = 100 * np.array([np.mean(bins[m], axis=0) for m in middle]).T
-        axes.plot(middle, median, ms=4, **_line(method))
+        axes.plot(middle, median, ms=4, **style.line_of(method))
         axes.fill_between(middle, lower, upper, color=style.METHOD[method], alpha=0.13, lw=0)
 
 
@@ -478,10 +476,6 @@ def _save_balance(path: Path, measured: Sequence[Measured]) -> Caption | None:
         handles.append(Line2D([], [], color=style.TRUTH, ls=":", label="equal RMSE"))
         fig.legend(handles=handles, loc="outside lower center", ncols=6)
     return {}
-
-
-def _line(method: str) -> dict[str, Any]:
-    return {"color": style.METHOD[method], "marker": style.MARKER[method], "ls": style.LINE[method]}
 
 
 def _samples(names: Iterable[str], look: Callable[[str], dict[str, Any]]) -> list[Line2D]:

@@ -270,7 +270,7 @@ def _filled(template: str, **values: Any) -> str:
 
 def _on_shared(measured: Sequence[Measured]) -> list[tuple[str, ...]]:
     """Cameras, markings that all methods share, and errors on them (cm): CNI, Opt, Opt by the paper."""
-    out = []
+    out: list[tuple[str, ...]] = []
     for port, drives in by_port(measured).items():
         for cameras in drives[0].rows:
             rows = _common(drives, cameras, ("CNI", "Opt"))

@@ -55,17 +55,10 @@ class Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict, sets = metrics["verdict"], list(metrics["results"].values())
         worst = next((f"{one['check']} ({one['about']}): {one['says']}" for one in verdict["findings"]), "")
-        return cls(
-            drive,
-            status=str(verdict["status"]),
-            says=one_line(worst),
-            images=int(metrics["drive"]["images"]),
-            markings=int(sets[-1]["Opt"]["markings"]) if sets else None,
-            minutes=round(sum(metrics.get("seconds", {}).values()) / 60, 3),
-            kept=kept,
-            folder=place,
-            source=source,
-        )
+        markings = int(sets[-1]["Opt"]["markings"]) if sets else None
+        images, seconds = int(metrics["drive"]["images"]), sum(metrics.get("seconds", {}).values())
+        figures = (images, markings, round(seconds / 60, 3))
+        return cls(drive, str(verdict["status"]), one_line(worst), *figures, kept, place, source)
 
 
 def as_csv(rows: Sequence[Row]) -> bytes:

@@ -64,7 +64,14 @@ def run_fleet(
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)
-    with _growing(options.folder) as folder:
+    there = place_of(str(options.folder), "--table")
+    growing: AbstractContextManager[GrowingFolder | RemoteTable]
+    if isinstance(there, Path):
+        growing = growing_folder(there, "--table")
+    else:
+        there.check()
+        growing = nullcontext(RemoteTable(there))
+    with growing as folder:
         table = _Table(folder, todo.sources, progress)
         for row in todo.refused:
             table.add(row)
@@ -72,15 +79,6 @@ def run_fleet(
             with cluster(options.address, options.workers) as ray:
                 _map_all(ray, todo.jobs, table, progress)
         return table.rows
-
-
-def _growing(place: Path | str) -> AbstractContextManager[GrowingFolder | RemoteTable]:
-    """The folder of the table, or its place at an object store."""
-    there = place_of(str(place), "--table")
-    if isinstance(there, Path):
-        return growing_folder(there, "--table")
-    there.check()
-    return nullcontext(RemoteTable(there))
 
 
 class _Table:

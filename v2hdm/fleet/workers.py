@@ -25,6 +25,7 @@ from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.finished import RunResult, take_or_make
 from v2hdm.pipeline.run import map_and_save
+from v2hdm.progress import Progress
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import Line, StageCache, log_again, recorded
 
@@ -56,18 +57,18 @@ class ProgressActor:
         return [(*key, *value) for key, value in reported.items()]
 
 
-class DriveProgress:
-    """Reports one drive to the :class:`ProgressActor`, now and then and at the ends of its stages."""
+def reported(actor: Any, drive: str) -> Progress:
+    """Progress of one drive for the :class:`ProgressActor`, now and then and at the ends of its stages."""
+    last_s = -_REPORT_EVERY_S
 
-    def __init__(self, actor: Any, drive: str) -> None:
-        self._actor, self._drive, self._reported_s = actor, drive, -_REPORT_EVERY_S
-
-    def __call__(self, task: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``task`` are finished."""
+    def report(task: str, done: int, total: int) -> None:
+        nonlocal last_s
         now_s = time.monotonic()
-        if done >= total or now_s - self._reported_s >= _REPORT_EVERY_S:
-            self._reported_s = now_s
-            self._actor.report.remote(self._drive, task, done, total)
+        if done >= total or now_s - last_s >= _REPORT_EVERY_S:
+            last_s = now_s
+            actor.report.remote(drive, task, done, total)
+
+    return report
 
 
 class DetectorActor:
@@ -210,7 +211,7 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
     os.chdir(folder)
     job.config.workers = 1
     try:
-        report = DriveProgress(progress, job.name)
+        report = reported(progress, job.name)
         mapped = partial(_mapped, job, detectors, report)
         result, kept = take_or_make(job.config, mapped, job.config.resume, report)
     except Exception as error:  # a drive that fails is a row, and the others go on
@@ -223,7 +224,7 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
 
 
 def _mapped(
-    job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, cache: StageCache
+    job: Job, detectors: Sequence[Any], report: Progress, config: RunConfig, cache: StageCache
 ) -> RunResult:
     executor = RayExecutor(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
     context = Context(progress=report, detect=partial(detect_by, detectors), executor=executor)

@@ -47,6 +47,13 @@ LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", 
 MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
 """Marker of each method."""
 
+
+def line_of(method: str) -> dict[str, Any]:
+    """Colour, marker and line style of a method as keywords of ``plot``."""
+    marker, line = MARKER.get(method, "."), LINE.get(method, "-")
+    return {"color": METHOD.get(method, "k"), "marker": marker, "ls": line}
+
+
 _RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10,
@@ -108,10 +115,8 @@ def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
 
 def set_logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     """A logarithmic axis with a grid, whose 1, 2 and 5 have labels."""
+    axes.set(**{f"{which}scale": "log"})
     axis = axes.xaxis if which == "x" else axes.yaxis
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(
-        lambda value, _: f"{value:g}" if f"{value:g}".lstrip("0.")[:1] in ("2", "5") else ""
-    )
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:g}".lstrip("0.")[:1] in ("2", "5") else "")
     axes.grid(axis=which, which="both", color=GRID)

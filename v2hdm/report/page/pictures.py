@@ -61,30 +61,25 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     calibrations = {name: one.calibration for name, one in facts.cameras.items()}
     cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
     cuts = [cut for cut in _cuts(facts, cam_from_map) if cut.image in images]
-    cuts = sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]
-    made: list[tuple[int, str, dict[str, Any]]] = []
     by_image: dict[str, list[_Cut]] = {}
-    for cut in cuts:
+    for cut in sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]:
         by_image.setdefault(cut.image, []).append(cut)
+    made: list[tuple[_Cut, dict[str, Any]]] = []
     for name, wanted in by_image.items():
         image = images[name]
         pixels = read_image(image, facts.drive.cameras[image.camera])
         for cut in wanted:
             picture = _cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
             if picture is not None:
-                made.append((cut.rank, cut.key, {**picture, "image": name}))
-    return _within_budget(made)
-
-
-def _within_budget(made: list[tuple[int, str, dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
-    """The best picture of everything first, then the second best, until the budget is spent."""
+                made.append((cut, {**picture, "image": name}))
+    # The best picture of everything first, then the second best, until the budget is spent.
     out: dict[str, list[dict[str, Any]]] = {}
     spent = 0
-    for _, key, picture in sorted(made, key=lambda one: one[0]):
+    for cut, picture in sorted(made, key=lambda one: one[0].rank):
         spent += len(picture["src"])
         if spent > BUDGET_BYTES:
             break
-        out.setdefault(key, []).append(picture)
+        out.setdefault(cut.key, []).append(picture)
     return out
 
 
