@@ -20,7 +20,7 @@ from v2hdm.extras import need
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.safe.texts import shown
-from v2hdm.mapping.results import AdjustedPoses, MethodResult
+from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Camera, Drive, FloatArray, HdMap, ImageDetections
 from v2hdm.report.style import METHOD, OKABE_ITO, ROUTE
 
@@ -87,7 +87,12 @@ class RerunViewer:
         for name, calibration in best.calibrations.items():
             self._log_camera(name, self._drive.cameras[name], calibration.cam_from_vehicle)
         if best.poses is not None:
-            self._show_poses(cameras, self._drive, best.poses)
+            adjusted = [best.poses.of_image(image) for image in self._drive.images]
+            for index, pose in enumerate(adjusted):
+                self._at(self._drive, index)
+                self._stream.log("map/vehicle", self._pose(pose))
+            route = [np.array([pose[:3, 3] for pose in adjusted])]
+            self._log(f"map/{cameras}/route", self._rr.LineStrips3D(route, colors=[_MARKING]))
         self._stream.flush()
 
     def close(self) -> None:
@@ -131,27 +136,15 @@ class RerunViewer:
         self._stream.log(f"{path}/lanes", rr.LineStrips2D(lines, colors=[_LANE] * len(lines)))
 
     def _show_map(self, path: str, hd_map: HdMap) -> None:
-        rr = self._rr
-        markings = [_ground(one) for one in _closed(marking.corners_map for marking in hd_map.markings)]
         kinds = [marking.kind for marking in hd_map.markings]
-        lanes = [_ground(lane.points_map) for lane in hd_map.lanes]
-        symbols = [_ground(one) for one in _closed(symbol.outline_map for symbol in hd_map.symbols)]
-        for name, strips, colour, labels in (
-            ("markings", markings, _MARKING, kinds),
-            ("lanes", lanes, _LANE, None),
-            ("symbols", symbols, _SYMBOL, None),
+        for name, lines, colour, labels in (
+            ("markings", _closed(one.corners_map for one in hd_map.markings), _MARKING, kinds),
+            ("lanes", [one.points_map for one in hd_map.lanes], _LANE, None),
+            ("symbols", _closed(one.outline_map for one in hd_map.symbols), _SYMBOL, None),
         ):
-            colours = [colour] * len(strips)
-            drawn = rr.LineStrips3D(strips, colors=colours, labels=labels, show_labels=False)
-            self._log(f"{path}/{name}", drawn)
-
-    def _show_poses(self, cameras: str, drive: Drive, poses: AdjustedPoses) -> None:
-        adjusted = [poses.of_image(image) for image in drive.images]
-        for index, pose in enumerate(adjusted):
-            self._at(drive, index)
-            self._stream.log("map/vehicle", self._pose(pose))
-        route = [np.array([pose[:3, 3] for pose in adjusted])]
-        self._log(f"map/{cameras}/route", self._rr.LineStrips3D(route, colors=[_MARKING]))
+            look: dict[str, Any] = {"colors": [colour] * len(lines), "labels": labels, "show_labels": False}
+            strips = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
+            self._log(f"{path}/{name}", self._rr.LineStrips3D(strips, **look))
 
     def _at(self, drive: Drive, index: int) -> None:
         self._stream.set_time("image", sequence=index)
@@ -180,7 +173,3 @@ def has_display() -> bool:
 
 def _closed(outlines: Iterable[FloatArray]) -> list[FloatArray]:
     return [np.vstack([one, one[:1]]) for one in outlines]
-
-
-def _ground(points_map: FloatArray) -> FloatArray:
-    return np.column_stack([points_map, np.zeros(len(points_map))])

@@ -157,13 +157,9 @@ class Seen:
 class Fit:
     """A mounting and how well the points determine it.
 
-    Attributes:
-        seen: the points.
-        cam_from_vehicle: (4, 4).
-        covariance: (6, 6) of its left tangent; infinite on the diagonal where the points leave it free.
-        factor: q, of the stated variances.
-        right: (N,) probability that each point is right.
-        log_posterior: of the mounting, up to a constant of the points.
+    ``covariance`` (6, 6) is of the left tangent of ``cam_from_vehicle``, infinite on the diagonal where the
+    points leave it free. ``factor`` is q, of the stated variances, ``right`` (N,) the probability that each
+    point is right.
     """
 
     seen: Seen
@@ -182,10 +178,7 @@ class Fit:
 def fit_mountings(seen: Seen, starts: int = _REFINED, rounds: int = _ROUNDS) -> list[Fit]:
     """Mountings that explain the points, the most likely first; none where all points lie on a line.
 
-    Args:
-        seen: the points.
-        starts: how many are refined.
-        rounds: of expectation maximisation that each may take.
+    So many ``starts`` are refined, each by ``rounds`` of expectation maximisation at most.
     """
     found: list[Fit] = []
     for start in _starts(seen, starts):

@@ -57,13 +57,7 @@ def calibrate_from_ground(
 
 
 def estimate_mountings(parsed: argparse.Namespace) -> bool:
-    """Estimate every camera's mounting, print it with the verdict on the drive, and write it.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.calibrate_ground`.
-
-    Returns:
-        Whether the verdict is FAIL.
+    """Estimate every camera's mounting, print it with the verdict, and write it; whether the verdict is FAIL.
 
     Raises:
         V2hdmError: the drive cannot be read, or the results cannot be written.

@@ -204,13 +204,7 @@ def _readings(points: SurveyedPoints, info: CameraInfo) -> Iterator[tuple[str, F
 
 
 def calibrate_camera(parsed: argparse.Namespace) -> bool:
-    """Calibrate, print the result with the verdict on it, and write it.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.calibrate`.
-
-    Returns:
-        Whether the verdict is FAIL.
+    """Calibrate, print the result with the verdict on it, and write it; whether the verdict is FAIL.
 
     Raises:
         V2hdmError: the points or the intrinsics cannot be used, or the results cannot be written.

@@ -39,12 +39,10 @@ _AROUND = 12  # places on the circle of known_around
 class Residuals:
     """N points under a mounting.
 
-    Attributes:
-        off_px: (N, 2) recorded less predicted pixel.
-        off_m: (N, 2) where the IPM puts the pixel, less where the point was surveyed; nan above the horizon.
-        sigmas: (N,) distance of the point from the prediction of all others, in standard deviations.
-        probability: (N,) of a right point being as far off by chance.
-        known_m: (N,) standard deviation of the IPM there, in the direction known worst.
+    ``off_px`` (N, 2) is the recorded less the predicted pixel, ``off_m`` (N, 2) where the IPM puts the pixel
+    less where the point was surveyed, nan above the horizon. ``sigmas`` (N,) is the distance from what all
+    others predict, in standard deviations, ``probability`` (N,) that of a right point being as far off by
+    chance, ``known_m`` (N,) the standard deviation of the IPM there, in the direction known worst.
     """
 
     off_px: FloatArray

@@ -88,10 +88,7 @@ def recipe_file(recipe: str) -> str:
 def drive_record(job: Job, workers: int, progress: Progress) -> dict[str, Any]:
     """The record of a drive and of its maps, from disk or made now and kept there.
 
-    Args:
-        job: the drive.
-        workers: processes to render and detect in; 1 stays in this one.
-        progress: called with how far each stage is.
+    ``workers`` are processes to render and detect in; 1 stays in this one.
 
     Raises:
         V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.

@@ -262,7 +262,9 @@ def _save_calibration(path: Path, record: Mapping[str, Any], pictures: Path) -> 
 
 def _draw_image(axes: Axes, camera: Mapping[str, Any], pictures: Path) -> None:
     image = cv2.imread(str(pictures / camera["picture"]))
-    info = _info_of(camera)
+    plain = dict(camera["info"])
+    plain |= {"intrinsic": np.array(plain["intrinsic"]), "distortion": tuple(plain["distortion"])}
+    info = CameraInfo(**plain)
     if image is not None:
         axes.imshow(image[..., ::-1])
     mounting, roi = (np.array(camera[key]) for key in ("true_cam_from_vehicle", "roi_vehicle"))
@@ -330,14 +332,6 @@ def _draw_field(axes: Axes, field: Mapping[str, Any], size_px: tuple[int, int]) 
     span = _ARROW_SHARE * cell[0]
     look = {"width": 0.004, "color": LINK, "pivot": "mid"}
     style.draw_arrows(axes, np.array(places), np.array(arrows), longest, span, **look)
-
-
-def _info_of(camera: Mapping[str, Any]) -> CameraInfo:
-    """The intrinsics in a record."""
-    plain = dict(camera["info"])
-    return CameraInfo(
-        **plain | {"intrinsic": np.array(plain["intrinsic"]), "distortion": tuple(plain["distortion"])}
-    )
 
 
 _BOX = "#7fb8b4"
@@ -439,15 +433,13 @@ def _save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> Caption | 
 def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
     for method in style.MARKER:
         bins: dict[float, list[list[float]]] = {}
-        for one in found:
-            for middle, *quartiles, _ in one.get(method, []):
-                bins.setdefault(middle, []).append(quartiles)
-        if not bins:
-            continue
-        middle = np.array(sorted(bins))
-        lower, median, upper = 100 * np.array([np.mean(bins[m], axis=0) for m in middle]).T
-        axes.plot(middle, median, ms=4, **style.line_of(method))
-        axes.fill_between(middle, lower, upper, color=style.METHOD[method], alpha=0.13, lw=0)
+        for middle, *quartiles, _ in (one for range_ in found for one in range_.get(method, [])):
+            bins.setdefault(middle, []).append(quartiles)
+        if bins:
+            middles = np.array(sorted(bins))
+            lower, median, upper = 100 * np.array([np.mean(bins[m], axis=0) for m in middles]).T
+            axes.plot(middles, median, ms=4, **style.line_of(method))
+            axes.fill_between(middles, lower, upper, color=style.METHOD[method], alpha=0.13, lw=0)
 
 
 def _save_balance(path: Path, measured: Sequence[Measured]) -> Caption | None:

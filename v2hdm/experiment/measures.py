@@ -171,13 +171,8 @@ def residuals(
     ``field`` holds for ``before`` and ``after`` the median residual (px) of detected corners against the
     optimised map, by cell of the image: before under the first IPM and the recorded poses, after under
     the optimised extrinsic and the adjusted poses. ``range`` holds by method quartiles of the distance
-    (m) between corners of single sightings, laid on the ground, and the true ones.
-
-    Args:
-        drive: as it was described, with its first IPMs.
-        detections: of its images.
-        methods: of one camera set; ``Opt`` is among them.
-        truth: of the drive.
+    (m) between corners of single sightings, laid on the ground, and the true ones. ``drive`` is as it was
+    described; ``Opt`` is among the ``methods``.
     """
     best = methods["Opt"]
     out: dict[str, Any] = {}
@@ -292,12 +287,12 @@ def _by_range(
     known = np.flatnonzero(np.isin(seen.marking, list(true_of)))
     if not len(known):
         return {}
-    corners = np.array(
-        [
-            _alike(truth.map.markings[true_of[int(marking)]].corners_map, turned)
-            for marking, turned in zip(seen.marking[known], seen.corners_map[known], strict=True)
-        ]
-    )
+    corners = []
+    for k in known:
+        # Corners begin where they lie nearest to those of the sighting.
+        true = truth.map.markings[true_of[int(seen.marking[k])]].corners_map
+        turned = np.stack([np.roll(true, shift, axis=0) for shift in range(4)])
+        corners.append(turned[((turned - seen.corners_map[k]) ** 2).sum(axis=(1, 2)).argmin()])
     images = [seen.image[k] for k in known]
     recorded = flat_motion(np.array([drive.images[image].map_from_vehicle for image in images]))
     vehicle_from_map = inverse(np.array([_adjusted(drive, image, best) for image in images]))
@@ -312,19 +307,13 @@ def _by_range(
             grounds[method] = recorded @ facing_ipm(camera.ipm[ipm], side)
     true_pose = truth.map_from_vehicle[images]
     camera_map = (true_pose @ np.append(camera_centre(truth.cam_from_vehicle[name]), 1.0))[:, :2]
-    range_m = np.linalg.norm(corners - camera_map[:, None], axis=2).ravel()
+    range_m = np.linalg.norm(np.array(corners) - camera_map[:, None], axis=2).ravel()
     out = {}
     for method in METHODS:
         if method in grounds:
             on_ground = apply_in_front(grounds[method], seen.corners_px[known])
             out[method] = _quartiles(range_m, np.linalg.norm(on_ground - corners, axis=2).ravel())
     return out
-
-
-def _alike(corners: FloatArray, other: FloatArray) -> FloatArray:
-    """Corners (4, 2) of a quadrilateral, begun where they lie nearest to those of another."""
-    turned = [np.roll(corners, shift, axis=0) for shift in range(4)]
-    return min(turned, key=lambda one: float(((one - other) ** 2).sum()))
 
 
 def _quartiles(range_m: FloatArray, error_m: FloatArray) -> list[list[float]]:

@@ -163,7 +163,11 @@ def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source
         _, config = _composed(file, overrides)
         if not config.drive.paths:
             raise ConfigError(f"{file}: --site joins drives that lie in folders; set drive.path")
-        _refuse_other_settings(files[0], settings, file, config)
+        for key, *values in _differences(settings, config):
+            raise ConfigError(
+                f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {files[0]}: a site has one "
+                f"set of settings; say the same in both, or {key}=... for all"
+            )
         paths += map(str, config.drive.path if isinstance(config.drive.path, list) else [config.drive.path])
     OmegaConf.update(first, "name", site)
     OmegaConf.update(first, "drive.path", paths)
@@ -179,16 +183,13 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
     return composed, config
 
 
-def _refuse_other_settings(first: Path, settings: RunConfig, file: Path, config: RunConfig) -> None:
+def _differences(settings: RunConfig, config: RunConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Every setting besides name and path that is another in the second: its key, and both values."""
     without = [replace(one, name=None, drive=replace(one.drive, path=None)) for one in (settings, config)]
     mine, other = (dict(_leaves(asdict(one))) for one in without)
-    for key in [*mine, *other]:
-        values = [one.get(key) for one in (mine, other)]
-        if values[0] != values[1]:
-            raise ConfigError(
-                f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {first}: a site has one "
-                f"set of settings; say the same in both, or {key}=... for all"
-            )
+    return (
+        (key, mine.get(key), other.get(key)) for key in [*mine, *other] if mine.get(key) != other.get(key)
+    )
 
 
 def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

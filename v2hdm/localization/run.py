@@ -97,12 +97,12 @@ class Localised:
     @property
     def sigma(self) -> FloatArray:
         """Standard deviations (F, 3) of ahead, left and heading, the map's own shift included."""
-        heading = np.array([state.mean[2] for state in self.states])
-        ahead = np.column_stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)])
-        left = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros_like(heading)])
-        axes = np.stack([ahead, left, np.tile([0.0, 0.0, 1.0], (len(heading), 1))], axis=1)
-        covariance = np.stack([state.covariance[:3, :3] for state in self.states])
-        return np.asarray(np.sqrt(np.einsum("fki,fij,fkj->fk", axes, covariance, axes) + self.shared))
+        out = []
+        for state in self.states:
+            c, s = np.cos(state.mean[2]), np.sin(state.mean[2])
+            turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+            out.append(np.sqrt(np.diag(turn @ state.covariance[:3, :3] @ turn.T) + self.shared))
+        return np.stack(out)
 
     @property
     def explained(self) -> bool:
@@ -195,11 +195,8 @@ def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive
 
 def _yaw_variance(calibrations: Mapping[str, Calibration]) -> float:
     """Variance, rad^2, of the cameras' common turn about the vertical: that of their mean."""
-    variances = []
-    for one in calibrations.values():
-        up = one.cam_from_vehicle[:3, 2]
-        variances.append(0.0 if one.covariance is None else float(up @ one.covariance[3:, 3:] @ up))
-    return float(np.mean(variances))
+    known = [(one.cam_from_vehicle[:3, 2], one.covariance) for one in calibrations.values()]
+    return float(np.mean([0.0 if c is None else float(up @ c[3:, 3:] @ up) for up, c in known]))
 
 
 def _seen(
@@ -210,16 +207,9 @@ def _seen(
     out = []
     for row in np.flatnonzero(sightings.frame == frame).tolist():
         camera = names[sightings.camera[row]]
-        out.append(
-            Seen(
-                sightings.kinds[sightings.kind[row]],
-                drive.cameras[camera].info.intrinsic,
-                calibrations[camera].cam_from_vehicle,
-                sightings.corners_pinhole_px[row],
-                sightings.covariance_px[row],
-                informs[row],
-            )
-        )
+        kind, corners_px = sightings.kinds[sightings.kind[row]], sightings.corners_pinhole_px[row]
+        pose = (drive.cameras[camera].info.intrinsic, calibrations[camera].cam_from_vehicle)
+        out.append(Seen(kind, *pose, corners_px, sightings.covariance_px[row], informs[row]))
     return out
 
 
@@ -243,13 +233,7 @@ def _in_view(
 
 
 def localise_drive(parsed: argparse.Namespace) -> bool:
-    """Localise a drive in a map, print the figures and write them with poses and picture.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.localize`.
-
-    Returns:
-        Whether the map explains the drive.
+    """Localise a drive in a map, print the figures and write them; whether the map explains the drive.
 
     Raises:
         V2hdmError: map, calibrations or drive cannot be read or do not belong together.

@@ -13,7 +13,7 @@ evaluates them at Chebyshev nodes, the polynomial through these gives them at ev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,6 +30,7 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry import tensors
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.shots import Canvas, Lens, Shot
+from v2hdm.progress import Steps
 from v2hdm.records import FloatArray
 
 TILES_PX = (128, 64, 32, 16)
@@ -74,16 +75,11 @@ def blend(
     shots: Sequence[Shot],
     lenses: Mapping[str, Lens],
     device: str = "cpu",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
 ) -> Iterator[Sheet]:
     """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
 
-    Args:
-        canvas: what to fill.
-        shots: images in driving order.
-        lenses: their cameras.
-        device: of torch.
-        progress: called as ``progress(done, total)``, in images put onto sheets.
+    ``shots`` are in driving order; ``progress`` counts images put onto sheets.
 
     Raises:
         DriveError: an image is missing, damaged or of the wrong size.

@@ -124,11 +124,8 @@ class Picture:
         rows, columns = (side // self.factor for side in sheet.rgba.shape[:2])
         row, column = sheet.row // self.factor, sheet.column // self.factor
         alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
-        reduced = cv2.resize(
-            np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2),
-            (columns, rows),
-            interpolation=cv2.INTER_AREA,
-        )
+        weighed = np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2)
+        reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
         seen = reduced[..., 3:]
         colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
         self._rgba[row : row + rows, column : column + columns] = np.round(
@@ -170,12 +167,8 @@ def write_mosaic(
 ) -> dict[str, Any]:
     """Write the mosaic of a run's ground into its folder; returns what stands in ``mosaic.json``.
 
-    Args:
-        folder: of the run: its map, calibrations and adjusted trajectory.
-        drive: what the run has mapped.
-        resolution_m: side of a pixel on the ground.
-        device: of torch.
-        progress: called as ``progress(done, total)``, in images put onto the ground.
+    ``folder`` holds the run's map, calibrations and adjusted trajectory, ``drive`` is what it has mapped.
+    ``resolution_m`` is the side of a pixel on the ground; ``progress`` counts images put onto the ground.
 
     Raises:
         MapFileError: the folder is no result, or not one of this drive.

@@ -167,7 +167,13 @@ def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     way = metrics.way_along(place)
     chosen = np.unique(np.searchsorted(way, np.linspace(0, way[-1], _ARROWS)))
     length = 0.05 * max(float(np.ptp(place, axis=0).max()), 1e-9)
-    look = {"color": "white", "edgecolor": "#1b1e21", "linewidth": 0.7, "width": 0.0028, "zorder": 3}
+    look: dict[str, Any] = {
+        "color": "white",
+        "edgecolor": "#1b1e21",
+        "linewidth": 0.7,
+        "width": 0.0028,
+        "zorder": 3,
+    }
     arrows = (length * poses[chosen, :2, 0]).T
     axes.quiver(*place[chosen].T, *arrows, angles="xy", scale_units="xy", scale=1, **look)
 
@@ -210,7 +216,8 @@ def _site(axes: Axes, changes: Changes, hd_map: HdMap, route_map: FloatArray) ->
     _draw_map(axes, hd_map)
     for fate, colour in _COLOURS.items():
         own = changes.of(fate)
-        places = np.array([_outline(one).mean(axis=0) for one in own]).reshape(-1, 2)
+        outlines = [one.before if one.after is None else one.after for one in own]
+        places = np.array([one.mean(axis=0) for one in outlines if one is not None]).reshape(-1, 2)
         marker = {Fate.MOVED: "o", Fate.VANISHED: "x", Fate.NEW: "+"}[fate]
         face = "none" if fate is Fate.MOVED else colour
         label = f"{len(own)} {fate.value}"
@@ -250,12 +257,6 @@ def _draw_map(axes: Axes, hd_map: HdMap) -> None:
     polygons = [one.corners_map for one in hd_map.markings]
     axes.add_collection(PolyCollection(polygons, facecolors="#c9d3da", edgecolors="#9aa4ad", lw=0.4))
     axes.autoscale_view()
-
-
-def _outline(one: Change) -> FloatArray:
-    corners = one.before if one.after is None else one.after
-    assert corners is not None
-    return corners
 
 
 def _distance_m(one: Change) -> float:

@@ -240,19 +240,14 @@ def save_overlay(
     for name, pinhole_px_from_map in views.items():
         pen = OVERLAY.get(name, _BEFORE)
         for line in lines:
-            draw_lines(canvas, _project_map_line(line, info, position_map, pinhole_px_from_map), pen)
+            # Densified, for lenses bend it.
+            dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
+            near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
+            pieces = _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
+            draw_lines(canvas, pieces, pen)
         said = "found by the run" if name in OVERLAY else "that the run began with"
         legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
     _write_image(path, with_legend(canvas, legend))
-
-
-def _project_map_line(
-    line_map: FloatArray, info: CameraInfo, position_map: FloatArray, pinhole_px_from_map: FloatArray
-) -> list[FloatArray]:
-    """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
-    dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line_map)])
-    near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-    return _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
 
 
 def _visible_pieces(

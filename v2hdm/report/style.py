@@ -54,7 +54,7 @@ def line_of(method: str) -> dict[str, Any]:
     return {"color": METHOD.get(method, "k"), "marker": marker, "ls": line}
 
 
-_RC: dict[Any, Any] = {
+RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10,
     "axes.spines.top": False,
@@ -76,7 +76,7 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
 
     It has a canvas of its own and never touches pyplot's global state.
     """
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
         FigureCanvasAgg(fig)
         yield fig

@@ -98,14 +98,11 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
         lines = progress_lines(lambda line: plain(console, line))
         yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
         return
-    columns = (
-        TextColumn("{task.description:<20}", markup=False),
-        TextColumn("{task.fields[stage]:<16}", markup=False),
-        BarColumn(30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as bars:
+    texts = [
+        TextColumn(text, markup=False) for text in ("{task.description:<20}", "{task.fields[stage]:<16}")
+    ]
+    bar = (BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*texts, *bar, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
         def advance(drive: str, stage: str, done: int, total: int) -> None:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from v2hdm.records import FloatArray, HdMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
 from v2hdm.report.page.layers import SIGMAS_95
-from v2hdm.report.style import OKABE_ITO, draw_arrows, set_image_axes
+from v2hdm.report.style import OKABE_ITO, RC, draw_arrows, set_image_axes
 
 INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
 """Colours of text, axes, grid and background: those that ``page.css`` replaces by its theme's."""
@@ -32,19 +32,16 @@ CELLS = (9, 16)
 _LEAST_IN_CELL = 10
 """Observations of a cell from which its mean is drawn: its error is a third of one observation's."""
 
-_RC: dict[Any, Any] = {
+_RC: dict[Any, Any] = RC | {
+    "axes.titleweight": "normal",
     "svg.fonttype": "none",
-    "font.family": "sans-serif",
     "font.size": 9.5,
     "text.color": INK,
     "axes.labelcolor": INK,
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
     "axes.linewidth": 0.8,
     "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
     "axes.titlecolor": INK,
     "xtick.color": MUTED,
     "ytick.color": MUTED,
@@ -52,7 +49,6 @@ _RC: dict[Any, Any] = {
     "ytick.labelcolor": INK,
     "grid.color": GRID,
     "grid.linewidth": 0.8,
-    "legend.frameon": False,
     "legend.labelcolor": INK,
     "lines.linewidth": 1.6,
     "patch.linewidth": 1.2,
