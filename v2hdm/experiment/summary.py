@@ -142,14 +142,13 @@ def _tex(text: str) -> str:
     return text.replace("+-", r"$\pm$")
 
 
-OPT_TO_CNI = 1.1
-"""The optimised map is to be at most so many times as far off as one under a manual calibration (port1)."""
-
-ENI_TO_OPT = 10.0
-"""The map under a borrowed calibration is to be so many times as far off as the optimised one (port2)."""
-
-ONI_TO_CNI = 1.2
-"""The naive map under the optimised IPM is to be at most so many times as far off as under the manual one."""
+_RATIOS = (
+    ("the optimisation is as good as a manual calibration", "Opt", "CNI", "<=", 1.1, "calibrated"),
+    ("it repairs a borrowed calibration", "ENI", "Opt", ">=", 10.0, "estimated"),
+    ("its IPM serves as well as the manual one", "ONI", "CNI", "<=", 1.2, None),
+)
+"""Claims on how many times as far off the map of one method is as that of another, the limit of that, and the
+IPM that a port must start from to test it; None for any."""
 
 
 @dataclass(frozen=True)
@@ -179,14 +178,9 @@ def claims(measured: Sequence[Measured]) -> list[Claim]:
     for port, drives in by_port(measured).items():
         started = drives[0].started_from
         for cameras in drives[0].rows:
-            if started == "calibrated":
-                text = "the optimisation is as good as a manual calibration: Opt / CNI"
-                found.append(_claim(text, port, drives, cameras, ("Opt", "CNI"), "<=", OPT_TO_CNI))
-            elif started == "estimated":
-                text = "it repairs a borrowed calibration: ENI / Opt"
-                found.append(_claim(text, port, drives, cameras, ("ENI", "Opt"), ">=", ENI_TO_OPT))
-            text = "its IPM serves as well as the manual one: ONI / CNI"
-            found.append(_claim(text, port, drives, cameras, ("ONI", "CNI"), "<=", ONI_TO_CNI))
+            for text, above, below, sign, limit, needed in _RATIOS:
+                if needed in (None, started):
+                    found.append(_claim(text, port, drives, cameras, (above, below), sign, limit))
         found += _more_with_more(port, drives)
     return [claim for claim in found if claim.values]
 
@@ -220,7 +214,8 @@ def _claim(
     shared = _known(above.shared_rmse_m / below.shared_rmse_m for above, below in pairs)
     mean = float(np.mean(values)) if values else float("nan")
     holds = mean <= limit if sign == "<=" else mean >= limit
-    return Claim(text, f"{port}, {cameras}", f"{sign} {limit:g}", values, holds, shared)
+    title = f"{text}: {' / '.join(methods)}"
+    return Claim(title, f"{port}, {cameras}", f"{sign} {limit:g}", values, holds, shared)
 
 
 def write_words(

@@ -157,11 +157,10 @@ def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
     squared: list[float] = []
     for row, column in zip(rows, columns, strict=True):
         covariance = markings[row].covariance_m2
-        if covariance is None:
-            continue
-        off = corner_errors([markings[row]], [facts.truth.map.markings[column]])
-        blocks = covariance.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
-        squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(blocks), off).tolist()
+        if covariance is not None:
+            off = corner_errors([markings[row]], [facts.truth.map.markings[column]])
+            blocks = covariance.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
+            squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(blocks), off).tolist()
     return None if len(squared) < _LEAST_FOR_SHARE else float(np.mean(np.array(squared) <= SIGMAS_95**2))
 
 
@@ -184,18 +183,13 @@ _CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
 
 def check_point_table(facts: Facts) -> Table | None:
     """Surveyed points that no estimate has seen, beside the map: what ``check_points.csv`` says of them."""
-    shown = {
-        name: column
-        for name, column in _CHECK_COLUMNS.items()
-        if any(row.get(name) for row in facts.check_points)
-    }
+    rows = facts.check_points
+    shown = {name: one for name, one in _CHECK_COLUMNS.items() if any(row.get(name) for row in rows)}
     if not shown:
         return None
-    return Table(
-        [heading for heading, _, _ in shown.values()],
-        [[_check_cell(row.get(name, ""), *shown[name][1:]) for name in shown] for row in facts.check_points],
-        [factor is not None for _, factor, _ in shown.values()],
-    )
+    cells = [[_check_cell(row.get(name, ""), *one[1:]) for name, one in shown.items()] for row in rows]
+    headings, factors, _ = zip(*shown.values(), strict=True)
+    return Table(headings, cells, [factor is not None for factor in factors])
 
 
 def _check_cell(text: str, factor: float | None, digits: int) -> str:
