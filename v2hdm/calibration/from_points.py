@@ -135,8 +135,13 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
             f"{points.path}: the points fix no camera: they lie about on a line, or all but one do; "
             "survey some to the left and to the right of it"
         )
-    unit, height = _unit_of(fits[0]), _height_m(fits[0])
-    if unit is not None:
+    height = _height_m(fits[0])
+
+    def log_odds(metres: float, prior: float) -> float:
+        return float(-0.5 * (np.log(height * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
+
+    unit = max(UNITS, key=lambda unit: log_odds(UNITS[unit], _MISREAD))
+    if log_odds(UNITS[unit], _MISREAD) > log_odds(1.0, 1.0):
         raise DriveError(
             f"{points.path}: the camera comes out {height:.4g} m above the ground: x and y look like {unit}; "
             f"write metres, in which that is {height * UNITS[unit]:.2f} m"
@@ -168,16 +173,6 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise, given: F
                 cause, highest = words, _score(fit)
     as_given = -np.inf if given is None else _score(given)
     return cause if highest > -np.inf and highest + np.log(_MISREAD) - as_given > _SURE else None
-
-
-def _unit_of(fit: Fit) -> str | None:
-    """The unit of the ground points where it is not the metre, by the height that the camera comes out at."""
-
-    def log_odds(metres: float, prior: float) -> float:
-        return float(-0.5 * (np.log(_height_m(fit) * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
-
-    best = max(UNITS, key=lambda unit: log_odds(UNITS[unit], _MISREAD))
-    return best if log_odds(UNITS[best], _MISREAD) > log_odds(1.0, 1.0) else None
 
 
 def _score(fit: Fit) -> float:

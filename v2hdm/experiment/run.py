@@ -96,9 +96,9 @@ def _start_worker(queue: SimpleQueue[Any]) -> None:
 
 
 def _work(job: Job) -> dict[str, Any]:
-    def report(stage: str, done: int, total: int) -> None:
+    def report(task: str, done: int, total: int) -> None:
         if _queue is not None:
-            _queue.put((job.title, stage, done, total))
+            _queue.put((job.title, task, done, total))
 
     with listed_files(job.root, _OPTION):
         return drive_record(job, 1, report)

@@ -308,8 +308,6 @@ class _Sums:
 
 def _box(trust: np.ndarray) -> tuple[slice, slice]:
     """The rows and columns that are trusted at all, and one around them."""
-    rows, columns = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2),
-        slice(max(int(columns[0]) - 1, 0), int(columns[-1]) + 2),
-    )
+    trusted = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(max(int(one[0]) - 1, 0), int(one[-1]) + 2) for one in trusted)
+    return rows, columns
