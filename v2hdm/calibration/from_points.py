@@ -132,7 +132,7 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     Raises:
         DriveError: none does: they lie on a line, or the table is written otherwise than its columns say.
     """
-    fits = fit_mountings(Seen.of(points, info, noise))
+    fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
         cause = _misreading(points, info, noise, fits[0] if fits else None)
         if cause is not None:
@@ -142,8 +142,13 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
             f"{points.path}: the points fix no camera: they lie about on a line, or all but one do; "
             "survey some to the left and to the right of it"
         )
-    unit, height = _unit_of(fits[0]), _height_m(fits[0])
-    if unit is not None:
+    height = _height_m(fits[0])
+
+    def log_odds(metres: float, prior: float) -> float:
+        return float(-0.5 * (np.log(height * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
+
+    unit = max(UNITS, key=lambda unit: log_odds(UNITS[unit], _MISREAD))
+    if log_odds(UNITS[unit], _MISREAD) > log_odds(1.0, 1.0):
         raise DriveError(
             f"{points.path}: the camera comes out {height:.4g} m above the ground: x and y look like {unit}; "
             f"write metres, in which that is {height * UNITS[unit]:.2f} m"
@@ -169,23 +174,12 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise, given: F
     """The cause under which the points make sense, if they make none as they are."""
     cause, highest = None, -np.inf
     for words, points_px, points_vehicle in _readings(points, info):
-        seen = Seen.of_pixels(points_px, points_vehicle, info, noise)
+        seen = Seen.of(points_px, points_vehicle, info, noise)
         for fit in fit_mountings(seen, _STARTS, _ROUNDS):
             if _score(fit) > highest:
                 cause, highest = words, _score(fit)
     as_given = -np.inf if given is None else _score(given)
     return cause if highest > -np.inf and highest + np.log(_MISREAD) - as_given > _SURE else None
-
-
-def _unit_of(fit: Fit) -> str | None:
-    """The unit of the ground points where it is not the metre, by the height that the camera comes out at."""
-
-    def log_odds(metres: float, prior: float) -> float:
-        return float(-0.5 * (np.log(_height_m(fit) * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
-
-    scores = {unit: log_odds(metres, _MISREAD) for unit, metres in UNITS.items()}
-    best = max(scores, key=lambda unit: scores[unit])
-    return best if scores[best] > log_odds(1.0, 1.0) else None
 
 
 def _score(fit: Fit) -> float:
@@ -233,26 +227,18 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
     with (folder / POINTS_FILE).open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
-        table.writerows(_rows(found))
+        points, off = found.points, found.residuals
+        for k, name in enumerate(points.names):
+            shift = [
+                *(f"{value:.3f}" for value in off.off_px[k]),
+                *(f"{value:.4f}" for value in off.off_m[k]),
+            ]
+            known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
+            table.writerow(
+                [name, *points.points_px[k].tolist(), *points.points_vehicle[k].tolist(), *shift, *known]
+            )
     labels = found.points.labels
     save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
-
-
-def _rows(found: PointCalibration) -> list[list[object]]:
-    points, off = found.points, found.residuals
-    return [
-        [
-            points.names[k],
-            *points.points_px[k].tolist(),
-            *points.points_vehicle[k].tolist(),
-            *(f"{value:.3f}" for value in off.off_px[k]),
-            *(f"{value:.4f}" for value in off.off_m[k]),
-            f"{off.sigmas[k]:.2f}",
-            f"{found.fit.right[k]:.3g}",
-            f"{off.known_m[k]:.4f}",
-        ]
-        for k in range(len(points.names))
-    ]
 
 
 def summary_lines(found: PointCalibration) -> list[str]:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
@@ -30,6 +28,7 @@ from v2hdm.records import (
     IntArray,
     Trajectory,
 )
+from v2hdm.report import style
 from v2hdm.report.outputs import write_json
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
@@ -93,8 +92,7 @@ class Localised:
         for state in self.states:
             c, s = np.cos(state.mean[2]), np.sin(state.mean[2])
             turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-            variance = np.diag(turn @ state.covariance[:3, :3] @ turn.T)
-            out.append(np.sqrt(variance + self.shared))
+            out.append(np.sqrt(np.diag(turn @ state.covariance[:3, :3] @ turn.T) + self.shared))
         return np.stack(out)
 
     @property
@@ -197,11 +195,8 @@ def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive
 
 def _yaw_variance(calibrations: Mapping[str, Calibration]) -> float:
     """Variance, rad^2, of the cameras' common turn about the vertical: that of their mean."""
-    variances = []
-    for one in calibrations.values():
-        up = one.cam_from_vehicle[:3, 2]
-        variances.append(0.0 if one.covariance is None else float(up @ one.covariance[3:, 3:] @ up))
-    return float(np.mean(variances))
+    known = [(one.cam_from_vehicle[:3, 2], one.covariance) for one in calibrations.values()]
+    return float(np.mean([0.0 if c is None else float(up @ c[3:, 3:] @ up) for up, c in known]))
 
 
 def _seen(
@@ -212,16 +207,9 @@ def _seen(
     out = []
     for row in np.flatnonzero(sightings.frame == frame).tolist():
         camera = names[sightings.camera[row]]
-        out.append(
-            Seen(
-                sightings.kinds[sightings.kind[row]],
-                drive.cameras[camera].info.intrinsic,
-                calibrations[camera].cam_from_vehicle,
-                sightings.corners_pinhole_px[row],
-                sightings.covariance_px[row],
-                informs[row],
-            )
-        )
+        kind, corners_px = sightings.kinds[sightings.kind[row]], sightings.corners_pinhole_px[row]
+        pose = (drive.cameras[camera].info.intrinsic, calibrations[camera].cam_from_vehicle)
+        out.append(Seen(kind, *pose, corners_px, sightings.covariance_px[row], informs[row]))
     return out
 
 
@@ -276,22 +264,20 @@ def save_errors(path: Path, found: Localised, sigma: FloatArray) -> None:
     Bands are two standard deviations (F, 3) of estimate and recorded pose together; frames in which the
     vehicle does not know where it is are crosses.
     """
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
-    axes = figure.subplots(3, 1, sharex=True)
-    for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
-        band = 2 * factor * sigma[:, k]
-        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
-        axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
-        if not known.all():
-            axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
-        limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
-        limit = max(limit, 2 * float(np.median(band)))
-        axis.set_ylim(-limit, limit)
-        axis.set_ylabel(f"{name}, {unit}")
-        axis.grid(alpha=0.3)
-    axes[0].legend(loc="upper right", ncols=3, fontsize=8)
-    axes[0].set_title("Localised by the map's markings, less the recorded pose")
-    axes[-1].set_xlabel("time, s")
-    figure.savefig(path, dpi=110)
+    with style.figure(path, 9, 6) as figure:
+        axes = figure.subplots(3, 1, sharex=True)
+        for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
+            band = 2 * factor * sigma[:, k]
+            axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
+            axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
+            if not known.all():
+                axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+            limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
+            limit = max(limit, 2 * float(np.median(band)))
+            axis.set_ylim(-limit, limit)
+            axis.set_ylabel(f"{name}, {unit}")
+            axis.grid(alpha=0.3)
+        axes[0].legend(loc="upper right", ncols=3, fontsize=8)
+        axes[0].set_title("Localised by the map's markings, less the recorded pose")
+        axes[-1].set_xlabel("time, s")

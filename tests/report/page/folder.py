@@ -29,7 +29,8 @@ from v2hdm.records import (
     Marking,
     Symbol,
 )
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
+from v2hdm.store.results import result_folder
 
 INFO = CameraInfo("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))
 DIAMOND_M = np.array([[0.5, 0.0], [0.0, 0.35], [-0.5, 0.0], [0.0, -0.35]])
