@@ -17,7 +17,7 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, frame_tangent
-from v2hdm.adjust.problem import LINE_EXCESS, Problem, SolveOptions
+from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.start import coarse_extrinsics, is_near, is_worth_a_look
 from v2hdm.adjust.validation import VarianceFactors, as_of_point, classify, noise_scale, variance_factors
@@ -123,15 +123,13 @@ def report(
     began: float,
 ) -> Solution:
     """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
-    from v2hdm.adjust.engines.numba.prepare import on_line  # loads numba
-
     robust = Loss(options.loss, options.loss_scale)
     engine, estimate, terms = descent.engine, descent.estimate, descent.terms
     arrays = engine.arrays
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
     residual_px, mahalanobis2, behind = engine.report(estimate, problem.intrinsic[:, :2])
-    lines = on_line(problem.observations.covariance_px, LINE_EXCESS)
+    lines = problem.observations.on_line
     if lines.any():
         mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
     scale = noise_scale(mahalanobis2)
