@@ -204,7 +204,7 @@ class ReducedSystem:
         self._kept_diagonal = lower.view(plan.kept_tiles, plan.size)
         for tile, pad in enumerate(empty.view(plan.kept_tiles, -1)):
             place = int(plan.position[plan.frame_tiles + tile])
-            self.matrix.diagonal[place].diagonal().add_(pad.to(lower.dtype))
+            self.matrix.tiles[place, place].diagonal().add_(pad.to(lower.dtype))
         border = self.spread.by_camera(run, coupling).flatten(0, 1)
         for tile, part in enumerate(torch.split(border, 2 * each)):
             place = int(plan.position[plan.frame_tiles + tile])
@@ -219,8 +219,9 @@ class ReducedSystem:
         """Add values at rows and columns of the tiles; of two that mirror each other the lower one counts."""
         rows, columns = torch.broadcast_tensors(rows, columns)  # type: ignore[no-untyped-call]
         low, high = torch.minimum(rows, columns), torch.maximum(rows, columns)
-        size, tile = self.plan.size, low // self.plan.size * self.plan.tile_count + high // self.plan.size
-        keys, at = self.matrix.addresses
+        size, device = self.plan.size, values.device
+        tile = low // size * (self.plan.tile_count + 1) + high // size
+        keys, at = (torch.as_tensor(one, device=device) for one in (self.matrix.keys, self.matrix.at))
         places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
         self.matrix.values.index_add_(0, places.flatten(), values.flatten())
 
