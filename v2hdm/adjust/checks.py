@@ -29,7 +29,7 @@ def check_problem(problem: Problem) -> None:
     _check_lengths(problem)
 
 
-def _refuse(wrong: BoolArray, said: str, *values: FloatArray | IntArray) -> None:
+def _refuse(wrong: BoolArray | np.bool_, said: str, *values: FloatArray | IntArray) -> None:
     """Raise for the first item that is ``wrong``, if any is: its number and ``values`` are filled in."""
     if wrong.any():
         k = int(np.argmax(wrong))

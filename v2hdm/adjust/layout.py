@@ -73,6 +73,8 @@ def _state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArr
     """
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
+    if not chosen:
+        return np.zeros(0, dtype=np.int64), np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0))
     total = np.array([one.by_state() for one in problem.pose_sigmas])
     drifts = [one.drift_by_state() for one in problem.pose_sigmas]
     drift, over_m = np.array([[(each.sigma, each.over_m) for each in one] for one in drifts]).transpose(

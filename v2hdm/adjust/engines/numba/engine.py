@@ -14,13 +14,13 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
-from v2hdm.adjust.engine import Evaluated
+from v2hdm.adjust.engine import Engine, Evaluated, Linearised
 from v2hdm.adjust.engines.numba import evaluate, frames, linearise, motion, observe
 from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.adjust.engines.numba.evaluate import Evaluation
 from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
 from v2hdm.adjust.engines.numba.pool import share
-from v2hdm.adjust.engines.numba.tables import Sums, cam_from_map, prior_blocks_of, spread_of, with_priors
+from v2hdm.adjust.engines.numba.tables import cam_from_map, prior_blocks_of, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
 from v2hdm.adjust.tiles import find_pattern
@@ -36,25 +36,12 @@ _CLEARLY_LESS = 0.5
 _PAIR_BLOCK = torch.triu_indices(6, 6)
 
 
-class NumbaEngine:
+class NumbaEngine(Engine):
     """The kernels over one problem's arrays."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        self._arrays = arrays
-        self._shape = (arrays.camera_count, arrays.frame_count, 6)
-
-    @property
-    def arrays(self) -> Arrays:
-        """The problem."""
-        return self._arrays
-
-    def over(self, arrays: Arrays) -> NumbaEngine:
-        """The engine over another problem."""
-        return NumbaEngine(arrays)
 
     @cached_property
     def _whole(self) -> Layout:
-        return make_layout(self._arrays)
+        return make_layout(self.arrays)
 
     @cached_property
     def layout(self) -> Layout:
@@ -72,7 +59,7 @@ class NumbaEngine:
     @cached_property
     def _plan(self) -> Plan:
         """The cheapest: all corners eliminated first, in either order, or those of several drives kept."""
-        arrays, per_tile = self._arrays, frames_per_tile(self._arrays)
+        arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
         none, states = arrays.corner_order[:0], len(arrays.states)
         if not states:
             return Plan(per_tile, 0, 0, find_pattern(0, []), none)
@@ -95,13 +82,13 @@ class NumbaEngine:
         return best
 
     def _with_kept(self, kept: Tensor) -> Layout:
-        mask = np.zeros(self._arrays.corner_count, dtype=np.bool_)
+        mask = np.zeros(self.arrays.corner_count, dtype=np.bool_)
         mask[kept.numpy()] = True
         return self._whole._replace(kept=mask[self._whole.unit[:-1]])
 
     def _shared_corners(self) -> Tensor:
         """Corners (n,) that several drives observed, with those that known lengths join to them."""
-        arrays, layout = self._arrays, self._whole
+        arrays, layout = self.arrays, self._whole
         visit = arrays.visit[arrays.pair.long() % arrays.frame_count].numpy()
         begin = layout.begin[layout.unit[:-1]]
         shared = np.minimum.reduceat(visit, begin) < np.maximum.reduceat(visit, begin)
@@ -123,11 +110,11 @@ class NumbaEngine:
 
     def poses(self, estimate: Estimate) -> Tensor:
         """``cam_from_map`` of every pair, (C, J, 4, 4)."""
-        return cam_from_map(self._arrays, estimate)
+        return cam_from_map(self.arrays, estimate)
 
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
         """Corners (N, 2) by weighted back-projection from recorded poses, and which a ray fixes."""
-        arrays, count = self._arrays, self._arrays.corner_count
+        arrays, count = self.arrays, self.arrays.corner_count
         corners, fixed = np.empty((count, 2)), np.empty(count, dtype=np.bool_)
         state = torch.zeros_like(arrays.state_information_root)
         table = _table(self.poses(Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())))
@@ -146,14 +133,14 @@ class NumbaEngine:
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         count = len(self._whole.pair)
         out = observe.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
-        order, focal = self._arrays.order.numpy(), np.ascontiguousarray(focal_px)
+        order, focal = self.arrays.order.numpy(), np.ascontiguousarray(focal_px)
         self.share(lambda b, e: observe.report(b, e, self._whole, table, corners, order, focal, out))
         return out
 
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
         """The cost, by name."""
         spread = self.spread(estimate)
-        system = ReducedSystem(self._arrays, self.plan(), spread)
+        system = ReducedSystem(self.arrays, self.plan(), spread)
         return self.eliminate(system, estimate, robust, 0.0).terms
 
     def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
@@ -161,17 +148,19 @@ class NumbaEngine:
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         wrench, by_corner = np.zeros((len(table), 6)), np.zeros_like(corners)
         observe.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
-        gathered = self.spread(estimate).gather(torch.from_numpy(wrench).view(self._shape))
+        gathered = self.spread(estimate).gather(
+            torch.from_numpy(wrench).view(self.arrays.camera_count, -1, 6)
+        )
         camera = gathered.camera
         return Gradient(camera[:, :6], gathered.frame_state, torch.from_numpy(by_corner), camera[:, 6:])
 
     def spread(self, estimate: Estimate) -> Spread:
         """How pairs move with frame states and clock offsets."""
-        return spread_of(self._arrays, estimate)
+        return spread_of(self.arrays, estimate)
 
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
         """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
-        return prior_blocks_of(self._arrays, estimate)
+        return prior_blocks_of(self.arrays, estimate)
 
     def eliminate(
         self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
@@ -181,7 +170,7 @@ class NumbaEngine:
         Raises:
             AdjustError: corners that lengths join cannot be solved for together.
         """
-        arrays, layout, spread = self._arrays, self.layout, system.spread
+        arrays, layout, spread = self.arrays, self.layout, system.spread
         clock, width, pairs = _by_pair(spread.clock), system.tip, arrays.pair_count
         touched, chunks = len(layout.touched), len(layout.chunk) - 1
         owners = touched if system.by_pair else chunks * arrays.camera_count
@@ -221,7 +210,9 @@ class NumbaEngine:
             self._keep(system, base)
         if states:
             self._subtract_frames(base, system)
-        terms, gradient = with_priors(arrays, estimate, spread, self.sums(out.costs, out.wrench))
+        terms, gradient = with_priors(
+            arrays, estimate, spread, torch.from_numpy(out.costs.sum(0)), self.pairs(out.wrench)
+        )
         return NumbaLinearised(
             terms,
             gradient,
@@ -237,7 +228,7 @@ class NumbaEngine:
     def _keep(self, system: ReducedSystem, base: Base) -> None:
         """Add the kept corners' blocks, found where factors belong, to the system; factors are then 1."""
         layout, kept = self.layout, system.plan.kept
-        number = np.full(self._arrays.corner_count, -1)
+        number = np.full(self.arrays.corner_count, -1)
         number[kept.numpy()] = np.arange(len(kept))
         index, blocks = [], []
         for u in np.flatnonzero(layout.kept):
@@ -255,7 +246,7 @@ class NumbaEngine:
                     index.append((number[first + high], number[first + low]))
                     blocks.append(joint[high, :, low].copy())
             joint.reshape(2 * size, -1)[:] = np.eye(2 * size)
-        run = self._arrays.gather(kept)
+        run = self.arrays.gather(kept)
         coupling = self.coupling(run, base._replace(corners=base.corners[kept.numpy()]))
         system.add_kept(run, coupling, torch.tensor(np.array(index).T), torch.from_numpy(np.array(blocks)))
 
@@ -282,7 +273,7 @@ class NumbaEngine:
             at=matrix.at,
         )
         by_state, clock = _by_pair(spread.state), _by_pair(spread.clock)
-        each, values = self._arrays.camera_unknowns, matrix.values.numpy()
+        each, values = self.arrays.camera_unknowns, matrix.values.numpy()
         cuts = np.linspace(0, plan.tile_count, min(_COLUMN_RANGES, plan.tile_count) + 1).astype(int)
 
         def work(begin: int, end: int) -> None:
@@ -294,37 +285,28 @@ class NumbaEngine:
 
         share(work, len(cuts) - 1, len(layout.pair))
 
-    def sums(self, costs: FloatArray, wrench: FloatArray) -> Sums:
-        """Sums over the chunks, (Q, 3) and (R, 6)."""
-        observed, control, lengths = torch.from_numpy(costs.sum(0))
-        return Sums(observed, control, lengths, self._pairs(wrench))
-
     def coupled(self, by_pair: FloatArray, carried: FloatArray, spread: Spread) -> Coupled:
         """W V^-1 g, from what chunks add up by pair (R, 6) or by the cameras' unknowns (Q, D)."""
-        if self._arrays.states:
-            return spread.gather(self._pairs(by_pair))
-        cameras = torch.from_numpy(carried.sum(0)).view(self._arrays.camera_count, -1)
-        return Coupled(cameras.new_zeros(self._arrays.frame_count, 0), cameras)
+        if self.arrays.states:
+            return spread.gather(self.pairs(by_pair))
+        cameras = torch.from_numpy(carried.sum(0)).view(self.arrays.camera_count, -1)
+        return Coupled(cameras.new_zeros(self.arrays.frame_count, 0), cameras)
 
-    def _pairs(self, parts: FloatArray) -> Tensor:
-        return torch.from_numpy(self.gather(parts)).view(self._shape)
+    def pairs(self, parts: FloatArray) -> Tensor:
+        """Sums (C, J, n) of the chunks' (R, n)."""
+        return torch.from_numpy(self.gather(parts)).view(self.arrays.camera_count, -1, 6)
 
     def gather(self, parts: FloatArray) -> FloatArray:
         """Sums (P, n) of the chunks' (R, n) by the pairs that they touch."""
-        out = np.zeros((self._arrays.pair_count, parts.shape[1]))
+        out = np.zeros((self.arrays.pair_count, parts.shape[1]))
         _gather(self._whole.touched, parts, out)
         return out
 
 
-@dataclass
-class NumbaLinearised:
-    """A problem linearised by kernels, its corners eliminated: :class:`v2hdm.adjust.engine.Linearised`."""
+@dataclass(frozen=True)
+class NumbaLinearised(Linearised):
+    """A problem linearised by kernels, its corners eliminated."""
 
-    terms: dict[str, Tensor]
-    gradient: Gradient
-    corner_factor: CornerFactor
-    whitened: Tensor
-    coupled: Coupled
     engine: NumbaEngine
     base: Base
     estimate: Estimate
@@ -346,8 +328,8 @@ class NumbaLinearised:
             evaluate.evaluate(begin, end, layout, base, table, moved, by_camera, whitened, room, out)
 
         engine.share(work)
-        sums = engine.sums(out.costs, out.wrench)
-        terms, gradient = with_priors(arrays, at, engine.spread(at), sums)
+        costs, wrench = torch.from_numpy(out.costs.sum(0)), engine.pairs(out.wrench)
+        terms, gradient = with_priors(arrays, at, engine.spread(at), costs, wrench)
         by_tangent = (torch.from_numpy(chart).mT @ gradient.extrinsic[..., None])[..., 0]
         at = replace(at, corners_map=torch.from_numpy(out.corners))
         return Evaluated(at, terms, replace(gradient, extrinsic=by_tangent), *self._carried(out))

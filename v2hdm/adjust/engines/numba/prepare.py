@@ -26,9 +26,10 @@ class Seen(NamedTuple):
     @classmethod
     def of(cls, columns: Iterable[NDArray[Any]], intrinsic: FloatArray) -> Seen:
         """Of columns in this order, copied only where their kind or layout is another."""
-        indices_come_first = 3 * (np.int64,) + 3 * (np.float64,)
-        both = zip((*columns, intrinsic), indices_come_first, strict=True)
-        return cls(*(np.ascontiguousarray(values, dtype=kind) for values, kind in both))
+        kinds = 3 * (np.int64,) + 3 * (np.float64,)
+        both = zip((*columns, intrinsic), kinds, strict=True)
+        made: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in both]
+        return cls(*made)
 
 
 @kernel
