@@ -32,10 +32,12 @@ def run_on_terminal(config: RunConfig, config_yaml: str) -> Verdict:
         console.print(results_table(result.metrics["name"], result.metrics["results"]))
     if "changes" in result.metrics:
         console.print(changes_table(result.metrics["changes"]))
-    style = _STYLES[result.verdict.status]
-    for number, line in enumerate(result.verdict.lines):
-        console.print(
-            line, style=style if number == 0 else None, highlight=False, markup=False, soft_wrap=True
-        )
+    summary, *findings = result.verdict.lines
+    for line in findings:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     console.print(f"results in {result.place}: open report.html", highlight=False, soft_wrap=True)
+    # last, where it is in sight: how good the map is
+    console.print(
+        summary, style=_STYLES[result.verdict.status], highlight=False, markup=False, soft_wrap=True
+    )
     return result.verdict

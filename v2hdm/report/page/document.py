@@ -56,6 +56,7 @@ def document(facts: Facts) -> SimpleNamespace:
         summary=_summary(facts),
         verdict=SimpleNamespace(
             status=status,
+            headline=str(verdict.get("headline") or "").partition(": ")[2],
             says=_SAYS.get(status, ""),
             raised=tables.finding_rows(verdict, "findings"),
             untold=tables.finding_rows(verdict, "untold"),
