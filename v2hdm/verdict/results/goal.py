@@ -32,7 +32,9 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         radius_m = np.array([worst_corner_m(one) for one in markings])
         reached_m = float(np.quantile(radius_m, _SHARE, method="inverted_cdf"))
         says = f"95 % of {len(markings)} markings within {_cm(reached_m)} in the frame of the {frame}"
-        relative_m = [_relative_m(one) for one in markings if one.relative_sigma_m is not None]
+        relative_m = [
+            _CIRCLE_95 * one.relative_sigma_m for one in markings if one.relative_sigma_m is not None
+        ]
         if relative_m:
             says += f", {_cm(float(np.quantile(relative_m, _SHARE)))} from marking to marking"
         # The map's own limit on sigmas leaves the worst out, so that the share alone would flatter.
@@ -84,11 +86,7 @@ def _own_m(marking: Marking) -> float:
         return 0.0
     centre_m = _radius_m(np.einsum("iajb->ab", marking.covariance_m2.reshape(4, 2, 4, 2)) / 16)
     shape_m2 = max(worst_corner_m(marking) ** 2 - centre_m**2, 0.0)
-    return float(np.sqrt(_relative_m(marking) ** 2 + shape_m2))
-
-
-def _relative_m(marking: Marking) -> float:
-    return _CIRCLE_95 * (marking.relative_sigma_m or 0.0)
+    return float(np.hypot(_CIRCLE_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
 
 
 def ground_ahead(calibration: Calibration) -> tuple[float, str]:
