@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.mapping.scene import extrinsic
 from tests.verdict.test_solution import INFO, square_at
+from v2hdm.cli import terminal
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
-from v2hdm.pipeline.config import check_choice
+from v2hdm.pipeline.config import RunConfig, check_choice
+from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.records import Calibration, FloatArray, HdMap, Marking
 from v2hdm.site.candidates import Exclusion
@@ -110,6 +113,18 @@ def test_what_states_no_covariance_promises_nothing() -> None:
         assert "within an unknown distance" in verdict.headline
         json.dumps(verdict.as_json(), allow_nan=False)
     assert "it saw no marking" in next(f.says for f in judged(one).raised if f.about == "front")
+
+
+def test_the_terminal_ends_with_how_good_the_map_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verdict = judged(mapped([marking(n, shared_m=0.05) for n in range(30)]))
+    result = RunResult(Path("out"), {"results": {}}, (), verdict)
+    monkeypatch.setattr(terminal, "run", lambda *_: result)
+    assert terminal.run_on_terminal(RunConfig(name="yard"), "") is verdict
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert [line.split(":")[0] for line in lines] == ["WARN coarse (map)", "results in out", "verdict"]
+    assert "95 % of 30 markings within 12 cm" in lines[-1]
 
 
 def test_a_failed_run_promises_no_accuracy() -> None:
