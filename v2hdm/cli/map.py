@@ -49,9 +49,9 @@ def _map(job: Job) -> int:
     if "changes" in result.metrics:
         console.print(changes_table(result.metrics["changes"]))
     first, *lines = result.verdict.lines
-    console.print(
-        first, style=_STYLES[result.verdict.status.value], highlight=False, markup=False, soft_wrap=True
-    )
     for line in [*lines, f"results in {result.place}: open report.html"]:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+    # Last, where it is in sight: how good the map is.
+    style = _STYLES[result.verdict.status.value]
+    console.print(first, style=style, highlight=False, markup=False, soft_wrap=True)
     return exit_code(result.verdict)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from v2hdm.io.safe.texts import shown, take_camera_name, take_name
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig
+
+ACCURACY_GOAL_CM = 5.0
+"""The 95 % radius, cm, that is asked of a map where nobody states another."""
 
 NO_DRIVE = (
     "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, "
@@ -72,6 +76,8 @@ class RunConfig:
         device: the value that ``conf/map.yaml`` passes on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: the value that it passes on as ``mapping.mode``, ``batch`` or ``incremental``.
+        accuracy_goal_cm: the radius, cm, within which 95 % of the markings, and the calibrations, have to be
+            known at 95 %, else the verdict is WARN (docs/verdict.md).
         mosaic: whether the ground is shown from above, too (docs/mosaic.md).
         viewer: ``rerun`` shows and records the run while it goes on (docs/live-view.md), ``none`` does not.
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
@@ -90,6 +96,7 @@ class RunConfig:
     workers: int = 0
     device: str = "cpu"
     mode: str = "batch"
+    accuracy_goal_cm: float = ACCURACY_GOAL_CM
     all_maps: bool = False
     mosaic: bool = False
     viewer: str = "none"
@@ -164,12 +171,15 @@ def admit(config: RunConfig) -> str:
         raise ConfigError(
             "mosaic=true puts the images of one drive on the ground; map the drives one by one for it"
         )
-    check_choice(config.mapping, len(config.drive.paths), config.map.base is not None)
+    has_base = config.map.base is not None
+    check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name
 
 
-def check_choice(options: MappingOptions, drives: int, has_base: bool) -> None:
+def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: float) -> None:
     """Raise ConfigError where settings do not go with so many drives, with an earlier map, or here."""
+    if not 0 < goal_cm < math.inf:
+        raise ConfigError(f"accuracy_goal_cm is {goal_cm}: set {POSITIVE}")
     if has_base and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if drives > 1 and options.mode == INCREMENTAL:

@@ -20,7 +20,7 @@ from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
-from v2hdm.pipeline.config import check_choice
+from v2hdm.pipeline.config import ACCURACY_GOAL_CM, check_choice
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
@@ -32,6 +32,7 @@ from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
+from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_result
 from v2hdm.verdict.results.survey import check_known_sizes
 
@@ -56,6 +57,7 @@ def map_drive(
     detector: Detector | DetectorOptions | None = None,
     reading: ReadOptions | None = None,
     base: Path | str | None = None,
+    accuracy_goal_cm: float = ACCURACY_GOAL_CM,
     name: str | None = None,
     cache: Path | str | None = None,
     progress: Progress = silent,
@@ -70,6 +72,7 @@ def map_drive(
         detector: the detector, or its settings.
         reading: how folders are read.
         base: the map.geojson of an earlier result, which the drive brings up to date.
+        accuracy_goal_cm: the 95 % radius, cm, within which map and calibrations have to be known for a PASS.
         name: of the result; None takes that of the drive.
         cache: folder that keeps what each stage has found for the next call; None keeps nothing.
         progress: shows how far the long steps are, ``progress(task, done, total)``.
@@ -84,9 +87,10 @@ def map_drive(
         DriveError: the drive cannot be read.
         MapFileError: ``base`` cannot be used.
         DetectorError: the detector cannot be used.
+        ConfigError: ``accuracy_goal_cm`` or another setting is out of range.
         MappingError: there is nothing to map, although no check of the drive has failed.
 
-    >>> result = map_drive(port, workers=1)
+    >>> result = map_drive(port, accuracy_goal_cm=10.0, workers=1)
     >>> result.verdict.status.value
     'PASS'
     >>> {marking.kind for marking in result.map.markings} <= {"diamond", "lane_dash", "stop_line"}
@@ -100,7 +104,7 @@ def map_drive(
     settings = detector.options if isinstance(detector, Detector) else detector
     settings = settings or DetectorOptions.for_mapping()
     sources = [drive] if isinstance(drive, Source) else list(drive)
-    check_choice(options, len(sources), base is not None)
+    check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
     earlier = None if base is None else read_base(Path(base))
     if earlier is not None:
@@ -125,7 +129,7 @@ def map_drive(
         failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
         verdict = Verdict.of([*checked.findings, failed])
         return replace(unjudged, verdict=verdict, figures={"results": {}})
-    return _judge(unjudged, checked, detections, sets, survey, context)
+    return _judge(unjudged, checked, detections, sets, survey, accuracy_goal_cm, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
@@ -170,6 +174,7 @@ def _judge(
     detections: Sequence[ImageDetections],
     sets: dict[str, MappedSet],
     survey: Survey,
+    goal_cm: float,
     context: Context,
 ) -> Result:
     methods = {name: one.methods for name, one in sets.items()}
@@ -177,7 +182,9 @@ def _judge(
     with context.timed("judge"):
         found = check_result(checked.drive, methods, checked.ground)
         unfit = check_known_sizes(survey.mapping.known_sizes, best)
-        verdict = Verdict.of([*checked.findings, *found, *unfit, *check_survey(survey, best, compared)])
+        reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.control else "poses")
+        surveyed = check_survey(survey, best, compared)
+        verdict = Verdict.of([*checked.findings, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
         judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}

@@ -231,6 +231,7 @@ def map_and_save(config: RunConfig, cache: StageCache, config_yaml: str, context
                 detector=config.detector,
                 reading=config.drive,
                 base=config.map.base,
+                accuracy_goal_cm=config.accuracy_goal_cm,
                 context=context,
             )
             key = result_key(config, found.drives, found.contents, context.cache.key())

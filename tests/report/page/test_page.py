@@ -41,6 +41,14 @@ def page(drive: Drive, result: Path) -> SimpleNamespace:
     return document(read_facts(result, drive))
 
 
+def test_the_page_begins_with_how_good_the_map_is(page: SimpleNamespace, result: Path, drive: Drive) -> None:
+    assert page.verdict.headline == "95 % of 12 markings within 2.1 cm; goal 5 cm"
+    text = write_page(result, drive).read_text()
+    first = re.search(r'class="says">([^<]*)<', text)
+    assert first is not None
+    assert first[1] == "95 % of 12 markings within 2.1 cm; goal 5 cm."
+
+
 def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance() -> None:
     turned = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     one = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T

@@ -36,6 +36,7 @@ def document(facts: Facts) -> SimpleNamespace:
         version=str(metrics.get("version", "")),
         summary=_summary(facts),
         status=str(verdict.get("status", "FAIL")),
+        headline=str(verdict.get("headline") or "").partition(": ")[2],
         findings=findings,
         figures=tables.key_figures(facts),
         site=_site(facts),
