@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.faults.doors import Situation, calibrating
+from tests.benchmarks.faults.situations import Situation, calibrating
 from tests.faults.judge import Case, Prepare
 from tests.ports import short_port
 from v2hdm.errors import DriveError
