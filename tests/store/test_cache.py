@@ -156,23 +156,6 @@ def test_of_several_results_the_missing_ones_are_begun_before_one_is_waited_for(
     assert cache.get("stage", "c", list[int]) == [4]
 
 
-def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_needs(tmp_path: Path) -> None:
-    code = (
-        "import sys; sys.modules.update(dict.fromkeys(('msgspec', 'fsspec', 'filelock', 'scipy', 'torch')))\n"
-        "import pkgutil, importlib, v2hdm.store; from pathlib import Path\n"
-        "for one in pkgutil.iter_modules(v2hdm.store.__path__, 'v2hdm.store.'):\n"
-        "    importlib.import_module(one.name)\n"
-        "from v2hdm.store.cache import StageCache; from v2hdm.store.results import growing_folder\n"
-        "with growing_folder(Path(sys.argv[1]) / 'drawn', '--draw') as folder: folder.write('a.jpg', b'a')\n"
-        "from v2hdm.errors import ConfigError\n"
-        "try: StageCache(Path(sys.argv[1])).key(1)\n"
-        "except ConfigError as error: print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
-    assert "install the map extra, pip install 'v2hdm[map]'" in done.stdout, done.stderr
-    assert (tmp_path / "drawn" / "a.jpg").is_file()
-
-
 def test_what_one_machine_has_made_another_takes_and_keeps(memory: RemoteFolder, tmp_path: Path) -> None:
     assert made(StageCache(tmp_path / "one", memory), [1]) == [1]
     assert made(StageCache(tmp_path / "two", memory), [2]) == [1]
