@@ -43,7 +43,7 @@ audit: $(DEV_INSTALLED)
 		$(BIN)/python -m pip_audit --skip-editable --progress-spinner off
 
 installs: $(DEV_INSTALLED)
-	$(BIN)/python -m tests.installs
+	PYTHONPATH=. $(BIN)/python .ci/installs.py
 
 clean:
 	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -75,17 +75,6 @@ def test_the_optimum_is_the_same_in_short_runs_and_in_one(monkeypatch, pose_stat
     np.testing.assert_allclose(parts.corner_covariance(groups), covariance, rtol=1e-6)
 
 
-def test_part_of_a_problem_keeps_the_lengths_whose_corners_it_keeps():
-    whole = make_arrays(street(), (), "cpu")
-    rank = torch.argsort(whole.corner_order)
-    part, corners = whole.take(~torch.isin(whole.corner.long(), rank[[5, 30]]))
-    assert part.corner_count == whole.corner_count - 2
-    assert torch.equal(part.corner_order, whole.corner_order[corners])
-    assert part.corner_order[part.lengths.first].tolist() == [9]
-    assert part.corner_order[part.lengths.second].tolist() == [7]
-    assert bool(part.joined[torch.maximum(part.lengths.first, part.lengths.second)].all())
-
-
 def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_they_are_grouped():
     problem = make_scene(3, frames=30, cameras=1, start_error_deg=0.0, start_error_m=0.0).problem
     first, second = np.array([2, 3]), np.array([3, 8])

@@ -1,6 +1,5 @@
 """The whitened problem is round, its factor is the dense one, its inverse is the covariance."""
 
-import copy
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.adjust.tiles import TIP, TiledMatrix, factorise_tiles, find_pattern
+from v2hdm.adjust.tiles import find_pattern
 from v2hdm.adjust.whitening import factorise
 
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
@@ -59,57 +58,6 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
     moves = (gradient - opposite).abs() > 0
     torch.testing.assert_close(((gradient - opposite) / 2)[moves], step[moves], rtol=1e-4, atol=1e-8)
     assert int((~moves).sum()) < 96
-
-
-def dense(tiles, pattern, size, tip):
-    count = len(pattern.below)
-    matrix = torch.zeros(count * size + tip, count * size + tip, dtype=torch.float64)
-    for (row, column), tile in tiles.items():
-        r = count * size if row == TIP else row * size
-        c = count * size if column == TIP else column * size
-        matrix[r : r + len(tile), c : c + tile.shape[1]] = tile
-        matrix[c : c + tile.shape[1], r : r + len(tile)] = tile.T
-    return matrix
-
-
-@pytest.mark.parametrize(
-    "cliques",
-    [
-        [],
-        [[0, 1, 2], [2, 3], [3, 4], [4, 5]],
-        [[0, 1], [1, 2], [3, 4], [4, 5], [0, 4], [1, 5]],
-        [list(range(6))],
-    ],
-)
-@pytest.mark.parametrize("least_degree", [False, True])
-def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree):
-    size, tip, count = 5, 4, 6
-    generator = torch.Generator().manual_seed(1)
-    pattern = find_pattern(count, cliques, least_degree)
-    arrow = TiledMatrix.zeros(pattern, size, tip, torch.zeros((), dtype=torch.float64))
-    tiles = arrow.tiles
-    for tile in (*arrow.diagonal, arrow.tip):
-        tile += 50 * torch.eye(len(tile), dtype=torch.float64)
-    for column in range(count):
-        tiles[TIP, column].normal_(generator=generator)
-    for clique in cliques:
-        places = sorted(pattern.position[tile] for tile in clique)
-        for n, column in enumerate(places):
-            for row in places[n + 1 :]:
-                tiles[row, column] += torch.randn(size, size, generator=generator, dtype=torch.float64)
-    matrix = dense(tiles, pattern, size, tip)
-    lower = torch.linalg.cholesky(matrix)
-    indefinite = copy.deepcopy(arrow)
-    indefinite.tip.neg_()
-    assert factorise_tiles(indefinite) is None
-    factor = factorise_tiles(arrow)
-    assert factor is not None
-    right = torch.randn(len(matrix), 3, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close(factor.solve(right), torch.linalg.solve_triangular(lower, right, upper=False))
-    torch.testing.assert_close(
-        factor.solve_transposed(right), torch.linalg.solve_triangular(lower.T, right, upper=True)
-    )
-    torch.testing.assert_close(factor.pivots(), lower.diagonal().square())
 
 
 def test_laps_fill_in_only_where_they_meet():

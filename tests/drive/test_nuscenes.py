@@ -82,10 +82,7 @@ def test_four_tables_are_the_same_drive(tmp_path: Path) -> None:
         (lambda content: content["ego_pose"][3].update(rotation=[1, 1, 0, 0]), "quaternion of norm 1.41421"),
         (lambda content: content["sample_data"][0].update(timestamp="now"), "timestamp: expected a finite"),
         (lambda content: content["sample_data"][0].pop("token"), "a list of rows with a 'token' each"),
-        (
-            lambda content: content["calibrated_sensor"][0].update(camera_intrinsic=[]),
-            "expected 3 x 3 numbers",
-        ),
+        (lambda content: content["calibrated_sensor"][0].update(camera_intrinsic=[]), "expected 3 x 3"),
         (
             lambda content: (
                 content["calibrated_sensor"].append(content["calibrated_sensor"][0] | {"token": "other"}),

@@ -33,13 +33,6 @@ def test_a_motion_times_its_inverse_is_the_identity(batch, dtype):
     torch.testing.assert_close(motion @ tf.inverse(motion), identity, atol=TOLERANCE[dtype], rtol=0)
 
 
-@pytest.mark.parametrize("batch", BATCHES)
-def test_composition_is_associative_on_points(batch):
-    first, second = tf.exp(tangents(batch, seed=1)), tf.exp(tangents(batch, seed=2))
-    points = torch.randn(*batch, 5, 3, dtype=torch.float64)
-    torch.testing.assert_close(apply(first @ second, points), apply(first, apply(second, points)))
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1.0])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_log_undoes_exp(batch, size):

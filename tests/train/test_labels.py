@@ -180,10 +180,7 @@ ANNOTATION = {"id": 5, "image_id": 7, "category_id": 1, "segmentation": [[0, 0, 
     ("changes", "words"),
     [
         ({"annotations": [ANNOTATION | {"category_id": 2}]}, "annotation 5: category 'zebra' is no class"),
-        (
-            {"annotations": [ANNOTATION | {"category_id": 8}]},
-            "annotation 5: its category 8 is not in the file",
-        ),
+        ({"annotations": [ANNOTATION | {"category_id": 8}]}, "annotation 5: its category 8 is not in the"),
         ({"annotations": [ANNOTATION | {"image_id": 8}]}, "annotation 5: its image 8 is not in the file"),
         ({"annotations": [ANNOTATION | {"segmentation": {"counts": "x"}}]}, "no list of polygons"),
         ({"annotations": [ANNOTATION | {"segmentation": [[0, 0, 1]]}]}, "not x, y, x, y"),
