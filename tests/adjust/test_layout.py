@@ -9,7 +9,6 @@ import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import KnownLengths, PoseSigma, Problem, SolveOptions, arrays, solve
-from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 
 
@@ -41,24 +40,6 @@ def test_an_observation_takes_52_bytes_and_the_factorised_hessian_none(pose_stat
     assert sum(part.element_size() * part.numel() for part in own) == 52 * count
     outside = [vars(whitening.linearised), dataclasses.replace(whitening, engine=None)]
     assert all(count not in part.shape for record in outside for part in tensors(record))
-
-
-def test_runs_hold_every_observation_once_in_order_and_part_no_corners_that_lengths_join(monkeypatch):
-    monkeypatch.setattr(arrays, "_RUN", 50)
-    laid_out = make_arrays(street(), (), "cpu")
-    runs = list(laid_out.runs())
-    assert len(runs) > 20
-    assert all(run.corner_count for run in runs)
-    assert [run.observations.start for run in runs[1:]] == [run.observations.stop for run in runs[:-1]]
-    assert [run.corners.start for run in runs[1:]] == [run.corners.stop for run in runs[:-1]]
-    assert runs[-1].observations.stop == len(laid_out.pair)
-    assert runs[-1].corners.stop == laid_out.corner_count
-    for run in runs:
-        assert torch.equal(run.corner + run.corners.start, laid_out.corner[run.observations].long())
-        assert not laid_out.joined[run.corners.start]
-    rank = torch.argsort(laid_out.corner_order)
-    assert sorted(torch.diff(rank[[0, 5, 40]].sort().values).tolist()) == [1, 1]
-    assert abs(int(rank[7] - rank[9])) == 1
 
 
 @pytest.mark.parametrize("pose_states", [(), POSE_STATES])

@@ -205,16 +205,7 @@ height: 720
 width: 1280
 distortion_model: {model}
 d: {d}
-k:
-- 905.5
-- 0.0
-- 641.25
-- 0.0
-- 903.25
-- 352.75
-- 0.0
-- 0.0
-- 1.0
+k: [905.5, 0.0, 641.25, 0.0, 903.25, 352.75, 0.0, 0.0, 1.0]
 r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 p: [905.5, 0.0, 641.25, 0.0, 0.0, 903.25, 352.75, 0.0, 0.0, 0.0, 1.0, 0.0]
 binning_x: 0
@@ -244,16 +235,11 @@ def test_an_echoed_message_and_a_camera_info_file_of_ros_are_read(
     echo.write_text(ECHO.format(model=model, d=lens))
     assert read_intrinsics(echo).name == "front_optical"
     np.testing.assert_allclose(seen(read_intrinsics(echo)), expected(), atol=1e-9)
-    content = {
-        "image_width": 1280,
-        "image_height": 720,
-        "camera_name": "front",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": MATRIX.ravel().tolist()},
-        "distortion_model": model,
-        "distortion_coefficients": {"rows": 1, "cols": len(lens), "data": lens},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": np.eye(3, 4).ravel().tolist()},
-    }
+    matrices = {"camera_matrix": MATRIX, "distortion_coefficients": np.array([lens])}
+    matrices |= {"rectification_matrix": np.eye(3), "projection_matrix": np.eye(3, 4)}
+    content = {"image_width": 1280, "image_height": 720, "camera_name": "front", "distortion_model": model}
+    for name, of in matrices.items():
+        content[name] = {"rows": of.shape[0], "cols": of.shape[1], "data": of.ravel().tolist()}
     file = tmp_path / "front.yaml"
     file.write_text(yaml.safe_dump(content))
     np.testing.assert_allclose(seen(read_intrinsics(file)), expected(), atol=1e-9)

@@ -177,20 +177,6 @@ def test_the_first_layer_reads_the_bytes_of_the_image_and_outputs_are_not_rounde
         assert len(np.unique(output)) > 256
 
 
-def test_what_one_weight_loses_its_like_makes_up_for() -> None:
-    """Two inputs that are always the same: only the sum of their weights matters, and that is kept."""
-    moments = np.array([[[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
-    weight = np.array([1.0, 0.149]).reshape(1, 2, 1, 1)
-    whole, scale, _ = round_weights(weight, np.zeros(1), moments, highest=4)
-    assert (whole * scale).sum() == pytest.approx(1.25)
-    weight = np.array([0.124, 0.124, 0.124, 1.0]).reshape(1, 4, 1, 1)
-    alike = np.ones((1, 5, 5))
-    alike[0, 4], alike[0, :, 4] = 0, 0
-    alike[0, 4, 4] = 1
-    whole, scale, _ = round_weights(weight, np.zeros(1), alike, highest=4)
-    assert (whole * scale).sum() == pytest.approx(weight.sum(), abs=0.126)
-
-
 def test_the_detectors_network_runs_the_file_on_any_size(source: Source, file: Path) -> None:
     network = Network(file)
     for height, width in ((16, 16), (50, 130), (544, 960)):

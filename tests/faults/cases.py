@@ -558,34 +558,28 @@ def arguments() -> Iterator[Case]:
         yield Case(f"export {line}", "v2hdm export", line.split(), _both(), says)
 
 
-SETTINGS = {
-    "workers=-1": "workers is -1",
+def _plainly(lines: str) -> dict[str, str]:
+    """Settings that an error repeats: of ``data.width=7`` it says ``width is 7``, of words in quotes."""
+    pairs = [(line, *line.split("=")) for line in lines.split()]
+    return {line: f"{key.rpartition('.')[2]} is '?{value}" for line, key, value in pairs}
+
+
+SETTINGS = _plainly(
+    "workers=-1 device=tpu mode=x mapping.max_range_m=nan mapping.max_range_m=inf mapping.max_range_m=0 "
+    "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_length_m=-1 detector.threads=0 "
+    "detector.blur_px=99 detector.max_range_m=-1 detector.min_score=nan detector.border_px=-3 "
+    "drive.max_gap_s=-1 drive.max_gap_s=nan"
+) | {
     "workers=99999999999999999999": "workers is",
     "workers=many": "workers=many",
-    "device=tpu": "device is 'tpu'",
-    "mode=x": "mode is 'x'",
     "name=../x": "separator of folders",
     "name=..": "begins with a dot",
     "'name=\"a/b\"'": "separator of folders",
-    "mapping.max_range_m=nan": "max_range_m is nan",
-    "mapping.max_range_m=inf": "max_range_m is inf",
-    "mapping.max_range_m=0": "max_range_m is 0",
-    "mapping.rounds=0": "rounds is 0",
-    "mapping.loss=x": "loss is 'x'",
-    "mapping.pose_model=x": "pose_model is 'x'",
-    "mapping.lanes.min_length_m=-1": "min_length_m is -1",
     "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
     "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
     "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
     "mapping.survey.points_map=[[1.0]]": "points_map",
-    "detector.threads=0": "threads is 0",
-    "detector.blur_px=99": "blur_px is 99",
-    "detector.max_range_m=-1": "max_range_m is -1",
-    "detector.min_score=nan": "min_score is nan",
-    "detector.border_px=-3": "border_px is -3",
     "detector.model=nowhere.onnx": "nowhere.onnx",
-    "drive.max_gap_s=-1": "max_gap_s is -1",
-    "drive.max_gap_s=nan": "max_gap_s is nan",
     "export=[pdf]": "pdf",
     "maping.max_range_m=1": "did you mean mapping",
     "drive": "is no key=value",
@@ -595,61 +589,29 @@ SETTINGS = {
     "drive.cameras=front": "drive.cameras",
     "--config-name=x": "'x'",
 }
-
-SIMULATED = {
+SIMULATED = _plainly(
+    "simulate.seed=-1 simulate.cameras.front.width=0 simulate.cameras.front.width=100000 "
+    "simulate.route.image_spacing_m=0 simulate.route.speed_mps=nan "
+    "simulate.exposure.full_well_electrons=0 simulate.yard.barriers=-5"
+) | {
     "simulate.name=../x": "separator of folders",
-    "simulate.seed=-1": "simulate.seed is -1",
-    "simulate.cameras.front.width=0": "width is 0",
-    "simulate.cameras.front.width=100000": "width is 100000",
-    "simulate.route.image_spacing_m=0": "image_spacing_m is 0",
-    "simulate.route.speed_mps=nan": "speed_mps is nan",
-    "simulate.exposure.full_well_electrons=0": "full_well_electrons is 0",
-    "simulate.yard.barriers=-5": "barriers is -5",
     "+simulate.cameras.both=${simulate.cameras.front}": "results of all",
 }
-
-TRAINING = {
-    "batch=0": "batch is 0",
-    "batch=-4": "batch is -4",
-    "data.width=7": "data.width is 7",
-    "data.width=0": "data.width is 0",
-    "data.height=100": "data.height is 100",
+TRAINING = _plainly(
+    "batch=0 batch=-4 data.width=7 data.width=0 data.height=100 data.reservoir=0 data.views_per_render=0 "
+    "data.workers=-1 data.kerbs=nan data.labelled_share=2 learning_rate=nan learning_rate=-1 learning_rate=0 "
+    "weight_decay=inf minutes=-1 minutes=nan minutes=inf steps=0 warmup=1 ema_updates=0 threads=0 seed=-1 "
+    "checkpoint_minutes=0 net.head_width=0 loss.dice=-1 validation.images=-1"
+) | {
     "data.width=1024": "data.width x data.height",
-    "data.reservoir=0": "data.reservoir is 0",
-    "data.views_per_render=0": "views_per_render is 0",
-    "data.workers=-1": "data.workers is -1",
-    "data.kerbs=nan": "data.kerbs is nan",
-    "data.labelled_share=2": "labelled_share is 2",
-    "learning_rate=nan": "learning_rate is nan",
-    "learning_rate=-1": "learning_rate is -1",
-    "learning_rate=0": "learning_rate is 0",
-    "weight_decay=inf": "weight_decay is inf",
-    "minutes=-1": "minutes is -1",
-    "minutes=nan": "minutes is nan",
-    "minutes=inf": "minutes is inf",
-    "steps=0": "steps is 0",
-    "warmup=1": "warmup is 1",
-    "ema_updates=0": "ema_updates is 0",
-    "threads=0": "threads is 0",
-    "seed=-1": "seed is -1",
-    "checkpoint_minutes=0": "checkpoint_minutes is 0",
     "net.widths=[8]": "net.widths",
     "net.widths=[]": "net.widths",
-    "net.head_width=0": "net.head_width is 0",
-    "loss.dice=-1": "loss.dice is -1",
-    "validation.images=-1": "validation.images is -1",
     "device=abacus": "device=abacus",
     "start=nowhere.pt": "nowhere.pt",
     "catalogue=nowhere.yaml": "nowhere.yaml",
     "data.coco=nowhere.json": "nowhere.json",
 }
-
-EXPORTS = {
-    "opset=3": "opset is 3",
-    "opset=99": "opset is 99",
-    "tolerance=nan": "tolerance is nan",
-    "int8.frames=0": "int8.frames is 0",
-    "int8.bounds.kinds_agree=7": "kinds_agree is 7",
+EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kinds_agree=7") | {
     "checkpoint=nowhere.pt": "nowhere.pt",
     "precision=int4": "precision",
     "output=a.pt": "inputs",
