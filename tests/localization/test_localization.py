@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.localization.filter import Markings, Seen, State, locate, pose_of, predict, start
@@ -17,13 +18,9 @@ DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])
 DIAMOND = np.array([[0.5, 0.0], [0.0, 0.4], [-0.5, 0.0], [0.0, -0.4]])
 
 
-def looking_ahead() -> np.ndarray:
+def looking_ahead():
     """cam_from_vehicle of a camera 2.4 m above the ground, 15 degrees down."""
-    c, s = np.cos(np.deg2rad(15)), np.sin(np.deg2rad(15))
-    out = np.eye(4)
-    out[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    out[:3, 3] = -out[:3, :3] @ [1.5, 0.0, 2.4]
-    return out
+    return mounted([1.5, 0.0, 2.4], pitch_deg=15)
 
 
 def mapped(true: HdMap, rng: np.random.Generator, sigma_m: float = 0.01) -> HdMap:

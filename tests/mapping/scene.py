@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import (
@@ -30,8 +31,6 @@ from v2hdm.records import (
     MarkingDetection,
     PoseNoise,
 )
-
-OPTICAL_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(kw_only=True)
@@ -69,21 +68,11 @@ class Scene:
     cam_from_vehicle: dict[str, FloatArray]
 
 
-def extrinsic(
-    yaw_deg: float, pitch_deg: float, roll_deg: float, centre: tuple[float, float, float]
-) -> FloatArray:
-    """``cam_from_vehicle`` of a camera at ``centre`` looking along yaw, pitched down."""
-    vehicle_from_body = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
-    rotation = OPTICAL_FROM_BODY @ vehicle_from_body.T
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, -rotation @ np.asarray(centre)
-    return out
-
-
 MOUNTS = {
-    "front": (1.0, 16.0, 0.5, (3.6, 0.1, 2.4)),
-    "rear": (181.0, 18.0, -0.4, (-0.9, -0.1, 2.6)),
+    "front": mounted((3.6, 0.1, 2.4), pitch_deg=16.0, yaw_deg=1.0, roll_deg=0.5),
+    "rear": mounted((-0.9, -0.1, 2.6), pitch_deg=18.0, yaw_deg=181.0, roll_deg=-0.4),
 }
+"""``cam_from_vehicle`` of the cameras."""
 
 
 def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Marking]] = list) -> Scene:
@@ -95,7 +84,7 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
     route = _route(options)
     markings, lanes = _paint(route, options)
     markings = repaint(markings)
-    truth = {name: extrinsic(*MOUNTS[name]) for name in options.cameras}
+    truth = {name: MOUNTS[name] for name in options.cameras}
     cameras = {name: _camera(name, truth[name], options, rng) for name in options.cameras}
     true_poses, recorded = _poses(route, options, rng)
     images, detections = [], []

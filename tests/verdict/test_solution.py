@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mapping.scene import SceneOptions, extrinsic, make_scene
+from tests.cameras import mounted
+from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, CameraInfo, Drive, HdMap, Marking
@@ -123,7 +124,7 @@ def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubl
 
 def calibrated(yaw_deg):
     covariance = np.diag([1e-4] * 3 + [1e-8] * 3)
-    return Calibration(INFO, extrinsic(yaw_deg, 15.0, 0.0, (1.0, 0.0, 2.4)), covariance)
+    return Calibration(INFO, mounted((1.0, 0.0, 2.4), 15.0, yaw_deg), covariance)
 
 
 def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive):

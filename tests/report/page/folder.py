@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
 from v2hdm.io.calibration import write_calibration
 from v2hdm.io.drive import Trajectory
@@ -42,12 +43,7 @@ SHIFT_PX = np.array([0.3, -0.2])
 
 def camera_at(height_m: float = 2.0, pitch_rad: float = 0.25) -> np.ndarray:
     """``cam_from_vehicle`` above the vehicle's origin, forwards, tilted down."""
-    level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    c, s = np.cos(pitch_rad), np.sin(pitch_rad)
-    pose = np.eye(4)
-    pose[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]) @ level
-    pose[:3, 3] = -pose[:3, :3] @ [0.0, 0.0, height_m]
-    return pose
+    return mounted([0.0, 0.0, height_m], np.degrees(pitch_rad))
 
 
 def covariance(sigma_m: float = 0.01) -> np.ndarray:
