@@ -216,17 +216,16 @@ def test_a_mistake_in_a_tusimple_file_is_named(tmp_path, changes, words):
 
 
 def test_damaged_and_missing_files_and_settings_that_cannot_be_are_named(tmp_path):
-    path = coco(tmp_path)
-    (tmp_path / "bad.json").write_text('{"raw_file": "a.png"}\n{"lanes": \n')
-    with pytest.raises(LabelError, match=r"none.json: no such file"):
-        read_labels(config(coco=str(tmp_path / "none.json")))
-    with pytest.raises(LabelError, match="line 1: has no 'lanes'"):
-        read_labels(config(tusimple=str(tmp_path / "bad.json")))
-    with pytest.raises(LabelError, match="has no category 'stripe', only Arrow, zebra"):
-        read_labels(config(coco=str(path), coco_classes={"stripe": ARROW}))
-    with pytest.raises(LabelError, match="'zebra' is to be 'stripes'; choose from: diamond"):
-        read_labels(config(coco=str(path), coco_classes={"zebra": "stripes"}))
-    with pytest.raises(LabelError, match="smaller than a view of 128x32"):
-        read_labels(config(coco=str(path), width=128))
+    path, bad = str(coco(tmp_path)), tmp_path / "bad.json"
+    bad.write_text('{"raw_file": "a.png"}\n{"lanes": \n')
+    for given, words in (
+        ({"coco": str(tmp_path / "none.json")}, "none.json: no such file"),
+        ({"tusimple": str(bad)}, "line 1: has no 'lanes'"),
+        ({"coco": path, "coco_classes": {"stripe": ARROW}}, "has no category 'stripe', only Arrow, zebra"),
+        ({"coco": path, "coco_classes": {"zebra": "stripes"}}, "to be 'stripes'; choose from: diamond"),
+        ({"coco": path, "width": 128}, "smaller than a view of 128x32"),
+    ):
+        with pytest.raises(LabelError, match=words):
+            read_labels(config(**given))
     with pytest.raises(ConfigError, match=r"labelled_share is 0"):
-        read_labels(config(coco=str(path), labelled_share=0))
+        read_labels(config(coco=path, labelled_share=0))
