@@ -218,7 +218,7 @@ def test_a_mistake_in_a_tusimple_file_is_named(tmp_path, changes, words):
 def test_damaged_and_missing_files_and_settings_that_cannot_be_are_named(tmp_path):
     path, bad = str(coco(tmp_path)), tmp_path / "bad.json"
     bad.write_text('{"raw_file": "a.png"}\n{"lanes": \n')
-    for given, words in (
+    for files, words in (
         ({"coco": str(tmp_path / "none.json")}, "none.json: no such file"),
         ({"tusimple": str(bad)}, "line 1: has no 'lanes'"),
         ({"coco": path, "coco_classes": {"stripe": ARROW}}, "has no category 'stripe', only Arrow, zebra"),
@@ -226,6 +226,6 @@ def test_damaged_and_missing_files_and_settings_that_cannot_be_are_named(tmp_pat
         ({"coco": path, "width": 128}, "smaller than a view of 128x32"),
     ):
         with pytest.raises(LabelError, match=words):
-            read_labels(config(**given))
+            read_labels(config(**files))
     with pytest.raises(ConfigError, match=r"labelled_share is 0"):
         read_labels(config(coco=path, labelled_share=0))
