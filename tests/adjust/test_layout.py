@@ -1,11 +1,9 @@
 """The solver's own tables: small, complete, and the same problem however they are cut."""
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import KnownLengths, PoseSigma, Problem, SolveOptions, arrays, solve
@@ -17,29 +15,6 @@ def street(**changes) -> Problem:
     problem = make_scene(2, frames=40, jitter=PoseSigma(), **changes).problem
     lengths = KnownLengths(np.array([0, 5, 9]), np.array([5, 40, 7]), np.full(3, 2.0), np.full(3, 9.0))
     return dataclasses.replace(problem, lengths=lengths)
-
-
-def tensors(record: object) -> Iterator[torch.Tensor]:
-    """All tensors in a record of records, each once."""
-    if isinstance(record, torch.Tensor):
-        yield record
-    elif dataclasses.is_dataclass(record):
-        for field in dataclasses.fields(record):
-            yield from tensors(getattr(record, field.name))
-    elif isinstance(record, dict | tuple):
-        for value in record.values() if isinstance(record, dict) else record:
-            yield from tensors(value)
-
-
-@pytest.mark.parametrize("pose_states", [(), POSE_STATES])
-def test_an_observation_takes_52_bytes_and_the_factorised_hessian_none(pose_states):
-    problem = street()
-    count = len(problem.observations.corner)
-    whitening = solve(problem, SolveOptions(pose_states=pose_states)).covariance.whitening
-    own = [part for part in tensors(whitening.engine.arrays) if part.shape[-1:] == (count,)]
-    assert sum(part.element_size() * part.numel() for part in own) == 52 * count
-    outside = [vars(whitening.linearised), dataclasses.replace(whitening, engine=None)]
-    assert all(count not in part.shape for record in outside for part in tensors(record))
 
 
 @pytest.mark.parametrize("pose_states", [(), POSE_STATES])

@@ -5,14 +5,6 @@ import pytest
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import Drift, PoseSigma, SolveOptions, solve
-from v2hdm.adjust.tiles import find_pattern
-
-
-def test_laps_fill_in_only_where_they_meet():
-    lap = [[k, k + 1] for k in range(39)]
-    second_lap = [[k, k + 20] for k in range(20)]
-    filled = sum(len(rows) for rows in find_pattern(40, lap + second_lap).below)
-    assert filled < 40 * 39 / 2 / 4
 
 
 def test_covariances_agree_with_the_scatter_of_many_solves():

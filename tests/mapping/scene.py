@@ -93,14 +93,9 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
             images.append(Image(name, 0.2 * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
             seen = _look(cameras[name].info, truth[name], true_poses[j], markings, lanes, options, rng)
             detections.append(ImageDetections(len(images) - 1, *seen))
-    noise = PoseNoise(
-        max(options.rtk_m, 0.005),
-        max(np.deg2rad(options.heading_deg), 2e-4),
-        max(np.deg2rad(options.jitter_deg), 2e-4),
-        position_drift_m=0.0,
-        heading_drift_rad=0.0,
-        roll_pitch_drift_rad=0.0,
-    )
+    heading_rad, jitter_rad = (max(np.deg2rad(a), 2e-4) for a in (options.heading_deg, options.jitter_deg))
+    none = dict.fromkeys(("position_drift_m", "heading_drift_rad", "roll_pitch_drift_rad"), 0.0)
+    noise = PoseNoise(max(options.rtk_m, 0.005), heading_rad, jitter_rad, **none)
     drive = Drive("yard", Path(), cameras, images, noise)
     return Scene(drive, detections, markings, lanes, truth)
 
@@ -137,15 +132,8 @@ def _placed(shape: FloatArray, pose: FloatArray) -> FloatArray:
 def _paint(route: FloatArray, options: SceneOptions) -> tuple[list[Marking], list[FloatArray]]:
     diamond = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
     dash = np.array([[1.5, -0.075], [1.5, 0.075], [-1.5, 0.075], [-1.5, -0.075]])
-    markings = (
-        []
-        if options.dashes_only
-        else [
-            Marking("diamond", _placed(diamond, pose), 0)
-            for lateral in (1.5, -1.2)
-            for pose in _beside(route, 5.0, lateral)[1:]
-        ]
-    )
+    rows = () if options.dashes_only else (1.5, -1.2)
+    markings = [Marking("diamond", _placed(diamond, p), 0) for d in rows for p in _beside(route, 5.0, d)[1:]]
     sides = (1.8, -1.8) if options.dashes_only else (3.2,)
     markings += [Marking("lane_dash", _placed(dash, p), 0) for d in sides for p in _beside(route, 6.0, d)[1:]]
     lanes = [Lane("lane_line", _beside(route, 0.5, lateral)[:, :2], 0) for lateral in options.lines]

@@ -5,7 +5,6 @@ import torch
 from torch import nn
 
 from models import MarkingNet, NetConfig
-from models.marking_net import _channels_last_tiles, _space_to_depth
 from v2hdm.catalogue import PAINT_CLASSES
 
 
@@ -59,13 +58,6 @@ def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
     assert not any(isinstance(module, nn.BatchNorm2d) for module in net.modules())
     for one, other in zip(after, before, strict=True):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
-
-
-def test_the_tiles_of_a_training_are_those_of_the_vehicle() -> None:
-    image = random_images(2, 8, 12)
-    tiles = _channels_last_tiles(image)
-    torch.testing.assert_close(tiles, _space_to_depth(image))
-    assert tiles.is_contiguous(memory_format=torch.channels_last)
 
 
 def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net: MarkingNet) -> None:
