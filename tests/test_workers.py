@@ -60,14 +60,9 @@ def test_a_process_that_dies_is_one_error_and_no_endless_wait() -> None:
 
 def begun(code: str, **pipes: int) -> subprocess.Popen[str]:
     """A session of processes that runs this."""
-    command = [
-        sys.executable,
-        "-uc",
-        f"if __name__ == '__main__':\n  from tests.test_workers import *; {code}",
-    ]
-    return subprocess.Popen(
-        command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True, **pipes
-    )
+    code = f"if __name__ == '__main__':\n  from tests.test_workers import *; {code}"
+    given = {"cwd": ROOT, "stderr": subprocess.PIPE, "text": True, "start_new_session": True, **pipes}
+    return subprocess.Popen([sys.executable, "-uc", code], **given)
 
 
 def hanging(folder: Path) -> subprocess.Popen[str]:

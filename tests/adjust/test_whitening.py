@@ -1,4 +1,4 @@
-"""The whitened problem is round, its factor is the dense one, its inverse is the covariance."""
+"""Stated covariances are those of the errors, alone and over many drives."""
 
 import numpy as np
 import pytest
@@ -44,13 +44,3 @@ def test_the_normalised_error_of_a_marking_is_chi_square_distributed(jitter, dri
     # Corners of one drive share the camera's error: each drive is about one draw of a chi-square with two
     # degrees of freedom, whose standard deviation is 2. Three standard errors of the mean are allowed.
     assert np.mean(squares) == pytest.approx(2, abs=3 * 2 / np.sqrt(drives))
-
-
-def test_groups_of_corners_have_the_blocks_of_the_joint_covariance():
-    solution = solve(make_scene(21, frames=30, jitter=PoseSigma()).problem)
-    joint = solution.corner_covariance(np.array([3, 9, 4, 0]))
-    groups = solution.corner_covariance(np.array([[3, 9], [4, 0]]))
-    np.testing.assert_allclose(groups[0], joint[:4, :4], rtol=1e-9)
-    np.testing.assert_allclose(groups[1], joint[4:, 4:], rtol=1e-9)
-    np.testing.assert_allclose(joint, joint.T, atol=1e-15)
-    assert np.linalg.eigvalsh(joint).min() > 0

@@ -20,9 +20,10 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from tests.drive.bags import (
     VIDEO,
     Messages,
+    assert_mounted,
     assert_same_drive,
+    assert_same_poses,
     messages_of,
-    mountings,
     write_ros1,
     write_ros2,
 )
@@ -106,15 +107,8 @@ def test_a_bag_without_description_is_a_drive_where_its_frames_tell_the_mounting
 ) -> None:
     assert drive_name(bags[kind]) == bags[kind].stem
     got = read_drive(bags[kind], ReadOptions(cache=str(tmp_path)))
-    expected = read_drive(folder)
-    for one, other in zip(got.images, expected.images, strict=True):
-        assert (one.camera, one.stamp_s) == (other.camera, other.stamp_s)
-        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
-    for name, cam_from_vehicle in mountings().items():
-        # Of the extrinsic the IPM keeps the two columns of the ground's axes and the translation.
-        ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
-        product = got.cameras[name].ipm["estimated"] @ ground
-        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)
+    assert_same_poses(got, read_drive(folder))
+    assert_mounted(got)
 
 
 def test_a_bag_without_mounting_says_which_description_to_write(folder: Path, tmp_path: Path) -> None:

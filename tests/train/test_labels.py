@@ -23,6 +23,8 @@ from v2hdm.cli.compose import register
 from v2hdm.errors import ConfigError, LabelError
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND
 
+SQUARE = [10, 10, 20, 10, 20, 20, 10, 20]
+ZEBRA = {"id": 3, "image_id": 9, "category_id": 2, "segmentation": [SQUARE]}
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
 
@@ -139,8 +141,7 @@ def test_an_image_in_both_files_has_both_labels(tmp_path):
 
 
 def test_a_category_is_mapped_by_the_configuration_or_left_out(tmp_path):
-    square = [10, 10, 20, 10, 20, 20, 10, 20]
-    path = coco(tmp_path, annotations=[{"id": 3, "image_id": 9, "category_id": 2, "segmentation": [square]}])
+    path = coco(tmp_path, annotations=[ZEBRA])
     mapped = labelled(coco=str(path), coco_classes={"zebra": CROSSWALK_BAR})
     assert [shape.kind for image in mapped.images for shape in image.shapes or ()] == [CROSSWALK_BAR]
     dropped = labelled(coco=str(path), coco_classes={"zebra": "none"})
@@ -148,8 +149,7 @@ def test_a_category_is_mapped_by_the_configuration_or_left_out(tmp_path):
 
 
 def test_the_advice_about_an_unknown_category_is_an_argument_that_works(tmp_path):
-    square = [10, 10, 20, 10, 20, 20, 10, 20]
-    path = coco(tmp_path, annotations=[{"id": 3, "image_id": 9, "category_id": 2, "segmentation": [square]}])
+    path = coco(tmp_path, annotations=[ZEBRA])
     with pytest.raises(LabelError) as refusal:
         read_labels(config(coco=str(path)))
     (argument,) = re.findall("'([+].*?)'", str(refusal.value))
