@@ -19,10 +19,7 @@ ROUTE = [[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]]
 
 
 def short_port() -> PortConfig:
-    """A straight and a bend of the default port, with another vehicle's IPM to start from.
-
-    The default numbers of obstacles are those of a whole port, so there are fewer here.
-    """
+    """A straight and a bend of the default port, fewer obstacles, another vehicle's IPM to start from."""
     route = RouteConfig(pieces=ROUTE, image_spacing_m=1.0)
     yard = YardConfig(parked_trucks=1, barriers=2, lamp_posts=2, moving_trucks=1, shadow_strips=2)
     return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route, yard=yard)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from v2hdm.cli import compose as config
+from v2hdm.cli.main import run
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.config import RunConfig
 
@@ -45,50 +43,43 @@ def test_a_missing_value_is_an_error_that_gives_the_advice_of_the_door() -> None
         config.to_dataclass(OmegaConf.structured(Needy), Needy, "choose a run")
 
 
-def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "v2hdm.map", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
-
-
 @pytest.mark.parametrize(
-    ("arguments", "named"),
+    ("line", "named"),
     [
-        (("+run=port2", "maping.max_range_m=3"), "maping"),
-        (("+run=port2", "mapping.max_rnge_m=3"), "max_range_m"),
-        (("+run=port9",), "port9"),
+        ("+run=port2 maping.max_range_m=3", "maping"),
+        ("+run=port2 mapping.max_rnge_m=3", "max_range_m"),
+        ("+run=port9", "port9"),
         (
-            (),
-            "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, or choose a run",
+            "",
+            "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, or choose",
         ),
-        (("drive.path=nowhere",), "nowhere: no such drive folder"),
-        (("+run=port2", "workers=many"), "workers"),
-        (("+run=port2", "simulate.route.pieces=[[62.0,0.0],[23,-90.0]]"), "write 23.0"),
-        (("+run=port2", "+mapping.known_sizes.by_class_m={diamond: [1, 0.7]}"), "write 1.0"),
-        (("+run=kitti",), "drive.path"),
-        (("+run=kitti", "drive.path=nowhere"), "nowhere"),
-        (("+run=kitti", "drive.path=straße"), "wants quotes"),
-        (("+run=kitti", "drive.path=a(1)"), "wants quotes"),
+        ("drive.path=nowhere", "nowhere: no such drive folder"),
+        ("+run=port2 workers=many", "workers"),
+        ("+run=port2 simulate.route.pieces=[[62.0,0.0],[23,-90.0]]", "write 23.0"),
+        ("+run=port2 +mapping.known_sizes.by_class_m={diamond:[1,0.7]}", "write 1.0"),
+        ("+run=kitti", "drive.path"),
+        ("+run=kitti drive.path=nowhere", "nowhere"),
+        ("+run=kitti drive.path=straße", "wants quotes"),
+        ("+run=kitti drive.path=a(1)", "wants quotes"),
     ],
 )
-def test_a_wrong_argument_is_one_line_that_names_it(
-    arguments: tuple[str, ...], named: str, tmp_path: Path
-) -> None:
-    done = run_door(*arguments, folder=tmp_path)
-    assert done.returncode == 2
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    assert named in lines[0]
+def test_a_wrong_argument_is_one_line_that_names_it(line, named, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["map", *line.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert named in error
+    assert error.count("\n") == 1
     assert not list(tmp_path.rglob("metrics.json"))
 
 
-def test_a_users_own_runs_join_the_shipped_ones(tmp_path: Path) -> None:
+def test_a_users_own_runs_join_the_shipped_ones(tmp_path, monkeypatch, capsys) -> None:
     own = tmp_path / "conf" / "run"
     own.mkdir(parents=True)
     (own / "mysite.yaml").write_text("# @package _global_\nname: mysite\ndrive:\n  path: nowhere_at_all\n")
-    done = run_door("--config-dir", str(tmp_path / "conf"), "+run=mysite", folder=tmp_path)
-    assert done.returncode == 2
-    assert "nowhere_at_all" in done.stderr
+    monkeypatch.chdir(tmp_path)
+    assert run(["map", "--config-dir", str(tmp_path / "conf"), "+run=mysite"]) == 2
+    assert "nowhere_at_all" in capsys.readouterr().err
 
 
 def test_device_and_mode_reach_the_mapping() -> None:

@@ -58,20 +58,19 @@ def test_a_process_that_dies_is_one_error_and_no_endless_wait() -> None:
         share_out(os._exit, [9, 9], 2, nothing, (), print)
 
 
+def begun(code: str, **pipes: int) -> subprocess.Popen[str]:
+    """A session of processes that runs this."""
+    code = f"if __name__ == '__main__':\n  from tests.test_workers import *; {code}"
+    given = {"cwd": ROOT, "stderr": subprocess.PIPE, "text": True, "start_new_session": True, **pipes}
+    return subprocess.Popen([sys.executable, "-uc", code], **given)
+
+
 def hanging(folder: Path) -> subprocess.Popen[str]:
     """A session of processes, each of which has half written a file of ``folder``."""
-    code = (
-        "from pathlib import Path; from tests.test_workers import *; "
+    started = begun(
         # A shell's background job, as this test may be part of, ignores Ctrl-C and so would its processes.
         "signal.signal(signal.SIGINT, signal.default_int_handler); "
         f"share_out(hang_while_writing, [Path({str(folder)!r}, n) for n in 'ab'], 2, nothing, (), print)"
-    )
-    started = subprocess.Popen(
-        [sys.executable, "-c", f"if __name__ == '__main__':\n  {code}"],
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
     )
     end_s = time.monotonic() + 60
     while len(list(folder.glob(".*"))) < 2:
@@ -90,15 +89,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_nothing_half_written(tmp_path: Pat
 
 
 def test_workers_whose_parent_was_killed_end_after_their_job() -> None:
-    code = "from tests.test_workers import *; share_out(slowly_doubled, range(999), 2, nothing, (), print)"
-    started = subprocess.Popen(
-        [sys.executable, "-uc", f"if __name__ == '__main__':\n  {code}"],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    started = begun("share_out(slowly_doubled, range(999), 2, nothing, (), print)", stdout=subprocess.PIPE)
     assert started.stdout is not None
     started.stdout.readline()
     started.kill()

@@ -176,6 +176,12 @@ def make_scene(
     return Scene(problem, truth, map_from_vehicle, corners)
 
 
+def rows_of(seen: Observations, rows: np.ndarray | slice) -> Observations:
+    """Some of the observations."""
+    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
+    return Observations(*(part[rows] for part in parts))
+
+
 def with_late_clocks(scene: Scene, offset_s: np.ndarray) -> Scene:
     """The scene, its poses exact, in images taken ``offset_s`` (C,) later than they say.
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.adjust.scene import Scene, make_scene
+from tests.adjust.scene import Scene, make_scene, rows_of
 from v2hdm.adjust import (
     ControlPoints,
     Drift,
@@ -29,13 +29,7 @@ def street(**changes) -> Scene:
 
 
 def part(seen: Observations, rows: np.ndarray, first: int = 0) -> Observations:
-    return Observations(
-        seen.camera[rows],
-        seen.frame[rows],
-        seen.corner[rows] - first,
-        seen.pinhole_px[rows],
-        seen.covariance_px[rows],
-    )
+    return replace(rows_of(seen, rows), corner=seen.corner[rows] - first)
 
 
 def whole_markings(problem: Problem) -> Problem:
@@ -65,12 +59,8 @@ def by_marking(problem: Problem) -> list[Sighted]:
         lengths, control = problem.lengths, problem.control
         if lengths is not None:
             one = lengths.first // 4 == first // 4
-            lengths = KnownLengths(
-                lengths.first[one] - first,
-                lengths.second[one] - first,
-                lengths.length_m[one],
-                lengths.sigma_m[one],
-            )
+            ends = lengths.first[one] - first, lengths.second[one] - first
+            lengths = KnownLengths(*ends, lengths.length_m[one], lengths.sigma_m[one])
         if control is not None:
             one = control.corner // 4 == first // 4
             control = ControlPoints(

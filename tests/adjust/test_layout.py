@@ -1,15 +1,12 @@
 """The solver's own tables: small, complete, and the same problem however they are cut."""
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import KnownLengths, PoseSigma, Problem, SolveOptions, arrays, solve
-from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 
 
@@ -18,47 +15,6 @@ def street(**changes) -> Problem:
     problem = make_scene(2, frames=40, jitter=PoseSigma(), **changes).problem
     lengths = KnownLengths(np.array([0, 5, 9]), np.array([5, 40, 7]), np.full(3, 2.0), np.full(3, 9.0))
     return dataclasses.replace(problem, lengths=lengths)
-
-
-def tensors(record: object) -> Iterator[torch.Tensor]:
-    """All tensors in a record of records, each once."""
-    if isinstance(record, torch.Tensor):
-        yield record
-    elif dataclasses.is_dataclass(record):
-        for field in dataclasses.fields(record):
-            yield from tensors(getattr(record, field.name))
-    elif isinstance(record, dict | tuple):
-        for value in record.values() if isinstance(record, dict) else record:
-            yield from tensors(value)
-
-
-@pytest.mark.parametrize("pose_states", [(), POSE_STATES])
-def test_an_observation_takes_52_bytes_and_the_factorised_hessian_none(pose_states):
-    problem = street()
-    count = len(problem.observations.corner)
-    whitening = solve(problem, SolveOptions(pose_states=pose_states)).covariance.whitening
-    own = [part for part in tensors(whitening.engine.arrays) if part.shape[-1:] == (count,)]
-    assert sum(part.element_size() * part.numel() for part in own) == 52 * count
-    outside = [vars(whitening.linearised), dataclasses.replace(whitening, engine=None)]
-    assert all(count not in part.shape for record in outside for part in tensors(record))
-
-
-def test_runs_hold_every_observation_once_in_order_and_part_no_corners_that_lengths_join(monkeypatch):
-    monkeypatch.setattr(arrays, "_RUN", 50)
-    laid_out = make_arrays(street(), (), "cpu")
-    runs = list(laid_out.runs())
-    assert len(runs) > 20
-    assert all(run.corner_count for run in runs)
-    assert [run.observations.start for run in runs[1:]] == [run.observations.stop for run in runs[:-1]]
-    assert [run.corners.start for run in runs[1:]] == [run.corners.stop for run in runs[:-1]]
-    assert runs[-1].observations.stop == len(laid_out.pair)
-    assert runs[-1].corners.stop == laid_out.corner_count
-    for run in runs:
-        assert torch.equal(run.corner + run.corners.start, laid_out.corner[run.observations].long())
-        assert not laid_out.joined[run.corners.start]
-    rank = torch.argsort(laid_out.corner_order)
-    assert sorted(torch.diff(rank[[0, 5, 40]].sort().values).tolist()) == [1, 1]
-    assert abs(int(rank[7] - rank[9])) == 1
 
 
 @pytest.mark.parametrize("pose_states", [(), POSE_STATES])
@@ -73,17 +29,6 @@ def test_the_optimum_is_the_same_in_short_runs_and_in_one(monkeypatch, pose_stat
     groups = np.array([[0, 40], [9, 12]])
     covariance = whole.corner_covariance(groups)
     np.testing.assert_allclose(parts.corner_covariance(groups), covariance, rtol=1e-6)
-
-
-def test_part_of_a_problem_keeps_the_lengths_whose_corners_it_keeps():
-    whole = make_arrays(street(), (), "cpu")
-    rank = torch.argsort(whole.corner_order)
-    part, corners = whole.take(~torch.isin(whole.corner.long(), rank[[5, 30]]))
-    assert part.corner_count == whole.corner_count - 2
-    assert torch.equal(part.corner_order, whole.corner_order[corners])
-    assert part.corner_order[part.lengths.first].tolist() == [9]
-    assert part.corner_order[part.lengths.second].tolist() == [7]
-    assert bool(part.joined[torch.maximum(part.lengths.first, part.lengths.second)].all())
 
 
 def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_they_are_grouped():

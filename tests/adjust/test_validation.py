@@ -4,14 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.adjust.scene import make_scene
-from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, Verdict, solve
-
-
-def keep_rows(problem: Problem, keep: np.ndarray) -> Problem:
-    seen = problem.observations
-    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
-    return replace(problem, observations=Observations(*(part[keep] for part in parts)))
+from tests.adjust.scene import make_scene, rows_of
+from v2hdm.adjust import PoseSigma, SolveOptions, Verdict, solve
 
 
 def test_wrong_associations_are_listed_with_a_reason_and_few_others_are():
@@ -36,7 +30,7 @@ def test_of_two_observations_that_disagree_neither_is_believed():
     mine = np.flatnonzero(seen.corner == 20)
     keep = np.ones(len(seen.corner), dtype=bool)
     keep[mine[1:-1]] = False
-    pair = keep_rows(problem, keep)
+    pair = replace(problem, observations=rows_of(seen, keep))
     assert solve(pair).accepted[pair.observations.corner == 20].all()
     moved = pair.observations.pinhole_px.copy()
     first, second = np.flatnonzero(pair.observations.corner == 20)

@@ -12,7 +12,6 @@ from tests.adjust.site import DRIFTING, SCATTERING, site
 from v2hdm.adjust import (
     ControlPoints,
     KnownLengths,
-    Observations,
     PoseSigma,
     Problem,
     SolveOptions,
@@ -29,19 +28,15 @@ from v2hdm.errors import AdjustError
 def joined(first: Problem, second: Problem) -> Problem:
     """Two problems of the same cameras and corners as two visits of one problem."""
     frames = [len(one.map_from_vehicle) for one in (first, second)]
-    parts = [first.observations, second.observations]
-    seen = Observations(
-        camera=np.concatenate([one.camera for one in parts]),
-        frame=np.concatenate([parts[0].frame, parts[1].frame + frames[0]]),
-        corner=np.concatenate([one.corner for one in parts]),
-        pinhole_px=np.concatenate([one.pinhole_px for one in parts]),
-        covariance_px=np.concatenate([one.covariance_px for one in parts]),
-    )
+    one, other = first.observations, second.observations
+    other = replace(other, frame=other.frame + frames[0])
+    names = ("camera", "frame", "corner", "pinhole_px", "covariance_px")
+    seen = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in names}
     twists = [one.twist_vehicle for one in (first, second)]
     return replace(
         first,
         map_from_vehicle=np.concatenate([first.map_from_vehicle, second.map_from_vehicle]),
-        observations=seen,
+        observations=replace(one, **seen),
         pose_sigma=(first.pose_sigma, second.pose_sigma),
         twist_vehicle=None if twists[0] is None else np.concatenate(twists),
         visit=np.repeat([0, 1], frames),
@@ -97,12 +92,8 @@ def test_a_visit_without_drift_beside_one_with_it_is_as_by_itself(street: Scene)
     scene = replace(street, problem=known)
     first, second = visited_again(scene, DRIFTING, 3).problem, visited_again(scene, SCATTERING, 4).problem
     corners = first.corner_count
-    apart = replace(
-        joined(first, replace(second, observations=replace(
-            second.observations, corner=second.observations.corner + corners
-        ))),
-        corner_count=2 * corners,
-    )  # fmt: skip
+    moved = replace(second.observations, corner=second.observations.corner + corners)
+    apart = replace(joined(first, replace(second, observations=moved)), corner_count=2 * corners)
     cost = solve(apart).cost_terms["frame_states"]
     alone = [solve(one).cost_terms["frame_states"] for one in (first, second)]
     assert cost == pytest.approx(sum(alone), rel=0.1)

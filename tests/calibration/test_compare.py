@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.cameras import mounted
 from v2hdm.calibration.compare import FALSE_ALARM, movement
 from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
@@ -21,11 +22,7 @@ SIGMA = np.array([0.006, 0.002, 0.007, 0.0003, 0.0006, 0.0003])
 
 def looking_ahead(info: CameraInfo = INFO) -> Calibration:
     """2.5 m above the ground, 1.8 m ahead of the axle, 12 degrees down."""
-    c, s = np.cos(np.deg2rad(12)), np.sin(np.deg2rad(12))
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [1.8, 0.1, 2.5]
-    return Calibration(info, cam_from_vehicle, np.diag(SIGMA**2))
+    return Calibration(info, mounted([1.8, 0.1, 2.5], pitch_deg=12), np.diag(SIGMA**2))
 
 
 def measured(true: Calibration, rng: np.random.Generator) -> Calibration:

@@ -187,10 +187,7 @@ def test_intrinsics_of_another_lens_fail(
 MISTAKES = {
     "left and right": (lambda px, places: (px, places * [1, -1]), "y is counted to the right"),
     "x and y": (lambda px, places: (px, places[:, ::-1]), "x and y are exchanged"),
-    "upward": (
-        lambda px, places: (np.column_stack([px[:, 0], 719 - px[:, 1]]), places),
-        "v is counted upward",
-    ),
+    "upward": (lambda px, places: (np.column_stack([px[:, 0], 719 - px[:, 1]]), places), "v is counted"),
     "half the size": (lambda px, places: (px / 2, places), "an image 0.5 times as large"),
     "millimetres": (lambda px, places: (px, 1e3 * places), "x and y look like millimetres; .* that is 2.4"),
     "centimetres": (lambda px, places: (px, 1e2 * places), "x and y look like centimetres"),

@@ -87,19 +87,6 @@ def test_the_ipm_is_off_as_its_sigma_says() -> None:
     np.testing.assert_allclose(worst / np.mean(sigma, axis=0), 1.0, atol=0.4)
 
 
-def test_slopes_are_those_of_the_residual() -> None:
-    px, places = clicked(1)
-    points = SurveyedPoints(Path("points.csv"), NAMES, NAMES, px, places)
-    seen = Seen.of(points.points_px, points.points_vehicle, INFO, Noise())
-    for start in (mounting(), mounting((0.0, -80.0, 170.0))):  # before and behind the camera
-        steps = 1e-6 * np.eye(6)
-        expected = np.stack(
-            [(seen.residual_px(exp(s) @ start) - seen.residual_px(exp(-s) @ start)) / 2e-6 for s in steps],
-            axis=2,
-        )
-        np.testing.assert_allclose(seen.jacobian(start), expected, rtol=1e-5, atol=1e-3)
-
-
 @pytest.mark.parametrize("moved", [(0, 1.0, 0.0), (4, 0.0, -0.8), (9, 5.0, 0.0)])
 def test_one_wrong_point_is_named_and_moves_nothing(moved: tuple[int, float, float]) -> None:
     wrong, *shift = moved

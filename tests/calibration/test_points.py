@@ -64,10 +64,7 @@ def test_a_wrong_table_is_one_line_with_the_place(tmp_path: Path, mistake: str) 
     ("change", "expected"),
     [
         (lambda px, places: px.__setitem__(3, (1300.0, 400.0)), r"point P4 .* \(1300, 400\) lies outside"),
-        (
-            lambda px, places: px.__setitem__(3, (-1.0, 400.0)),
-            "lies outside the image of 1280 x 720; mend it",
-        ),
+        (lambda px, places: px.__setitem__(3, (-1.0, 400.0)), "lies outside the image of 1280 x 720; mend"),
         (lambda px, places: px.__setitem__(3, px[6]), "P4 .* and point P7 .* have the same pixel"),
         (lambda px, places: places.__setitem__(3, places[6]), "P4 .* have the same place on the ground"),
         (lambda px, places: px.__setitem__(slice(None), px[:, ::-1].copy()), "u and v look exchanged"),

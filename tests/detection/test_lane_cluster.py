@@ -44,18 +44,6 @@ def ahead(view: RoadCamera, start: tuple[float, float], end: tuple[float, float]
     return seen(view, to_image(view.camera, np.linspace(start, end, 60)))
 
 
-def test_the_evidence_is_that_of_a_gaussian(view):
-    evidence, _ = evidence_of(view, [seen(view, straight(view, side)) for side in (1.6, -2.0)])
-    prior = Prior(np.array([5.0, 0.0, 1.0]), np.diag([1e-3, 1e-4, 1e-2]))
-    for k, given in enumerate(evidence.log_evidence(prior)):
-        posterior = evidence.information[k] + prior.information
-        moment = evidence.moment[k] + prior.information @ prior.mean
-        square = evidence.square[k] + prior.mean @ prior.information @ prior.mean
-        misfit = square - moment @ np.linalg.solve(posterior, moment)
-        volume = np.linalg.slogdet(posterior)[1] - np.linalg.slogdet(prior.information)[1]
-        assert given == pytest.approx(-0.5 * (misfit + volume), rel=1e-9)
-
-
 def test_several_priors_at_once_tell_what_each_does_alone(view):
     evidence, _ = evidence_of(view, [seen(view, straight(view, side)) for side in (1.6, -2.0)])
     priors = [

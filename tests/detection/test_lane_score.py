@@ -55,25 +55,20 @@ def test_doubtful_crossings_make_a_doubtful_line(view):
 
 def cluttered(view, rows, seed, odds):
     """The rows with eight crossings of such log odds on each, anywhere."""
-    rng = np.random.default_rng(seed)
-    return [
-        AnchorRow(
-            row.v_px, np.append(row.u_px, rng.uniform(0, view.info.width, 8)), np.append(row.odds, [odds] * 8)
-        )
-        for row in rows
-    ]
+    rng, width = np.random.default_rng(seed), view.info.width
+    more = ((np.append(row.u_px, rng.uniform(0, width, 8)), np.append(row.odds, [odds] * 8)) for row in rows)
+    return [AnchorRow(row.v_px, *given) for row, given in zip(rows, more, strict=True)]
+
+
+def scores(view, rows):
+    return [lane.score for lane in boundaries_of(rows, view)]
 
 
 def test_crossings_all_over_the_ground_make_lines_less_sure(view):
     rows = anchors_of(view, [straight(view, 1.6)])
     alone = score_of(view, rows)
-    surest = [
-        [
-            max((lane.score for lane in boundaries_of(cluttered(view, rows, seed, odds), view)), default=0.0)
-            for seed in range(8)
-        ]
-        for odds in (0.1, 1.0)
-    ]
+    surest = [[max(scores(view, cluttered(view, rows, seed, odds)), default=0.0) for seed in range(8)]
+              for odds in (0.1, 1.0)]  # fmt: skip
     assert np.mean(surest, axis=1).max() < alone - 0.05
     assert np.max(surest) < alone + 0.15, "by chance some are on the line and make it longer"
 
@@ -81,15 +76,9 @@ def test_crossings_all_over_the_ground_make_lines_less_sure(view):
 def test_a_line_a_lane_away_makes_one_surer_and_one_too_near_does_not(view):
     line = straight(view, 1.6)
     alone = score_of(view, anchors_of(view, [line]))
-    scores = {
-        apart_m: min(
-            lane.score
-            for lane in boundaries_of(anchors_of(view, [line, straight(view, 1.6 - apart_m)]), view)
-        )
-        for apart_m in (1.0, 3.3)
-    }
-    assert scores[3.3] > alone + 0.05
-    assert scores[1.0] < alone - 0.05
+    near, away = (min(scores(view, anchors_of(view, [line, straight(view, y)]))) for y in (0.6, -1.7))
+    assert away > alone + 0.05
+    assert near < alone - 0.05
 
 
 def test_a_line_a_lane_away_that_runs_another_way_tells_nothing(view):

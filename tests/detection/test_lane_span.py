@@ -1,7 +1,6 @@
 """Spans of lines: where each is painted, runs on and has ended, and what becomes of double lines."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from tests.detection.pictures import (
     straight,
 )
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.lanes import boundaries as span
 from v2hdm.detection.network import AnchorRow
 from v2hdm.records import LANE_DASH, LANE_LINE
 
@@ -45,36 +43,6 @@ def as_seen(view, from_m, kind):
     rows = anchors_of(view, [whole, part])
     paint = [(painted(whole, view, 4, 26), LANE_LINE), (painted(part, view, from_m, 26), kind)]
     return rows, [replace(lane, kind=name) for lane, name in paint], [whole, part]
-
-
-def test_the_states_are_as_probable_as_all_sequences_of_them_say():
-    """Against the sum over all sequences of four, the matrix exponential of the rates summed up as a
-    series."""
-    rng, rates = np.random.default_rng(3), span._rates()
-    count = len(rates)
-    likelihood, step_m = rng.normal(0, 1, (1, 4, count)), rng.uniform(0.1, 3, (1, 3))
-
-    def moved(by_m):
-        term, total = np.eye(count), np.eye(count)
-        for k in range(1, 40):
-            term = term @ rates * by_m / k
-            total = total + term
-        return total
-
-    start = moved(2.0)
-    for _ in range(9):
-        start = start @ start
-    moves = [moved(by_m) for by_m in step_m[0]]
-    states, total = np.zeros((4, count)), 0.0
-    for path in product(range(count), repeat=4):
-        chance = start[0, path[0]] * np.exp(likelihood[0, range(4), path].sum())
-        for t in range(3):
-            chance *= moves[t][path[t], path[t + 1]]
-        total += chance
-        states[range(4), path] += chance
-    found, log_likelihood = span._forward_backward(likelihood, step_m)
-    np.testing.assert_allclose(found[0], states / total, rtol=1e-3)
-    assert log_likelihood[0] == pytest.approx(np.log(total), abs=1e-3)
 
 
 def test_where_one_strand_has_ended_the_line_passes_to_the_other(view):

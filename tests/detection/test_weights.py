@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import time
 
 import pytest
@@ -92,16 +90,13 @@ def test_the_user_of_an_own_network_is_told_whose_judge_scores_it(tmp_path):
         weights.unknown_network(tmp_path / "none.onnx")
 
 
-def test_the_check_takes_less_than_20_ms():
-    fresh = (
-        "import time; from v2hdm.detection import weights; begin = time.perf_counter(); "
-        "weights.check_weights(); print(time.perf_counter() - begin)"
-    )
-    times_s = [
-        float(subprocess.run([sys.executable, "-c", fresh], capture_output=True, check=True).stdout)
-        for _ in range(3)
-    ]
-    assert min(times_s) < 0.02
-    begin = time.perf_counter()
-    weights.check_weights()
-    assert time.perf_counter() - begin < 0.001
+def test_the_check_takes_less_than_20_ms_and_none_the_second_time():
+    times_s = []
+    for kept in (False, False, False, True):
+        if not kept:
+            weights._problem.cache_clear()
+        begin = time.perf_counter()
+        weights.check_weights()
+        times_s.append(time.perf_counter() - begin)
+    assert min(times_s[:3]) < 0.02
+    assert times_s[3] < 0.001

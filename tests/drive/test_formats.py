@@ -50,17 +50,6 @@ def test_intrinsics_survive_their_file_with_every_lens(tmp_path: Path, model: st
     assert got.distortion == coefficients
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif", ".webp"])
-@given(width=st.integers(16, 300), height=st.integers(16, 300))
-def test_the_header_tells_the_size_that_decoding_gives(
-    tmp_path_factory: pytest.TempPathFactory, suffix: str, width: int, height: int
-) -> None:
-    path = tmp_path_factory.mktemp("image") / f"image{suffix}"
-    assert cv2.imwrite(str(path), np.zeros((height, width, 3), np.uint8))
-    header = read_header(path)
-    assert (header.width, header.height) == (width, height)
-
-
 def test_a_progressive_jpeg_with_a_comment_has_a_size_too(tmp_path: Path) -> None:
     path = tmp_path / "image.jpg"
     cv2.imwrite(str(path), np.zeros((17, 19, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])

@@ -205,16 +205,7 @@ height: 720
 width: 1280
 distortion_model: {model}
 d: {d}
-k:
-- 905.5
-- 0.0
-- 641.25
-- 0.0
-- 903.25
-- 352.75
-- 0.0
-- 0.0
-- 1.0
+k: {k}
 r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 p: [905.5, 0.0, 641.25, 0.0, 0.0, 903.25, 352.75, 0.0, 0.0, 0.0, 1.0, 0.0]
 binning_x: 0
@@ -241,19 +232,14 @@ def test_an_echoed_message_and_a_camera_info_file_of_ros_are_read(
     tmp_path: Path, model: str, lens: list[float], expected: Callable[[], FloatArray]
 ) -> None:
     echo = tmp_path / "echo.yaml"
-    echo.write_text(ECHO.format(model=model, d=lens))
+    echo.write_text(ECHO.format(model=model, d=lens, k=MATRIX.ravel().tolist()))
     assert read_intrinsics(echo).name == "front_optical"
     np.testing.assert_allclose(seen(read_intrinsics(echo)), expected(), atol=1e-9)
-    content = {
-        "image_width": 1280,
-        "image_height": 720,
-        "camera_name": "front",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": MATRIX.ravel().tolist()},
-        "distortion_model": model,
-        "distortion_coefficients": {"rows": 1, "cols": len(lens), "data": lens},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": np.eye(3, 4).ravel().tolist()},
-    }
+    matrices = {"camera_matrix": MATRIX, "distortion_coefficients": np.array([lens])}
+    matrices |= {"rectification_matrix": np.eye(3), "projection_matrix": np.eye(3, 4)}
+    content = {"image_width": 1280, "image_height": 720, "camera_name": "front", "distortion_model": model}
+    for name, of in matrices.items():
+        content[name] = {"rows": of.shape[0], "cols": of.shape[1], "data": of.ravel().tolist()}
     file = tmp_path / "front.yaml"
     file.write_text(yaml.safe_dump(content))
     np.testing.assert_allclose(seen(read_intrinsics(file)), expected(), atol=1e-9)
@@ -331,7 +317,7 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "opencv omnidir": (
         lambda folder: write_opencv(folder / "a.yml", LENSES[4], xi=0.9),
-        r"omnidirectional \(xi\)",
+        r"omnidirectional",
     ),
     "no size": (opencv_mistake("image_width: 1280\n", ""), "missing key 'image_width'; add the size"),
     "six": (lambda folder: write_opencv(folder / "a.yml", [0.0] * 6), "6 distortion coefficients; expected"),
@@ -349,8 +335,7 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "missing": (lambda folder: folder / "none.yaml", "no such file"),
     "folder": (lambda folder: folder, "is a folder"),
     "uncalibrated message": (
-        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[]).replace("- 905.5", "- 0").replace(
-            "- 641.25", "- 0").replace("- 903.25", "- 0").replace("- 352.75", "- 0").replace("- 1.0", "- 0")),
+        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[], k=[0] * 9)),
         "not calibrated",
     ),
 }  # fmt: skip

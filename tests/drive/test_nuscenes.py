@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.drive.bags import mountings
+from tests.drive.bags import assert_mounted, assert_same_poses, mountings
 from tests.drive.example import make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import read_drive
@@ -62,15 +62,9 @@ def write(root: Path, change: Callable[[Tables], object]) -> Drive:
 def test_four_tables_are_the_same_drive(tmp_path: Path) -> None:
     expected = write(tmp_path, lambda content: None)
     got = read_drive(tmp_path)
-    assert [(image.camera, image.path) for image in got.images] == [
-        (image.camera, image.path) for image in expected.images
-    ]
-    for one, other in zip(got.images, expected.images, strict=True):
-        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
-    for name, cam_from_vehicle in mountings().items():
-        ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
-        product = got.cameras[name].ipm["estimated"] @ ground
-        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)
+    assert [image.path for image in got.images] == [image.path for image in expected.images]
+    assert_same_poses(got, expected)
+    assert_mounted(got)
 
 
 @pytest.mark.parametrize(
@@ -82,10 +76,7 @@ def test_four_tables_are_the_same_drive(tmp_path: Path) -> None:
         (lambda content: content["ego_pose"][3].update(rotation=[1, 1, 0, 0]), "quaternion of norm 1.41421"),
         (lambda content: content["sample_data"][0].update(timestamp="now"), "timestamp: expected a finite"),
         (lambda content: content["sample_data"][0].pop("token"), "a list of rows with a 'token' each"),
-        (
-            lambda content: content["calibrated_sensor"][0].update(camera_intrinsic=[]),
-            "expected 3 x 3 numbers",
-        ),
+        (lambda content: content["calibrated_sensor"][0].update(camera_intrinsic=[]), "expected 3 x 3"),
         (
             lambda content: (
                 content["calibrated_sensor"].append(content["calibrated_sensor"][0] | {"token": "other"}),

@@ -1,4 +1,4 @@
-"""Doors on a disk that fails at one call; `python -m tests.benchmarks.faults` makes all of them fail."""
+"""Doors on a disk that fails at some calls: a small edition of `python -m tests.benchmarks.faults`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.benchmarks.faults.failing_calls import Failure, watch, why_not
+from tests.benchmarks.faults.forked import Forked
+from tests.benchmarks.faults.situations import Expected, Situation, calibrating
 from tests.faults.cases import picture
-from tests.faults.doors import Expected, Situation, calibrating
-from tests.faults.failing_calls import Failure, watch, why_not
-from tests.faults.forked import Forked
 from tests.faults.judge import Case, judge, judge_again
 from v2hdm.mosaic.blend import Sheet
 from v2hdm.mosaic.result import geotiff

@@ -7,6 +7,7 @@ from tests.adjust.scene import mounted
 from v2hdm.geometry.ipm import (
     apply_homography,
     apply_in_front,
+    direction_covariance,
     extrinsic_from_ipm,
     facing_ipm,
     flat_motion,
@@ -54,12 +55,28 @@ def test_an_inexact_ipm_yields_the_rigid_camera_above_the_ground_whose_columns_a
 
 
 @pytest.mark.parametrize("mount", range(3))
-def test_ground_points_return_from_their_pixels(mount):
-    roi = ROI * [-1, 1] if mount == 1 else ROI
-    pixels, depth_m = project_ground(INFO.intrinsic, MOUNTS[mount], roi)
+@pytest.mark.parametrize("tangent", [np.zeros(6), np.array([12.0, -5.0, 0.02, -0.01, 0.02, 0.7])])
+def test_ground_points_return_from_their_pixels_under_a_tilted_pose_too(mount, tangent):
+    pose = exp(tangent)
+    cam_from_map = MOUNTS[mount] @ np.linalg.inv(pose)
+    back = ground_from_pinhole_px(INFO.intrinsic, cam_from_map)
+    ahead = (ROI * [-1, 1] if mount == 1 else ROI) @ pose[:2, :2].T + pose[:2, 3]
+    pixels, depth_m = project_ground(INFO.intrinsic, cam_from_map, ahead)
     assert (depth_m > 0).all()
-    back = apply_in_front(ground_from_pinhole_px(INFO.intrinsic, MOUNTS[mount]), pixels)
-    np.testing.assert_allclose(back, roi, atol=1e-9)
+    np.testing.assert_allclose(apply_in_front(back, pixels), ahead, atol=1e-9)
+
+
+def test_for_a_level_vehicle_the_plain_route_is_the_posed_one():
+    pose, pixels = exp(np.array([3.0, 4.0, 0, 0, 0, 1.1])), np.array([[500.0, 500.0], [800.0, 420.0]])
+    posed = ground_from_pinhole_px(INFO.intrinsic, MOUNTS[0] @ np.linalg.inv(pose))
+    plain = flat_motion(pose) @ facing_ipm(-ipm_from_extrinsic(INFO, MOUNTS[0]), np.array([8.0, 0.0]))
+    np.testing.assert_allclose(apply_in_front(plain, pixels), apply_in_front(posed, pixels), atol=1e-9)
+
+
+def test_a_pitch_error_moves_a_point_along_its_ray_as_the_formula_says():
+    """At h = 2.4 m and r = 10 m, one milliradian of pitch is (100 + 5.76) / 2.4 mm = 44 mm."""
+    covariance = direction_covariance(np.array([10.0, 0.0]), np.array(2.4), 1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.04407, 0.010], rtol=1e-3)
 
 
 def test_a_batch_of_cameras_projects_as_each_of_them_does():

@@ -35,21 +35,13 @@ def test_a_cyclic_shift_is_found_and_undone(shift: int) -> None:
     assert found.deformation_m == pytest.approx(0.0, abs=1e-12)
 
 
-def test_corners_that_are_not_valid_take_no_part() -> None:
+def test_corners_that_are_not_valid_take_no_part_and_another_shape_shows_as_deformation() -> None:
     broken = DIAMOND.copy()
     broken[2] = np.nan
     found = align(DIAMOND, ALL, broken, np.array([True, True, False, True]))
-    assert found.shift == 0
-    assert found.common == 3
+    assert (found.shift, found.common) == (0, 3)
     assert found.deformation_m == pytest.approx(0.0, abs=1e-12)
-
-
-def test_with_one_common_corner_nothing_can_be_said() -> None:
-    found = align(DIAMOND, ALL, DIAMOND, np.array([True, False, False, False]))
-    assert np.isinf(found.deformation_m)
-
-
-def test_another_shape_shows_as_deformation() -> None:
+    assert np.isinf(align(DIAMOND, ALL, DIAMOND, np.array([True, False, False, False])).deformation_m)
     assert align(DIAMOND, ALL, 1.5 * DIAMOND, ALL).deformation_m == pytest.approx(0.3)
 
 
@@ -60,11 +52,13 @@ def test_alignment_broadcasts_over_tracks_and_detections() -> None:
     np.testing.assert_allclose(found.offset[:, 0, 0], [0.0, -5.0, 3.0], atol=1e-12)
 
 
-def test_area_sense_and_diameter_of_a_diamond() -> None:
-    assert signed_area(DIAMOND) == pytest.approx(0.36)
-    assert is_convex(DIAMOND)
-    assert not is_convex(DIAMOND[::-1])
+def test_area_sense_and_diameter_of_a_diamond_and_of_its_image_whose_second_axis_turns_down() -> None:
+    in_image = DIAMOND * [1, -1]
+    assert signed_area(DIAMOND) == pytest.approx(0.36) == -signed_area(in_image)
     assert diameters(DIAMOND, ALL) == pytest.approx(1.2)
+    assert is_convex(DIAMOND)
+    assert is_convex_px(in_image)
+    assert not any([is_convex(DIAMOND[::-1]), is_convex_px(DIAMOND), is_convex(in_image)])
 
 
 def test_ordered_corners_run_counter_clockwise_on_the_screen() -> None:
@@ -73,10 +67,13 @@ def test_ordered_corners_run_counter_clockwise_on_the_screen() -> None:
     assert not is_convex_px(KITE[::-1])
 
 
-def test_normals_of_image_corners_point_outwards() -> None:
-    _, normal, _ = side_frames(KITE)
-    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
-    assert (((middle - KITE.mean(axis=0)) * normal).sum(axis=1) > 0).all()
+@pytest.mark.parametrize(("corners", "outwards"), [(KITE, 1), (DIAMOND, -1)], ids=["image", "map"])
+def test_normals_of_image_corners_point_outwards_and_of_map_corners_inwards(
+    corners: np.ndarray, outwards: int
+) -> None:
+    _, normal, _ = side_frames(corners)
+    middle = (corners + np.roll(corners, -1, axis=0)) / 2
+    assert (outwards * ((middle - corners.mean(axis=0)) * normal).sum(axis=1) > 0).all()
 
 
 def test_the_width_of_a_bar_is_its_breadth() -> None:
@@ -95,21 +92,6 @@ def test_a_quadrilateral_is_found_again_from_points_on_its_outline() -> None:
 @pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
 def test_points_that_enclose_nothing_give_no_quadrilateral(outline: np.ndarray) -> None:
     assert quad_from_hull(cv2.convexHull(outline.astype(np.float32))) is None
-
-
-def test_corners_of_the_map_become_those_of_an_image_when_the_second_axis_turns_down() -> None:
-    in_image = DIAMOND * [1, -1]
-    assert is_convex(DIAMOND)
-    assert not is_convex_px(DIAMOND)
-    assert is_convex_px(in_image)
-    assert not is_convex(in_image)
-    assert signed_area(in_image) == pytest.approx(-signed_area(DIAMOND))
-
-
-def test_normals_of_map_corners_point_inwards() -> None:
-    _, normal, _ = side_frames(DIAMOND)
-    middle = (DIAMOND + np.roll(DIAMOND, -1, axis=0)) / 2
-    assert ((middle * normal).sum(axis=1) < 0).all()
 
 
 @pytest.mark.parametrize("shift", range(4))

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import rotation_from_euler
@@ -39,11 +40,7 @@ _EVERY_M = 0.8
 
 def extrinsic(roll_deg: float = 0.0, pitch_deg: float = 20.0, yaw_deg: float = 0.0) -> FloatArray:
     """``cam_from_vehicle`` of a camera at :data:`CENTRE` that looks ahead and down."""
-    turn = rotation_from_euler(*(np.deg2rad([a]) for a in (roll_deg, pitch_deg, yaw_deg)))[0]
-    turn = turn @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turn.T, -turn.T @ CENTRE
-    return out
+    return mounted(CENTRE, pitch_deg, yaw_deg, roll_deg)
 
 
 def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:

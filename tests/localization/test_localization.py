@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.localization.filter import POSE, Markings, Seen, State, locate, pose_of, predict, start
+from v2hdm.localization.filter import Markings, Seen, State, locate, pose_of, predict, start
 from v2hdm.records import HdMap, Marking
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
@@ -18,13 +18,9 @@ DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])
 DIAMOND = np.array([[0.5, 0.0], [0.0, 0.4], [-0.5, 0.0], [0.0, -0.4]])
 
 
-def looking_ahead() -> np.ndarray:
+def looking_ahead():
     """cam_from_vehicle of a camera 2.4 m above the ground, 15 degrees down."""
-    c, s = np.cos(np.deg2rad(15)), np.sin(np.deg2rad(15))
-    out = np.eye(4)
-    out[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    out[:3, 3] = -out[:3, :3] @ [1.5, 0.0, 2.4]
-    return out
+    return mounted([1.5, 0.0, 2.4], pitch_deg=15)
 
 
 def mapped(true: HdMap, rng: np.random.Generator, sigma_m: float = 0.01) -> HdMap:
@@ -134,16 +130,3 @@ def test_a_detection_that_two_markings_could_explain_is_not_used() -> None:
     assert locate(unsure, seen, Markings(dashes))[1] == []
     sure = start(pose_of(np.zeros(5)), 0.3, 0.02, ATTITUDE_RAD)
     assert len(locate(sure, seen, Markings(dashes))[1]) == 1
-
-
-def test_motion_between_frames_agrees_with_its_own_derivative() -> None:
-    state = State(np.array([1.0, 2.0, 0.7, 3.0, 0.2, 0.0, 0.0]), np.diag(np.full(7, 1e-8)))
-    after = predict(state, 0.3, 0.0)
-    noise = predict(State(state.mean, np.zeros((7, 7))), 0.3, 0.0).covariance
-    slopes = [
-        (predict(State(state.mean + step, state.covariance), 0.3, 0.0).mean - after.mean) / 1e-6
-        for step in 1e-6 * np.eye(7)
-    ]
-    expected = np.array(slopes).T @ state.covariance @ np.array(slopes)
-    assert after.covariance - noise == pytest.approx(expected, abs=1e-13)
-    assert len(POSE) == 5

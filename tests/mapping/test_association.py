@@ -43,6 +43,10 @@ def true_rig(scene: Scene, sightings: Sightings) -> Rig:
     return Rig(rig.intrinsic, truth, sightings.map_from_vehicle)
 
 
+MERGING = {"floor_m": 0.05, "gate_sigmas": 4.0, "max_distance_m": 1.5, "shape_tolerance": 0.25}
+SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+
+
 def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
     """Index of the marking (S,) that each sighting shows, by its corners under the true extrinsic."""
     located = locate(sightings, true_rig(scene, sightings))
@@ -50,6 +54,13 @@ def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
     distance = np.linalg.norm(located.corners_map[:, None, :, None] - corners[None, :, None, :], axis=-1)
     distance = np.where(sightings.valid[:, None, :, None], distance, np.nan).min(axis=3)
     return np.nanmean(distance, axis=2).argmin(axis=1)
+
+
+def located_at(corners: np.ndarray, ray: np.ndarray) -> Located:
+    """Corners (n, 4, 2) that are known to a centimetre, along such rays."""
+    count, everywhere = len(corners), np.ones((len(corners), 4), bool)
+    covariance = np.tile(np.eye(2) * 1e-4, (count, 4, 1, 1))
+    return Located(corners, covariance, ray, np.full(count, 2.4), everywhere, everywhere)
 
 
 def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Association, Located]:
@@ -61,23 +72,21 @@ def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Asso
     ), located
 
 
-def test_under_an_ipm_that_is_wrong_by_decimetres_no_track_mixes_two_markings(
-    scene: Scene, sightings: Sightings
-) -> None:
-    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+@pytest.fixture(scope="module")
+def tracks(scene, sightings):
+    """Under an IPM that is wrong by decimetres."""
+    return tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)[0]
+
+
+def test_no_track_mixes_two_markings_and_all_are_long_although_images_miss_some(scene, sightings, tracks):
     marking = true_marking(scene, sightings)
     grouped = tracks.group >= 0
     per_track = np.unique(np.stack([tracks.group[grouped], marking[grouped]]), axis=1)
     assert per_track.shape[1] == tracks.count
+    assert np.median(np.bincount(tracks.group[grouped])) >= 8
 
 
-def test_tracks_are_long_although_images_miss_markings(scene: Scene, sightings: Sightings) -> None:
-    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
-    assert np.median(np.bincount(tracks.group[tracks.group >= 0])) >= 8
-
-
-def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings) -> None:
-    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings, tracks: Association) -> None:
     located = locate(sightings, true_rig(scene, sightings))
     true_corners = np.stack([m.corners_map for m in scene.markings])[true_marking(scene, sightings)]
     whole = np.ones((len(sightings), 4), dtype=bool)
@@ -93,15 +102,7 @@ def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings) 
 def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings) -> None:
     rig = true_rig(scene, sightings)
     tracks, located = tracks_under(rig, sightings, 0.002)
-    merged = merge_groups(
-        tracks,
-        sightings,
-        fuse_groups(tracks, located, 0.0017),
-        floor_m=0.05,
-        gate_sigmas=4.0,
-        max_distance_m=1.5,
-        shape_tolerance=0.25,
-    )
+    merged = merge_groups(tracks, sightings, fuse_groups(tracks, located, 0.0017), **MERGING)
     marking = true_marking(scene, sightings)
     # A sighting with a grossly misplaced corner may stay alone; it never makes a marking.
     size = np.bincount(merged.group[merged.group >= 0])
@@ -114,53 +115,28 @@ def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings
 
 def test_two_markings_of_one_image_are_never_merged(sightings: Sightings) -> None:
     together = sightings.subset(np.flatnonzero(sightings.image == sightings.image[0])[:2])
-    association = Association(np.array([0, 1]), np.zeros(2, int), 2)
-    rig_corners = np.tile(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), (2, 1, 1))
-    located = Located(
-        rig_corners,
-        np.tile(np.eye(2) * 1e-4, (2, 4, 1, 1)),
-        rig_corners + 5,
-        np.full(2, 2.4),
-        np.ones((2, 4), bool),
-        np.ones((2, 4), bool),
-    )
-    merged = merge_groups(
-        association,
-        together,
-        fuse_groups(association, located, 0.001),
-        floor_m=0.05,
-        gate_sigmas=4.0,
-        max_distance_m=1.5,
-        shape_tolerance=0.25,
-    )
-    assert merged.count == 2
+    association, corners = Association(np.array([0, 1]), np.zeros(2, int), 2), np.tile(SQUARE, (2, 1, 1))
+    fused = fuse_groups(association, located_at(corners, corners + 5), 0.001)
+    assert merge_groups(association, together, fused, **MERGING).count == 2
 
 
-def test_groups_are_renumbered_when_rows_are_dropped() -> None:
+def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_other_numbers() -> None:
     association = Association(np.array([0, 1, 2, 1, -1]), np.arange(5) % 4, 3)
     kept = keep_rows(association, np.array([False, True, True, True, True]))
-    assert kept.group.tolist() == [-1, 0, 1, 0, -1]
-    assert kept.count == 2
-
-
-def test_the_same_division_under_other_numbers_is_the_same() -> None:
-    a = Association(np.array([0, 0, 1, 2, -1]), np.zeros(5, int), 3)
-    b = Association(np.array([5, 5, 0, 1, 1]), np.zeros(5, int), 6)
-    c = Association(np.array([5, 0, 0, 1, 1]), np.zeros(5, int), 6)
+    assert (kept.group.tolist(), kept.count) == ([-1, 0, 1, 0, -1], 2)
+    a, b, c = (
+        Association(np.array(group), np.zeros(5, int), count)
+        for group, count in (([0, 0, 1, 2, -1], 3), ([5, 5, 0, 1, 1], 6), ([5, 0, 0, 1, 1], 6))
+    )
     assert same_groups(a, b)
     assert not same_groups(a, c)
 
 
 def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
-    corners = np.tile(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), (4, 1, 1))
+    corners, ray = np.tile(SQUARE, (4, 1, 1)), np.full((4, 4, 2), 4.0)
     corners[3] += 0.8
-    ray = np.full((4, 4, 2), 4.0)
     ray[3] = 14.0
-    everywhere = np.ones((4, 4), bool)
-    located = Located(
-        corners, np.tile(np.eye(2) * 1e-4, (4, 4, 1, 1)), ray, np.full(4, 2.4), everywhere, everywhere
-    )
-    fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located, 0.002)
+    fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located_at(corners, ray), 0.002)
     assert np.abs(fused.corners_map[0] - corners[0]).max() < 0.02
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.mapping.scene import MOUNTS, extrinsic
+from tests.mapping.scene import MOUNTS
 from v2hdm.association.ground import Views
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
@@ -17,7 +17,7 @@ from v2hdm.site.looks import Observer, Paint, learn_paint
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])
 INFO = CameraInfo("front", 1280, 720, INTRINSIC, "plumb_bob", (-0.1, 0.02, 1e-4, -2e-4, 0.0))
 CAMERA = Camera(INFO, {"estimated": np.eye(3)}, "estimated", np.array([[4.0, -4], [16, -4], [16, 4], [4, 4]]))
-MOUNT = extrinsic(*MOUNTS["front"])
+MOUNT = MOUNTS["front"]
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
 PLACES = np.array([[6.0 + 3.0 * k, 2.5 * (-1) ** k] for k in range(12)])
 GONE, HIDDEN = 4, 7

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -16,7 +15,7 @@ from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser, initial_rig
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import HdMap, ImageDetections, Marking, MarkingDetection
+from v2hdm.records import HdMap, Marking, MarkingDetection
 
 CAMERAS = ("front", "rear")
 
@@ -48,31 +47,23 @@ def both_ends_hidden(seen: MarkingDetection, rng: np.random.Generator) -> Markin
     return replace(seen, covariance_px=covariance, corner_valid=np.zeros(4, dtype=bool))
 
 
-def with_cut_dashes(
-    scene: Scene,
-    share: float,
-    cut: Callable[[MarkingDetection, np.random.Generator], MarkingDetection] = cut_short,
-) -> list[ImageDetections]:
+def with_cut_dashes(scene, share, cut=cut_short):
     """The detections of a scene, so many of whose whole dashes are cut."""
     rng = np.random.default_rng(0)
-    return [
-        replace(
-            found,
-            markings=tuple(
-                cut(m, rng) if m.kind == "lane_dash" and m.corner_valid.all() and rng.random() < share else m
-                for m in found.markings
-            ),
-        )
-        for found in scene.detections
-    ]
+
+    def seen(m):
+        return cut(m, rng) if m.kind == "lane_dash" and m.corner_valid.all() and rng.random() < share else m
+
+    return [replace(found, markings=tuple(seen(m) for m in found.markings)) for found in scene.detections]
+
+
+STREET = SceneOptions(length_m=45.0, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A short street, seen by detectors that err by their noise alone."""
-    return make_scene(
-        SceneOptions(length_m=45.0, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0)
-    )
+    return make_scene(STREET)
 
 
 @pytest.fixture(scope="module")
@@ -209,10 +200,7 @@ def crossed(seen: MarkingDetection, is_left: bool) -> MarkingDetection:
 
 def stop_lines(whole_images: int) -> tuple[list[Marking], Marking]:
     """Stop lines of the map, and the true one, which all but so many images of each camera show by halves."""
-    scene = make_scene(
-        SceneOptions(length_m=45.0, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0),
-        with_a_stop_line,
-    )
+    scene = make_scene(STREET, with_a_stop_line)
     left = dict.fromkeys(CAMERAS, whole_images)
     detections = []
     for found in scene.detections[::-1]:

@@ -34,6 +34,13 @@ def solved(true: np.ndarray, rng: np.random.Generator, sigma_m: float = 0.01) ->
     return Candidates(corners, np.tile(block, (len(true), 1, 1)))
 
 
+def row(seed, shapes, sigma_m=0.01):
+    """True markings in a row, and as a drive would map them."""
+    rng = np.random.default_rng(seed)
+    true = painted(shapes, rng)
+    return true, solved(true, rng, sigma_m)
+
+
 def well_seen(count: int) -> Counts:
     """Each place in ten images, in all of its easy views, and never as part of a symbol."""
     ten = np.full(count, 10)
@@ -67,9 +74,7 @@ def normalised(found: Posterior, true: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [DIAMOND, DASH])
 def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape: np.ndarray) -> None:
-    rng = np.random.default_rng(0)
-    true = painted([shape] * 60, rng)
-    candidates = solved(true, rng, 0.02)
+    true, candidates = row(0, [shape] * 60, 0.02)
     found = of_one_class(candidates)
     assert shape_rmse(found.candidates.corners_map, true) < 0.7 * shape_rmse(candidates.corners_map, true)
     assert normalised(found, true).mean() / 8 < 1.1
@@ -77,17 +82,14 @@ def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape: np.ndarr
 
 
 def test_a_corner_that_nobody_saw_is_where_the_class_has_it() -> None:
-    rng = np.random.default_rng(1)
-    true = painted([DIAMOND] * 30, rng)
-    found = of_one_class(without(solved(true, rng), 4, [2]))
+    true, candidates = row(1, [DIAMOND] * 30)
+    found = of_one_class(without(candidates, 4, [2]))
     assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
     assert normalised(found, true)[4] < 20
 
 
 def test_a_corner_on_a_known_line_is_found_along_it() -> None:
-    rng = np.random.default_rng(2)
-    true = painted([DASH] * 30, rng)
-    candidates = solved(true, rng)
+    true, candidates = row(2, [DASH] * 30)
     side = true[4, 1] - true[4, 0]
     long = [0, 1, 2, 3] if np.linalg.norm(side) > 1 else [1, 2, 3, 0]
     along = (true[4, long[1]] - true[4, long[0]]) / 3.0
@@ -101,9 +103,7 @@ def test_a_corner_on_a_known_line_is_found_along_it() -> None:
 
 
 def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it() -> None:
-    rng = np.random.default_rng(3)
-    true = painted([DIAMOND] * 40, rng)
-    candidates = solved(true, rng)
+    true, candidates = row(3, [DIAMOND] * 40)
     candidates.corners_map[7, 2] += 0.4 * (true[7, 2] - true[7].mean(axis=0))
     found = of_one_class(candidates)
     assert np.linalg.norm(found.candidates.corners_map[7] - true[7], axis=1).max() < 0.08
@@ -120,9 +120,7 @@ def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_d
 
 
 def test_a_worn_end_is_not_taken_for_the_end_of_the_paint() -> None:
-    rng = np.random.default_rng(5)
-    true = painted([DASH] * 60, rng)
-    candidates = solved(true, rng, 0.005)
+    true, candidates = row(5, [DASH] * 60, 0.005)
     for worn in (10, 20, 30, 40):
         k = int(np.argmax(np.linalg.norm(np.roll(true[worn], -1, axis=0) - true[worn], axis=1)))
         for corner, other in ((k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)):
@@ -141,28 +139,16 @@ def moved_end(candidates: Candidates, place: int, along: float, slant: float = 0
         corners[corner] += part * (corners[corner] - corners[other])
 
 
-def test_a_piece_of_a_dash_is_not_taken_for_a_short_dash() -> None:
-    rng = np.random.default_rng(15)
-    true = painted([DASH] * 30, rng)
-    candidates = solved(true, rng, 0.005)
-    moved_end(candidates, 12, -0.7)
-    found = of_one_class(candidates)
-    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
-
-
-def test_an_end_that_runs_on_into_a_slanted_stroke_is_no_end() -> None:
-    rng = np.random.default_rng(16)
-    true = painted([DASH] * 30, rng)
-    candidates = solved(true, rng, 0.005)
-    moved_end(candidates, 12, 0.15, 0.04)
+@pytest.mark.parametrize(("seed", "moved"), [(15, (-0.7, 0.0)), (16, (0.15, 0.04))])
+def test_a_piece_of_a_dash_is_no_short_dash_and_an_end_that_runs_on_into_a_stroke_is_no_end(seed, moved):
+    true, candidates = row(seed, [DASH] * 30, 0.005)
+    moved_end(candidates, 12, *moved)
     found = of_one_class(candidates)
     assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
 def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape() -> None:
-    rng = np.random.default_rng(17)
-    true = painted([DIAMOND] * 60, rng)
-    candidates = solved(true, rng, 0.01)
+    true, candidates = row(17, [DIAMOND] * 60, 0.01)
     shift = 0.1 * (true[12, 1] - true[12, 0])
     candidates.corners_map[12, 0] += shift
     candidates.corners_map[12, 2] -= shift
@@ -171,9 +157,8 @@ def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape() -> None:
 
 
 def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it() -> None:
-    rng = np.random.default_rng(6)
-    true = painted([DIAMOND] * 30, rng)
-    found = of_one_class(without(solved(true, rng), 4, [0, 1]))
+    _, candidates = row(6, [DIAMOND] * 30)
+    found = of_one_class(without(candidates, 4, [0, 1]))
     assert found.candidates.sigma_m[4].max() > 0.15
     assert found.candidates.sigma_m[[3, 5]].max() < 0.1
 
@@ -195,9 +180,8 @@ def test_a_class_may_have_several_shapes() -> None:
 
 
 def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelograms() -> None:
-    rng = np.random.default_rng(9)
-    true = painted([DIAMOND * rng.uniform(0.5, 2.0) for _ in range(12)], rng)
-    candidates = solved(true, rng, 0.02)
+    sizes = np.random.default_rng(8).uniform(0.5, 2.0, 12)
+    true, candidates = row(9, [DIAMOND * size for size in sizes], 0.02)
     found = of_one_class(candidates)
     corners = found.candidates.corners_map
     closure = corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]
@@ -207,17 +191,15 @@ def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelogr
 
 
 def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it() -> None:
-    rng = np.random.default_rng(10)
-    candidates, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
+    (_, candidates), counts = row(10, [DIAMOND] * 40), well_seen(40)
     counts.found[7], counts.images[7] = 1, 3
     assert of_one_class(candidates, counts).log_odds[7] > 2
 
 
 def odd_and_seldom() -> tuple[Candidates, Counts]:
     """Forty candidates, of which number 7 is of no marking's shape and seen in three images of many."""
-    rng = np.random.default_rng(11)
-    candidates, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
-    candidates.corners_map[7] += rng.normal(0, 0.25, (4, 2))
+    (_, candidates), counts = row(11, [DIAMOND] * 40), well_seen(40)
+    candidates.corners_map[7] += np.random.default_rng(11).normal(0, 0.25, (4, 2))
     counts.found[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
     counts.observations[7], counts.agreeing[7] = 12, 8
     return candidates, counts
@@ -277,8 +259,7 @@ def test_reasons_name_what_has_won() -> None:
 
 
 def test_of_two_markings_on_one_spot_the_likelier_stays() -> None:
-    rng = np.random.default_rng(14)
-    candidates, counts = solved(painted([DIAMOND] * 20, rng), rng), well_seen(20)
+    (_, candidates), counts = row(14, [DIAMOND] * 20), well_seen(20)
     candidates.corners_map[2] = candidates.corners_map[1] + [0.1, 0.0]
     counts.images[2] = 4
     classified = verdict(candidates, counts)
@@ -287,8 +268,7 @@ def test_of_two_markings_on_one_spot_the_likelier_stays() -> None:
 
 
 def test_a_shift_that_all_markings_share_speaks_against_none() -> None:
-    rng = np.random.default_rng(15)
-    candidates = solved(painted([DIAMOND] * 20, rng), rng)
+    _, candidates = row(15, [DIAMOND] * 20)
     shared = replace(
         candidates, covariance_m2=candidates.covariance_m2 + 0.4**2 * np.kron(np.ones((4, 4)), np.eye(2))
     )
@@ -296,7 +276,6 @@ def test_a_shift_that_all_markings_share_speaks_against_none() -> None:
 
 
 def test_a_place_less_certain_than_allowed_is_left_out() -> None:
-    rng = np.random.default_rng(16)
-    candidates = solved(painted([DIAMOND] * 20, rng), rng)
+    _, candidates = row(16, [DIAMOND] * 20)
     candidates.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
     assert verdict(candidates).verdict[3] == "its position is too uncertain"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.cameras import mounted
 from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
@@ -20,19 +21,11 @@ ARROW = np.array(
 )
 
 
-def level_camera(height_m: float) -> np.ndarray:
-    """``cam_from_vehicle`` of a camera that looks straight ahead."""
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
-    cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [0.0, 0.0, height_m]
-    return cam_from_vehicle
-
-
 def scene(arrow_x_m: float) -> tuple[Symbols, Rig]:
     """Three frames, a metre apart, that all see an arrow ahead of the first one."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = [0.0, 1.0, 2.0]
-    rig = Rig(INTRINSIC[None], level_camera(2.0)[None], poses)
+    rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], poses)
     outlines = []
     for pose in poses:
         vehicle = np.column_stack(
@@ -81,7 +74,7 @@ def seen(shapes: list[FloatArray], kinds: list[str], poses_x: list[float]) -> tu
     """What a camera at so many places ahead says of shapes on the ground, one from each."""
     poses = np.tile(np.eye(4), (len(poses_x), 1, 1))
     poses[:, 0, 3] = poses_x
-    rig = Rig(INTRINSIC[None], level_camera(2.0)[None], poses)
+    rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], poses)
     outlines = []
     for shape, pose in zip(shapes, poses, strict=True):
         ground = np.column_stack([shape, np.zeros(len(shape)), np.ones(len(shape))])

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.docs.blocks import ROOT, blocks
+from tests.docs.blocks import blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
 from v2hdm.cli.main import run
@@ -74,15 +72,3 @@ def test_what_a_user_must_mend_is_one_line(
     assert error.startswith("error: ")
     assert message in error
     assert error.count("\n") == 1
-
-
-def test_without_its_package_a_format_is_one_line_that_names_the_extra(folder: Path) -> None:
-    (folder / "pyogrio.py").write_text('raise ModuleNotFoundError("not installed", name="pyogrio")')
-    arguments = [sys.executable, "-m", "v2hdm", "export", "map.geojson", "--format", "gpkg"]
-    done = subprocess.run(
-        arguments, cwd=folder, env={"PYTHONPATH": f"{folder}:{ROOT}"}, capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert done.stderr == (
-        "error: the format gpkg needs pyogrio: install the gis extra, pip install 'v2hdm[gis]'\n"
-    )

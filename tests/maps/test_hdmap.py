@@ -174,10 +174,7 @@ def damaged_map(origin: object = None, **properties: object) -> str:
         ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither a geometry nor 'corn"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
-        (
-            damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}),
-            "origin, latitude_deg",
-        ),
+        (damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}), "origin, latitude"),
         (damaged_map(origin={"latitude_deg": 91, "longitude_deg": 1, "altitude_m": 1}), "latitude must lie"),
         (damaged_map(heights_m=[1.0, 2.0]), "feature 0, heights_m"),
         (damaged_map(sightings=1.5), "feature 0, sightings: expected a whole number"),

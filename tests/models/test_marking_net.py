@@ -1,12 +1,10 @@
 """The network's shapes and the exact rearrangements inside it."""
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from models import MarkingNet, NetConfig
-from models.marking_net import _channels_last_tiles, _depth_to_space, _space_to_depth
 from v2hdm.catalogue import PAINT_CLASSES
 
 
@@ -60,28 +58,6 @@ def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
     assert not any(isinstance(module, nn.BatchNorm2d) for module in net.modules())
     for one, other in zip(after, before, strict=True):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
-
-
-def test_the_stem_keeps_every_pixel_of_a_tile_as_a_channel() -> None:
-    image = random_images(2, 8, 12)
-    channels = _space_to_depth(image) * 64.0 + 112.0
-    for row, column, colour in ((0, 0, 0), (3, 1, 2), (2, 3, 1)):
-        channel = (row * 4 + column) * 3 + colour
-        np.testing.assert_allclose(
-            channels[:, channel], image[:, row::4, column::4, colour].float(), atol=1e-4
-        )
-
-
-def test_the_tiles_of_a_training_are_those_of_the_vehicle() -> None:
-    image = random_images(2, 8, 12)
-    tiles = _channels_last_tiles(image)
-    torch.testing.assert_close(tiles, _space_to_depth(image))
-    assert tiles.is_contiguous(memory_format=torch.channels_last)
-
-
-def test_depth_to_space_is_pixel_shuffle() -> None:
-    x = torch.randn(2, 12, 3, 5)
-    assert torch.equal(_depth_to_space(x), torch.pixel_shuffle(x, 2))
 
 
 def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net: MarkingNet) -> None:

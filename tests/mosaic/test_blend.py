@@ -112,19 +112,6 @@ def test_tiles_are_as_large_as_the_warp_stays_exact_and_a_coarse_canvas_is_refus
         Tiling.of(Canvas(np.zeros(2), 1.0, 9, 9), shots, lens)
 
 
-def test_tiles_under_a_polygon_are_all_that_it_touches_and_few_else() -> None:
-    generator = np.random.default_rng(3)
-    for _ in range(20):
-        points = generator.uniform(0, 900, (5, 2)).astype(np.float32)
-        polygon = cv2.convexHull(points)[:, 0].astype(float)
-        found = {tuple(tile) for tile in module._tiles_under(polygon, np.array([8, 8]), 128)}
-        weights = generator.dirichlet(np.ones(len(polygon)), 4000)
-        touched = {tuple(t) for t in np.floor((weights @ polygon + 0.5) / 128).astype(int)}
-        assert {t for t in touched if max(t) < 8} <= found
-        box = np.floor(polygon.min(axis=0) / 128), np.floor(polygon.max(axis=0) / 128)
-        assert all((t >= box[0] - 1).all() and (t <= box[1] + 1).all() for t in map(np.array, found))
-
-
 def test_a_sloping_road_is_undone_and_clocks_are_kept(drive: Drive) -> None:
     """Poses written in the recorded frame come back to the flat one, at the time that the image was taken."""
     up = np.eye(4)

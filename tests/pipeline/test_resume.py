@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.drive.example import description
 from v2hdm.detection import batch
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
@@ -25,7 +26,7 @@ from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import RunResult, run
 from v2hdm.store.pruning import items_of
 
-SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
+SAME = ("map.geojson", "calibration_front.yaml", "trajectory.tum", "excluded.geojson", "residuals.csv")
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,15 @@ def config(folder: Path, output: str, **changes: Any) -> RunConfig:
 def assert_same(folder: Path, other: Path) -> None:
     for name in SAME:
         assert (folder / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_two_processes_find_the_same_map_to_the_byte_without_the_truth(site: Path, tmp_path: Path) -> None:
+    blind = tmp_path / "blind"
+    shutil.copytree(site / "drive", blind, ignore=shutil.ignore_patterns("truth"))
+    with description(blind) as content:
+        content.pop("truth")
+    drive = DriveConfig(path=str(blind))
+    assert_same(run(config(tmp_path, "out", drive=drive, workers=2)).folder, site / "first" / "short")
 
 
 def refused(*_: object, **__: object) -> Any:

@@ -150,23 +150,18 @@ def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_di
 
 
 def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path: Path) -> None:
+    drawn, photos = tmp_path / "drawn", tmp_path / "photos"
     for text in (b"first", b"second"):
-        with growing_folder(tmp_path / "drawn", "--draw") as folder:
+        with growing_folder(drawn, "--draw") as folder:
             folder.write("a.jpg", text)
-    assert (tmp_path / "drawn" / "a.jpg").read_bytes() == b"second"
-    (tmp_path / "drawn" / "b.jpg").write_bytes(b"mine")
-    with (
-        growing_folder(tmp_path / "drawn", "--draw") as folder,
-        pytest.raises(ConfigError, match="no file of ours"),
-    ):
+    assert (drawn / "a.jpg").read_bytes() == b"second"
+    (drawn / "b.jpg").write_bytes(b"mine")
+    with growing_folder(drawn, "--draw") as folder, pytest.raises(ConfigError, match="no file of ours"):
         folder.write("b.jpg", b"ours")
-    assert (tmp_path / "drawn" / "b.jpg").read_bytes() == b"mine"
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "a.jpg").write_bytes(b"mine")
-    with (
-        pytest.raises(ConfigError, match="no results of ours"),
-        growing_folder(tmp_path / "photos", "--draw"),
-    ):
+    assert (drawn / "b.jpg").read_bytes() == b"mine"
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(b"mine")
+    with pytest.raises(ConfigError, match="no results of ours"), growing_folder(photos, "--draw"):
         pass
 
 

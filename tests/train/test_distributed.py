@@ -80,7 +80,7 @@ def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_only_member_of_a_team_is_shown_what_a_process_alone_is() -> None:
-    from tests.train.team_member import tiny
+    from tests.train.small import tiny
 
     data = tiny(Path("unused"), 1).data
     alone, member = (next(training_batches(data, 5, 2, 0, *part)) for part in ([], [(0, 1)]))

@@ -7,36 +7,15 @@ from train.scenes.hardships import (
     Hardships,
     bleached,
     junction_approach,
-    with_junction,
-    with_side_seams,
 )
-from train.scenes.paint import Bend, random_brush, rectangle, street_paint
+from train.scenes.paint import Bend, random_brush
 from train.scenes.scenes import training_sample
 from train.scenes.views import mounted_otherwise, random_view
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import ARROW, CROSSWALK_BAR, LANE_DASH, STOP_LINE
+from v2hdm.records import ARROW, CROSSWALK_BAR, STOP_LINE
 from v2hdm.simulate.render.scene import Ground
-
-
-def test_side_seams_lie_along_a_side_of_a_marking_and_go_on_beyond_it() -> None:
-    polygon = rectangle(np.array([9.0, 1.0]), 3.0, 0.3)
-    paint = random_brush(np.random.default_rng(0), 0.5).paint(np.random.default_rng(1), LANE_DASH, polygon)
-    along_a_side, beyond = 0, 0
-    for seed in range(30):
-        marks = with_side_seams(np.random.default_rng(seed), None, [paint], 1.0)
-        if marks is None:
-            continue
-        rows, columns = np.nonzero(marks.factor != 128)
-        x, y = np.array([columns, rows]) * marks.resolution_m + np.array(marks.origin_map)[:, None]
-        sides_m = [np.abs(y - 0.85), np.abs(y - 1.15), np.abs(x - 7.5), np.abs(x - 10.5)]
-        along_a_side += min(np.median(off) for off in sides_m) < 0.1
-        beyond += np.ptp(x) > 3.2
-    assert along_a_side > 14
-    assert beyond > 8
-    assert with_side_seams(np.random.default_rng(1), None, [paint], 0.0) is None
-    assert with_side_seams(np.random.default_rng(1), None, [], 9.0) is None
 
 
 def test_bleached_ground_keeps_its_tint_and_is_clipped_together_with_its_paint() -> None:
@@ -72,25 +51,6 @@ def test_a_junction_has_arrows_before_its_stop_line_and_a_crosswalk_behind_it() 
         assert all(inside_convex(ground, p.polygon_map).all() for p in paints if p.kind == CROSSWALK_BAR)
         kinds += [paint.kind for paint in paints]
     assert {ARROW, STOP_LINE, CROSSWALK_BAR} == set(kinds)
-
-
-def test_a_junction_lies_on_clear_ground() -> None:
-    rng = np.random.default_rng(11)
-    brush = random_brush(rng, 0.0)
-    road = street_paint(rng, brush, Bend(0.0))
-    crossed = with_junction(np.random.default_rng(5), road, brush, Bend(0.0), 1.0)
-    approach, ground = junction_approach(_after_one_draw(5), brush, Bend(0.0))
-    np.testing.assert_array_equal(crossed.paints[-1].polygon_map, approach[-1].polygon_map)
-    before, kept = len(road.paints), crossed.paints[: len(crossed.paints) - len(approach)]
-    assert 0 < len(kept) < before
-    assert not inside_convex(ground, np.array([paint.polygon_map.mean(axis=0) for paint in kept])).any()
-    assert with_junction(np.random.default_rng(5), road, brush, Bend(0.0), 0.0) is road
-
-
-def _after_one_draw(seed: int) -> np.random.Generator:
-    rng = np.random.default_rng(seed)
-    rng.random()
-    return rng
 
 
 def test_cameras_mounted_otherwise_keep_their_place_and_look_from_low_or_high() -> None:

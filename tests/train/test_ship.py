@@ -28,11 +28,18 @@ def into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "into"
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a training."""
-    train(tiny(tmp_path / "trained"))
-    return tmp_path / "trained"
+    folder = tmp_path_factory.mktemp("ship") / "trained"
+    train(tiny(folder))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path: Path, trained: Path) -> Path:
+    """A copy of it."""
+    return shutil.copytree(trained, tmp_path / "trained")
 
 
 @pytest.fixture

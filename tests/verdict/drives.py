@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
@@ -72,10 +73,7 @@ def motion(recorded: Trajectory) -> Motion:
 
 def camera(pitch_deg: float = 15.0, centre: FloatArray = CENTRE) -> Camera:
     """A camera that looks ahead and down, 900 px of focal length, 1280 x 720 px."""
-    c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ centre
+    cam_from_vehicle = mounted(centre, pitch_deg)
     intrinsic = np.array([[900.0, 0, 639.5], [0, 900.0, 359.5], [0, 0, 1]])
     info = CameraInfo("front", 1280, 720, intrinsic, "plumb_bob", (-0.1, 0.02, 0.0, 0.0, 0.0))
     return Camera(

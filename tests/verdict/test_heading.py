@@ -53,10 +53,7 @@ WRONG: dict[str, tuple[Spoil, str]] = {
     "axes": (swap_axes, "x and y of the positions are swapped"),
     "quaternions": (w_first, "order qw qx qy qz"),
     "inverse": (lambda r: with_matrices(r, np.linalg.inv(r.map_from_vehicle)), "vehicle_from_map"),
-    "z down": (
-        lambda r: with_matrices(r, r.map_from_vehicle @ np.diag([1.0, -1, -1, 1])),
-        "z axis points down",
-    ),
+    "z down": (lambda r: with_matrices(r, r.map_from_vehicle @ np.diag([1.0, -1, -1, 1])), "z axis points"),
     "camera": (camera_axes, "those of a camera"),
 }
 

@@ -24,24 +24,14 @@ def check(recorded: Trajectory) -> dict[str, str]:
     return raised(check_clocks(drive(poses()), motion(recorded)))
 
 
-def test_twenty_poses_a_second_without_gaps_pass() -> None:
-    assert not check(poses())
-
-
-def test_one_pose_a_second_is_too_few() -> None:
-    assert "poses are 1.00 s apart" in check(every(poses(), np.arange(0, 320, 20)))["pose rate"]
-
-
-def test_a_gap_on_the_way_is_told_with_its_error() -> None:
-    kept = np.delete(np.arange(320), np.arange(100, 120))
-    told = check(every(poses(), kept))
+def test_poses_that_are_few_have_gaps_or_repeat_are_told():
+    recorded = poses()
+    assert not check(recorded)
+    assert "poses are 1.00 s apart" in check(every(recorded, np.arange(0, 320, 20)))["pose rate"]
+    told = check(every(recorded, np.delete(np.arange(320), np.arange(100, 120))))
     assert list(told) == ["pose gaps"]
     assert "gap of 1.05 s" in told["pose gaps"]
-
-
-def test_a_log_faster_than_its_receiver_repeats_poses() -> None:
-    recorded = poses()
-    held = every(recorded, np.arange(320) // 5 * 5)
+    held = every(recorded, np.arange(320) // 5 * 5)  # a log faster than its receiver
     told = check(Trajectory(recorded.stamp_s, held.map_from_vehicle))
     assert list(told) == ["repeated poses"]
     assert "80 %" in told["repeated poses"]
@@ -54,14 +44,12 @@ def test_a_vehicle_that_stands_repeats_poses_and_is_fine() -> None:
     assert not check(Trajectory(np.arange(len(matrices)) / 20, matrices))
 
 
-def test_images_without_pose_are_counted() -> None:
-    some = replace(drive(poses()), unposed={"front": 20})
+@pytest.mark.parametrize(("without", "status"), [(20, Status.WARN), (200, Status.FAIL)])
+def test_images_without_pose_are_counted(without, status):
+    some = replace(drive(poses()), unposed={"front": without})
     found = {finding.check: finding for finding in check_clocks(some, motion(poses()))}["images without pose"]
-    assert found.status is Status.WARN
-    assert "20 of 100 images" in found.says
-    most = replace(some, unposed={"front": 200})
-    found = {finding.check: finding for finding in check_clocks(most, motion(poses()))}["images without pose"]
-    assert found.status is Status.FAIL
+    assert found.status is status
+    assert f"{without} of {80 + without} images" in found.says
 
 
 def test_a_camera_that_stops_early_is_told() -> None:
@@ -113,23 +101,22 @@ def test_a_frozen_picture_is_told_although_its_files_differ(tmp_path: Path) -> N
     assert "100 %" in raised(check_images(pictured(tmp_path, encoded_anew)))["frozen images"]
 
 
-@pytest.mark.parametrize(("grey", "check"), [(255, "bright images"), (2, "dark images")])
-def test_road_that_is_clipped_is_told(grey: int, check: str, tmp_path: Path) -> None:
-    def clipped(k: int) -> np.ndarray:
+@pytest.mark.parametrize(
+    ("rows", "grey", "told"),
+    [
+        (slice(360, None), 255, ["bright images"]),
+        (slice(360, None), 2, ["dark images"]),
+        (slice(150), 255, []),
+    ],
+    ids=["bright road", "dark road", "white sky"],
+)
+def test_road_that_is_clipped_is_told_and_a_white_sky_is_none(rows, grey, told, tmp_path):
+    def clipped(k):
         image = noisy(k)
-        image[360:] = grey
+        image[rows] = grey
         return image
 
-    assert list(raised(check_images(pictured(tmp_path, clipped)))) == [check]
-
-
-def test_a_white_sky_is_no_overexposed_road(tmp_path: Path) -> None:
-    def white_sky(k: int) -> np.ndarray:
-        image = noisy(k)
-        image[:150] = 255
-        return image
-
-    assert not raised(check_images(pictured(tmp_path, white_sky)))
+    assert list(raised(check_images(pictured(tmp_path, clipped)))) == told
 
 
 def test_one_list_of_images_for_two_cameras_is_told(tmp_path: Path) -> None:

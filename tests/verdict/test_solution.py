@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mapping.scene import SceneOptions, extrinsic, make_scene
+from tests.cameras import mounted
+from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, CameraInfo, Drive, HdMap, Marking
@@ -110,29 +111,24 @@ def test_a_bad_fit_is_raised_by_its_own_check(check: str, change: dict[str, obje
     assert set(raised(result(replace(FINE, **change)), drive)) == {check}  # type: ignore[arg-type]
 
 
-def test_markings_that_overlap_are_told_with_a_place(drive: Drive) -> None:
+def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubles(drive):
     apart = [square_at(3.0 * n, 0.0) for n in range(12)]
     found = raised(result(FINE, *apart, square_at(6.4, 0.2)), drive)
     assert set(found) == {"double markings"}
     assert "(6.5, 0.5)" in found["double markings"].says
-
-
-def test_neighbours_of_another_class_or_beside_one_another_are_no_doubles(drive: Drive) -> None:
     other = replace(square_at(0.4, 0.0), kind="stop_line")
     assert raised(result(FINE, square_at(0.0, 0.0), square_at(1.0, 0.0), other), drive) == {}
-
-
-def test_a_third_of_the_candidates_left_out_is_told(drive: Drive) -> None:
     left_out = tuple(Exclusion("diamond", np.zeros(2), 3, "odd shape") for _ in range(12))
     assert set(raised(result(excluded=left_out), drive)) == {"excluded"}
 
 
-def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive: Drive) -> None:
+def calibrated(yaw_deg):
     covariance = np.diag([1e-4] * 3 + [1e-8] * 3)
-    calibrations = {
-        name: Calibration(INFO, extrinsic(yaw, 15.0, 0.0, (1.0, 0.0, 2.4)), covariance)
-        for name, yaw in (("front", 0.0), ("rear", 180.0))
-    }
+    return Calibration(INFO, mounted((1.0, 0.0, 2.4), 15.0, yaw_deg), covariance)
+
+
+def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive):
+    calibrations = {"front": calibrated(0.0), "rear": calibrated(180.0)}
     ahead = drive.images[0].map_from_vehicle[:2, 0] * 0.3
     front = tuple(square_at(3.0 * n, 0.0) for n in range(12))
     rear = tuple(replace(m, corners_map=m.corners_map + ahead) for m in front)
@@ -146,14 +142,10 @@ def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive: Driv
     assert "30 cm ahead of where front does" in found[0].says
 
 
-def test_a_mounting_that_differs_alone_and_together_is_told(drive: Drive) -> None:
-    covariance = np.diag([1e-4] * 3 + [1e-8] * 3)
-    there, turned = (
-        Calibration(INFO, extrinsic(yaw, 15.0, 0.0, (1.0, 0.0, 2.4)), covariance) for yaw in (0.0, 0.2)
-    )
+def test_a_mounting_that_differs_alone_and_together_is_told(drive):
     sets = {
-        "front": {"Opt": result(cameras=("front",), calibrations={"front": turned})},
-        "both": {"Opt": result(calibrations={"front": there})},
+        "front": {"Opt": result(cameras=("front",), calibrations={"front": calibrated(0.2)})},
+        "both": {"Opt": result(calibrations={"front": calibrated(0.0)})},
     }
     found = [f.check for f in check_solution(drive, sets) if f.status is not Status.PASS]
     assert found == ["alone and together"]

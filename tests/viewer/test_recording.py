@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -14,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.ports import run_config
+from v2hdm.cli.main import run as run_command
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.io.calibration import read_calibration
@@ -28,18 +28,11 @@ from v2hdm.records import ImageDetections
 from v2hdm.store.cache import StageCache
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
-ROOT = Path(__file__).parents[2]
 Columns = Mapping[str, list[Any]]
 
 
 def configured(drive: Path, output: Path) -> RunConfig:
-    return RunConfig(
-        name="small",
-        drive=DriveConfig(path=str(drive)),
-        output=str(output),
-        cache=str(output / "cache"),
-        workers=1,
-    )
+    return run_config(drive, output, name="small", cache=str(output / "cache"))
 
 
 @pytest.fixture(scope="module")
@@ -121,15 +114,11 @@ def test_an_unknown_viewer_is_refused() -> None:
         check_viewer("foxglove")
 
 
-def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path: Path) -> None:
-    (tmp_path / "rerun.py").write_text('raise ModuleNotFoundError("not installed", name="rerun")')
-    done = subprocess.run(
-        [sys.executable, "-m", "v2hdm.map", "drive.path=nowhere", "viewer=rerun"],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr == (
+def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["map", "drive.path=nowhere", "viewer=rerun"]) == 2
+    assert capsys.readouterr().err == (
         "error: viewer=rerun needs rerun: install the viewer extra, pip install 'v2hdm[viewer]'\n"
     )
     assert not (tmp_path / "outputs").exists()

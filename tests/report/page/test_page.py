@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, PLACES, SHIFT_PX, make_result, make_site
+from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, SHIFT_PX, make_result, make_site
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
-from v2hdm.io.maps.evidence import COLUMNS, read_residuals
+from v2hdm.io.maps.evidence import COLUMNS
 from v2hdm.records import DIAMOND, Drive, Marking
 from v2hdm.report.outputs import write_json
 from v2hdm.report.page import pictures
@@ -111,17 +111,6 @@ def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result: Pa
     assert found.ground_m[ahead, 1] == pytest.approx(-0.3 * depth_m[ahead] / 500, rel=0.02)
     assert (found.ground_m[ahead, 0] > 0).all()  # 0.2 px up is farther away
     assert found.range_m.max() == pytest.approx(9.5, abs=0.1)
-
-
-def test_a_corner_is_where_its_marking_has_it_in_the_map(result: Path, drive: Drive) -> None:
-    residuals = read_residuals(result / "residuals.csv")
-    facts = read_facts(result, drive)
-    found = ground_residuals(facts)
-    assert found is not None
-    assert facts.hd_map is not None
-    first = (residuals.row_image == 0) & (residuals.marking == 1)
-    feet = found.range_m[first]
-    assert feet == pytest.approx(np.linalg.norm(DIAMOND_M + PLACES[0], axis=1), abs=0.05)
 
 
 def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_first(

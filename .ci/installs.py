@@ -1,4 +1,4 @@
-"""Each extra keeps what the documents promise: ``python -m tests.installs`` installs the wheel and tries it.
+"""Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
 The wheel is built once. An environment begins with the base install and grows to ``[map]``; ``[map,ros]`` and
 ``[map,video]`` stand beside it, each on top of ``[map]`` alone. A page says in its second line what it needs;

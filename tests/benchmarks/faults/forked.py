@@ -16,7 +16,7 @@ from pathlib import Path
 
 import cv2
 
-from tests.faults.failing_calls import Failure, watch
+from tests.benchmarks.faults.failing_calls import Failure, watch
 from tests.faults.judge import LONGEST_S, Case, Ran, run_here
 
 # A fork has none of the threads of OpenCV's pool, and would wait for them when it sets their number.
