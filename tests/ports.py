@@ -1,7 +1,5 @@
 """The rendered ports that tests share: each is rendered once a run, whichever process asks for it first."""
 
-from __future__ import annotations
-
 import fcntl
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,9 +31,7 @@ def small_port(**changes: object) -> PortConfig:
         initial_ipm="estimated",
         route=RouteConfig(pieces=ROUTE, image_spacing_m=2.0),
         yard=YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=1),
-        cameras={
-            "front": replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0),
-        },
+        cameras={"front": replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)},
     )
     return replace(port, **changes)  # type: ignore[arg-type]
 

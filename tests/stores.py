@@ -1,7 +1,5 @@
 """Stores to test against: one in memory, and an S3 server on this machine where moto is installed."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The commands: a list of them, their versions, and one line for Ctrl-C or a missing library."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -30,7 +28,7 @@ finally:
 """
 
 
-def run_command(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_command(folder, *arguments, **variables):
     """A command that finds modules of ``folder`` in place of those of the same name."""
     environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"} | variables
     command = [sys.executable, "-m", *arguments]
@@ -57,7 +55,7 @@ NEEDED = {
 
 
 @pytest.mark.parametrize("number", range(len(NEEDED)))
-def test_an_interruption_while_libraries_are_loaded_is_one_line(number, tmp_path) -> None:
+def test_an_interruption_while_libraries_are_loaded_is_one_line(number, tmp_path):
     line, (_, slow, _) = list(NEEDED.items())[number]
     signal = "SIGINT" if number % 2 else "SIGTERM"
     (tmp_path / f"{slow}.py").write_text(PRESSED_TWICE.format(signal=signal))
@@ -68,7 +66,7 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(number, tmp_path
 
 
 @pytest.mark.parametrize("line", [line for line, (extra, *_) in NEEDED.items() if extra])
-def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(line, tmp_path) -> None:
+def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(line, tmp_path):
     extra, _, missing = NEEDED[line]
     text = f'raise ModuleNotFoundError("not installed", name="{missing}")'
     (tmp_path / f"{missing}.py").write_text(text)
@@ -83,7 +81,7 @@ def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(line, 
 @pytest.mark.parametrize(
     "arguments", [("v2hdm.map", "--help"), ("v2hdm", "detect", "--help"), ("v2hdm", "--help")]
 )
-def test_help_that_nobody_reads_to_its_end_is_no_error(arguments: tuple[str, ...]) -> None:
+def test_help_that_nobody_reads_to_its_end_is_no_error(arguments):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as closed:
@@ -103,9 +101,7 @@ def test_openmp_waits_without_spinning_unless_the_user_says_so(given, expected, 
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 
 
-def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(capsys):
     assert run([]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
     assert {line.split("  ")[1].strip() for line in lines} == set(COMMANDS)
@@ -121,7 +117,7 @@ def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_explains_each_command_and_names_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_explains_each_command_and_names_it(name, capsys):
     with suppress(SystemExit):  # of argparse
         assert run([*name.split(), "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
@@ -153,7 +149,7 @@ import v2hdm.verdict.check
 """
 
 
-def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_on_a_vehicle(tmp_path) -> None:
+def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_on_a_vehicle(tmp_path):
     """The library, help, the detector, the store and the checks, in one process from light to heavy."""
     (tmp_path / "probe.py").write_text(IMPORTS)
     done = run_command(tmp_path, "probe")
@@ -165,7 +161,7 @@ OLD = {"extrinsic": "calibrate ground", "calibration": "calibrate compare", "cal
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_every_console_script_is_a_command_old_names_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_console_script_is_a_command_old_names_too(name, monkeypatch):
     script = EntryPoint(name, SCRIPTS[name], "console_scripts").load()
     asked: list[list[str]] = []
     monkeypatch.setattr("v2hdm.cli.main.answer_signals", lambda: None)
@@ -180,21 +176,21 @@ def test_every_console_script_is_a_command_old_names_too(name: str, monkeypatch:
 @pytest.mark.parametrize(
     "how", [["v2hdm"], ["v2hdm", "map"], ["v2hdm.map"], ["v2hdm", "calibrate", "ground"]]
 )
-def test_every_command_reports_the_version(how: list[str], tmp_path: Path) -> None:
+def test_every_command_reports_the_version(how, tmp_path):
     line = f"v2hdm {re.escape(__version__)}, (torch|no torch).*, (onnxruntime|no onnx).*, (numba|no numba).*"
     told = run_command(tmp_path, *how, "--version").stdout
     assert re.fullmatch(line + ", weights [0-9a-f]{8}\n", told)
 
 
-def test_a_version_is_told_where_libraries_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> str:
+def test_a_version_is_told_where_libraries_are_missing(monkeypatch):
+    def absent(name):
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", absent)
     assert version_line().startswith(f"v2hdm {__version__}, no torch, no onnxruntime, no numba, weights ")
 
 
-def test_every_file_that_states_the_version_states_the_same() -> None:
+def test_every_file_that_states_the_version_states_the_same():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert project["version"] == citation["version"] == __version__

@@ -1,12 +1,9 @@
 """The library: its names are documented with examples that run, and importing it loads nothing."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import inspect
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +23,7 @@ SETTINGS = {"DetectorOptions", "MappingOptions", "ReadOptions", "V2hdmError"}
 
 
 @pytest.fixture(scope="session")
-def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def names(tmp_path_factory):
     """What the examples name: the library, a rendered drive, its result, and a folder to write to."""
     folder = tmp_path_factory.mktemp("library")
     port = v2hdm.simulate_port(folder)
@@ -38,7 +35,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", sorted(set(v2hdm.__all__) - SETTINGS))
-def test_the_examples_of_each_public_name_run(name: str, names: dict[str, Any]) -> None:
+def test_the_examples_of_each_public_name_run(name, names):
     documented = getattr(v2hdm, name)
     own = documented.to_geodataframe if name == "HDMap" else None
     if own is not None:
@@ -53,7 +50,7 @@ def test_the_examples_of_each_public_name_run(name: str, names: dict[str, Any]) 
         assert runner.run(test, out=said.append).failed == 0, "".join(said)
 
 
-def test_the_library_has_the_names_that_it_promises() -> None:
+def test_the_library_has_the_names_that_it_promises():
     assert set(v2hdm.__all__) >= ASKED
     assert set(dir(v2hdm)) >= set(v2hdm.__all__)
     tree = ast.parse(inspect.getsource(v2hdm))
@@ -68,7 +65,7 @@ def test_the_library_has_the_names_that_it_promises() -> None:
         _ = v2hdm.nothing
 
 
-def test_what_is_saved_is_what_the_command_writes(names: dict[str, Any], tmp_path: Path) -> None:
+def test_what_is_saved_is_what_the_command_writes(names, tmp_path):
     from v2hdm.cli.main import run
 
     saved = names["result"].save(tmp_path / "saved")
@@ -82,7 +79,7 @@ def test_what_is_saved_is_what_the_command_writes(names: dict[str, Any], tmp_pat
         assert (saved / name).read_bytes() == (tmp_path / "run" / name).read_bytes(), name
 
 
-def test_nothing_is_left_by_a_mapping(names: dict[str, Any], tmp_path: Path, monkeypatch: Any) -> None:
+def test_nothing_is_left_by_a_mapping(names, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     v2hdm.check_drive(names["port"], ground=False)
     v2hdm.map_drive(names["port"].root, workers=1, options=v2hdm.MappingOptions(max_range_m=9.0))

@@ -1,7 +1,5 @@
 """A synthetic site: a street of which each drive has a stretch, and shares its ends."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

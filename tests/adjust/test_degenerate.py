@@ -12,7 +12,6 @@ from v2hdm.adjust import (
     KnownLengths,
     Observations,
     PoseSigma,
-    Problem,
     SolveOptions,
     Status,
     solve,
@@ -22,21 +21,21 @@ from v2hdm.errors import AdjustError
 PAPER = SolveOptions(pose_states=(), loss="none")
 
 
-def street(**changes) -> Problem:
+def street(**changes):
     return make_scene(1, frames=30, **changes).problem
 
 
-def with_observations(problem: Problem, **changes) -> Problem:
+def with_observations(problem, **changes):
     return replace(problem, observations=replace(problem.observations, **changes))
 
 
-def changed(values: np.ndarray, index, value) -> np.ndarray:
+def changed(values, index, value):
     out = values.copy()
     out[index] = value
     return out
 
 
-def lengths(first=(0, 4), second=(1, 6), length_m=(0.5, 0.7), sigma_m=(0.01, 0.01)) -> KnownLengths:
+def lengths(first=(0, 4), second=(1, 6), length_m=(0.5, 0.7), sigma_m=(0.01, 0.01)):
     return KnownLengths(np.array(first), np.array(second), np.array(length_m), np.array(sigma_m))
 
 
@@ -57,7 +56,7 @@ def bad_lengths():
     }
 
 
-def seen_in(problem: Problem, keep: np.ndarray) -> Problem:
+def seen_in(problem, keep):
     """Only the observations ``keep``, all of them of camera 0, and the corners that these are of."""
     corners, corner = np.unique(problem.observations.corner[keep], return_inverse=True)
     observations = replace(rows_of(problem.observations, keep), corner=corner)
@@ -149,7 +148,7 @@ def test_an_extrinsic_that_looks_at_the_sky_is_refused_with_advice():
         solve(replace(problem, cam_from_vehicle=mounted(1.5, 2.4, -80)[None]))
 
 
-def finite(solution) -> bool:
+def finite(solution):
     parts = (solution.cam_from_vehicle, solution.map_from_vehicle, solution.corners_map, solution.residual_px)
     return all(
         bool(np.isfinite(part).all()) for part in (*parts, solution.weight, solution.extrinsic_covariance)

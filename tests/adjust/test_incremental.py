@@ -5,17 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.adjust.scene import Scene, make_scene, rows_of
-from v2hdm.adjust import (
-    ControlPoints,
-    Drift,
-    KnownLengths,
-    Observations,
-    PoseSigma,
-    Problem,
-    SolveOptions,
-    solve,
-)
+from tests.adjust.scene import make_scene, rows_of
+from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.errors import AdjustError
 
@@ -24,22 +15,22 @@ JITTER = PoseSigma(position_m=0.01, heading_rad=0.001, roll_pitch_rad=0.002, hei
 DRIFTING = replace(JITTER, position_m=0.012, position_drift=Drift(0.01, 20.0))
 
 
-def street(**changes) -> Scene:
+def street(**changes):
     return make_scene(3, **{"frames": 60, "start_error_deg": 1.0, "min_views": 4, **changes})
 
 
-def part(seen: Observations, rows: np.ndarray, first: int = 0) -> Observations:
+def part(seen, rows, first=0):
     return replace(rows_of(seen, rows), corner=seen.corner[rows] - first)
 
 
-def whole_markings(problem: Problem) -> Problem:
+def whole_markings(problem):
     """Without the last corners that make no four."""
     count = problem.corner_count // 4 * 4
     rows = np.flatnonzero(problem.observations.corner < count)
     return replace(problem, corner_count=count, observations=part(problem.observations, rows))
 
 
-def known_beside(problem: Problem, truth: np.ndarray) -> Problem:
+def known_beside(problem, truth):
     """With a side of every marking and two surveyed corners of every third one."""
     first = np.arange(0, problem.corner_count, 4)
     surveyed = np.concatenate([first[::3], first[::3] + 2])
@@ -51,7 +42,7 @@ def known_beside(problem: Problem, truth: np.ndarray) -> Problem:
     )
 
 
-def by_marking(problem: Problem) -> list[Sighted]:
+def by_marking(problem):
     """Four corners each, in the order of their numbers, with what the problem knows of them."""
     seen, out = problem.observations, []
     for first in range(0, problem.corner_count - 3, 4):
@@ -70,14 +61,14 @@ def by_marking(problem: Problem) -> list[Sighted]:
     return out
 
 
-def grow(problem: Problem, options: SolveOptions = PAPER) -> IncrementalMap:
+def grow(problem, options=PAPER):
     grown = IncrementalMap(problem, options)
     for marking, sighted in enumerate(by_marking(problem)):
         grown.observe(marking, sighted)
     return grown
 
 
-def farthest(grown: IncrementalMap, problem: Problem, options: SolveOptions) -> float:
+def farthest(grown, problem, options):
     """Of all corners' coordinates, how far from the batch optimum at most, in standard deviations."""
     best = solve(problem, options)
     groups = np.arange(problem.corner_count).reshape(-1, 4)

@@ -1,20 +1,16 @@
 """Score tests of wrong inputs, against solving with the input freed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.adjust.scene import Scene, make_scene, with_late_clocks
+from tests.adjust.scene import make_scene, with_late_clocks
 from v2hdm.adjust import (
     ControlPoints,
     Fault,
     KnownLengths,
     PoseSigma,
-    Problem,
-    ScoreTest,
     SolveOptions,
     pose_innovations,
     score_faults,
@@ -25,28 +21,28 @@ OPTIONS = SolveOptions(coarse=False, loss="none")
 POSES = PoseSigma(0.01, 0.001, 0.002, 0.005)
 
 
-def scene(seed: int = 3) -> Scene:
+def scene(seed=3):
     return make_scene(seed, frames=60, every_m=3.0, jitter=POSES, start_error_deg=0.5)
 
 
-def found_of(problem: Problem, fault: Fault, camera: int, axis: int = 0) -> ScoreTest:
+def found_of(problem, fault, camera, axis=0):
     found = score_faults(problem, solve(problem, OPTIONS))
     (one,) = [s for s in found if (s.fault, s.camera, s.axis) == (fault, camera, axis)]
     return one
 
 
-def with_focal(problem: Problem, factor: float) -> Problem:
+def with_focal(problem, factor):
     intrinsic = problem.intrinsic.copy()
     intrinsic[:, :2] *= factor
     return replace(problem, intrinsic=intrinsic)
 
 
-def test_a_right_problem_contradicts_nothing() -> None:
+def test_a_right_problem_contradicts_nothing():
     problem = scene().problem
     assert all(one.sigmas < 4 for one in score_faults(problem, solve(problem, OPTIONS)))
 
 
-def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() -> None:
+def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
     problem = with_focal(scene().problem, 1.002)
     step = 5e-4
     low, middle, high = (2 * solve(with_focal(problem, 1 + p), OPTIONS).cost for p in (-step, 0.0, step))
@@ -58,7 +54,7 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() 
     assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
 
 
-def test_a_late_clock_is_found_and_named_first() -> None:
+def test_a_late_clock_is_found_and_named_first():
     late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
     found = score_faults(late, solve(late, OPTIONS))
     assert (found[0].fault, found[0].camera) == (Fault.CLOCK, 0)
@@ -66,7 +62,7 @@ def test_a_late_clock_is_found_and_named_first() -> None:
     assert found[0].sigmas > 10
 
 
-def test_a_survey_is_held_against_what_the_drive_says_without_it() -> None:
+def test_a_survey_is_held_against_what_the_drive_says_without_it():
     problem = scene().problem
     assert problem.centre_vehicle is not None
     centre = problem.centre_vehicle + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
@@ -81,7 +77,7 @@ def test_a_survey_is_held_against_what_the_drive_says_without_it() -> None:
     assert one.sigmas > 5
 
 
-def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses() -> None:
+def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses():
     problem = scene().problem
     assert problem.centre_vehicle is not None
     off = replace(problem, centre_vehicle=problem.centre_vehicle + np.array([1.2, 0.0, 0.0]))
@@ -90,7 +86,7 @@ def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses() -> 
     assert first.value == pytest.approx(-1.2, abs=0.1)
 
 
-def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_has() -> None:
+def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_has():
     street = scene()
     side_m = 0.35 * 2**0.5
     corners = street.corners_map
@@ -102,7 +98,7 @@ def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_ha
     assert one.value == pytest.approx(0.05, abs=0.005)
 
 
-def test_one_surveyed_point_off_is_told_from_all_off() -> None:
+def test_one_surveyed_point_off_is_told_from_all_off():
     street = scene()
     chosen = np.arange(0, len(street.corners_map), 12)
     points = street.corners_map[chosen].copy()
@@ -113,7 +109,7 @@ def test_one_surveyed_point_off_is_told_from_all_off() -> None:
     assert one.value == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_less() -> None:
+def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_less():
     problem = scene().problem
     vague = replace(
         problem,
@@ -129,7 +125,7 @@ def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_
     assert (np.median(seen, axis=0) < 0.7 * stated).all()
 
 
-def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not() -> None:
+def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not():
     problem = scene().problem
     right = pose_innovations(solve(problem, OPTIONS)).rms()
     assert max(right.values()) < 1.2
@@ -137,7 +133,7 @@ def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_mor
     assert pose_innovations(solve(small, OPTIONS)).rms()["heading"] > 1.4
 
 
-def test_observations_that_the_loss_has_switched_off_do_not_vote() -> None:
+def test_observations_that_the_loss_has_switched_off_do_not_vote():
     """Wrong associations put corners into the camera's plane, where residuals and derivatives are huge."""
     street = scene()
     problem, seen = street.problem, street.problem.observations

@@ -8,14 +8,13 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.adjust.scene import Scene, make_scene, rows_of, with_late_clocks
+from tests.adjust.scene import make_scene, rows_of, with_late_clocks
 from v2hdm.adjust import (
     ControlPoints,
     Drift,
     KnownLengths,
     Observations,
     PoseSigma,
-    Problem,
     SolveOptions,
     Status,
     solve,
@@ -26,7 +25,7 @@ POSES = PoseSigma()
 REAL = PoseSigma(position_m=0.02, heading_rad=0.0017, roll_pitch_rad=0.005, height_m=0.01)
 
 
-def reference_residuals(problem: Problem, x: np.ndarray) -> np.ndarray:
+def reference_residuals(problem, x):
     """The model of the problem's docstring, written anew in plain numpy: all residuals, flat."""
     cameras, frames, count = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
     extrinsic, state, corners = np.split(x, [6 * cameras, len(x) - 2 * count])
@@ -57,7 +56,7 @@ def reference_residuals(problem: Problem, x: np.ndarray) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def reference_optimum(scene: Scene) -> float:
+def reference_optimum(scene):
     """The least cost that scipy finds from the truth."""
     problem = scene.problem
     turn = scene.cam_from_vehicle[:, :3, :3] @ problem.cam_from_vehicle[:, :3, :3].transpose(0, 2, 1)
@@ -68,7 +67,7 @@ def reference_optimum(scene: Scene) -> float:
     return float(least_squares(partial(reference_residuals, problem), start, **exact).cost)
 
 
-def sides(scene: Scene, sigma_m: float, error_m: float = 0.0) -> KnownLengths:
+def sides(scene, sigma_m, error_m=0.0):
     """Two sides and a diagonal of every other diamond of which all corners are seen, off by ``error_m``."""
     corners = scene.corners_map
     whole = [k for k in range(len(corners) - 3) if np.ptp(corners[k : k + 4], axis=0).max() < 0.75][::2]
@@ -237,7 +236,7 @@ def test_two_control_points_undo_the_drift_of_the_receiver():
     assert tied.chi2_per_dof == pytest.approx(1, abs=0.07)
 
 
-def far_marking(seed: int) -> tuple[Scene, np.ndarray]:
+def far_marking(seed):
     """A street on which one diamond, the corners that are returned, is only seen from beyond 18 m."""
     scene = make_scene(seed, frames=60, max_range_m=30.0, cameras=1, prior_sigma_m=0.005, start_error_deg=1.0)
     seen, corners = scene.problem.observations, scene.corners_map

@@ -1,7 +1,5 @@
 """Ten surveyed points before a camera whose mounting is known, projected by OpenCV."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -4,8 +4,6 @@
 lens, a Gaussian point spread, noise, sRGB coding. It shares no code with the package's renderer or fits.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from functools import lru_cache

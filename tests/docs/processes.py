@@ -3,8 +3,6 @@
 Run as a program it is that process: ``python processes.py SOCKET``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Bags of a drive folder, written with rosbags' own writers, for the tests of reading them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A small but complete drive with two cameras, for the tests of reading and writing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every way in which a drive can be damaged gets one line: what, where, what to do."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +17,8 @@ from v2hdm.io.drive.truth import read_truth
 Damage = Callable[[Path], None]
 
 
-def edit(file: str, pattern: str, replacement: str) -> Damage:
-    def damage(root: Path) -> None:
+def edit(file, pattern, replacement):
+    def damage(root):
         text = (root / file).read_text()
         changed = re.sub(pattern, replacement, text, count=1, flags=re.MULTILINE)
         assert changed != text
@@ -29,10 +27,10 @@ def edit(file: str, pattern: str, replacement: str) -> Damage:
     return damage
 
 
-def front(**changes: object) -> Damage:
+def front(**changes):
     """Change entries of the front camera in ``drive.yaml``; None removes one."""
 
-    def damage(root: Path) -> None:
+    def damage(root):
         content = yaml.safe_load((root / "drive.yaml").read_text())
         entry = content["cameras"]["front"]
         for key, value in changes.items():
@@ -44,19 +42,19 @@ def front(**changes: object) -> Damage:
     return damage
 
 
-def write(file: str, text: str) -> Damage:
+def write(file, text):
     return lambda root: (root / file).write_text(text) and None
 
 
-def remove(file: str) -> Damage:
+def remove(file):
     return lambda root: (root / file).unlink()
 
 
-def truncate(file: str, size: int) -> Damage:
+def truncate(file, size):
     return lambda root: (root / file).write_bytes((root / file).read_bytes()[:size]) and None
 
 
-def shrink_image(root: Path) -> None:
+def shrink_image(root):
     cv2.imwrite(str(root / "front/images/000001.jpg"), np.zeros((24, 32, 3), np.uint8))
 
 
@@ -126,7 +124,7 @@ CASES: dict[str, tuple[Damage, str]] = {
 
 
 @pytest.mark.parametrize(("damage", "message"), CASES.values(), ids=CASES.keys())
-def test_a_damaged_drive_is_refused_in_one_line(tmp_path: Path, damage: Damage, message: str) -> None:
+def test_a_damaged_drive_is_refused_in_one_line(tmp_path, damage, message):
     make_drive(tmp_path)
     damage(tmp_path)
     with pytest.raises(DriveError, match=message) as caught:
@@ -134,7 +132,7 @@ def test_a_damaged_drive_is_refused_in_one_line(tmp_path: Path, damage: Damage, 
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(DriveError, match="nowhere: no such drive folder"):
         read_drive(tmp_path / "nowhere")
 
@@ -147,7 +145,7 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
         (ReadOptions(max_gap_s=0.0), "max_gap_s is 0"),
     ],
 )
-def test_impossible_wishes_are_refused(tmp_path: Path, options: ReadOptions, message: str) -> None:
+def test_impossible_wishes_are_refused(tmp_path, options, message):
     make_drive(tmp_path)
     with pytest.raises(DriveError, match=message):
         read_drive(tmp_path, options)
@@ -163,7 +161,7 @@ def test_impossible_wishes_are_refused(tmp_path: Path, options: ReadOptions, mes
         (edit("truth/cameras.yaml", "rear", "back"), "camera 'rear': missing"),
     ],
 )
-def test_damaged_truth_is_refused(tmp_path: Path, damage: Damage, message: str) -> None:
+def test_damaged_truth_is_refused(tmp_path, damage, message):
     make_drive(tmp_path)
     damage(tmp_path)
     with pytest.raises(DriveError, match=message):
@@ -178,9 +176,7 @@ def test_damaged_truth_is_refused(tmp_path: Path, damage: Damage, message: str) 
         ([[0.5, -1.0], [1.5, -1.0], [1.5, 1.0], [0.5, 1.0]], "lies outside the image"),
     ],
 )
-def test_a_region_that_the_camera_does_not_see_is_named_for_that(
-    tmp_path: Path, roi: list[list[float]], cause: str
-) -> None:
+def test_a_region_that_the_camera_does_not_see_is_named_for_that(tmp_path, roi, cause):
     make_drive(tmp_path)
     front(roi_vehicle=roi)(tmp_path)
     with pytest.raises(DriveError, match=f"camera 'front', roi_vehicle: {cause}"):
@@ -188,9 +184,7 @@ def test_a_region_that_the_camera_does_not_see_is_named_for_that(
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_region_of_which_the_image_shows_a_part_is_taken_whatever_the_sign_of_the_ipm(
-    tmp_path: Path, sign: float
-) -> None:
+def test_a_region_of_which_the_image_shows_a_part_is_taken_whatever_the_sign_of_the_ipm(tmp_path, sign):
     make_drive(tmp_path)
     content = yaml.safe_load((tmp_path / "drive.yaml").read_text())
     ipm = {name: (sign * np.array(m)).tolist() for name, m in content["cameras"]["front"]["ipm"].items()}

@@ -1,7 +1,5 @@
 """All bad inputs and situations, as a table; `python -m tests.benchmarks.bad_inputs` runs it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

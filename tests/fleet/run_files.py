@@ -1,7 +1,5 @@
 """Run files of fleets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

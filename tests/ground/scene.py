@@ -1,7 +1,5 @@
 """A drive over a flat, rough floor, small enough for a test: every pixel is looked up where its ray lands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,16 +11,7 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.records import (
-    Camera,
-    CameraInfo,
-    CentrePrior,
-    Drive,
-    FloatArray,
-    Image,
-    PoseNoise,
-    Trajectory,
-)
+from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray, Image, PoseNoise, Trajectory
 
 INFO = CameraInfo(
     "front", 480, 320, np.array([[340.0, 0, 239.5], [0, 340.0, 159.5], [0, 0, 1]]), "plumb_bob",

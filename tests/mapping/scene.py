@@ -4,8 +4,6 @@ Everything is drawn from one generator, so a seed names a scene. The truth stays
 gets a :class:`v2hdm.records.Drive` and detections.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,13 +1,11 @@
 """Tracks stay pure under a wrong IPM; merging joins what is one marking and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.mapping.scene import Scene, SceneOptions, make_scene
+from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.association.ground import Located, locate
 from v2hdm.association.groups import (
     Association,
@@ -18,7 +16,7 @@ from v2hdm.association.groups import (
     same_groups,
 )
 from v2hdm.association.options import AssociationOptions
-from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.geometry.quadrilateral import align
 from v2hdm.mapping.bundle import vehicle_twists
@@ -28,16 +26,16 @@ MAX_RANGE_M = 16.0
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return make_scene(SceneOptions(length_m=80.0, seed=11, false_rate=0.0))
 
 
 @pytest.fixture(scope="module")
-def sightings(scene: Scene) -> Sightings:
+def sightings(scene):
     return collect_sightings(scene.drive, scene.detections, ("front", "rear"))
 
 
-def true_rig(scene: Scene, sightings: Sightings) -> Rig:
+def true_rig(scene, sightings):
     rig = initial_rig(scene.drive.cameras, sightings.map_from_vehicle)
     truth = np.stack([scene.cam_from_vehicle[name] for name in sightings.cameras])
     return Rig(rig.intrinsic, truth, sightings.map_from_vehicle)
@@ -47,7 +45,7 @@ MERGING = {"floor_m": 0.05, "gate_sigmas": 4.0, "max_distance_m": 1.5, "shape_to
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
-def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
+def true_marking(scene, sightings):
     """Index of the marking (S,) that each sighting shows, by its corners under the true extrinsic."""
     located = locate(sightings, true_rig(scene, sightings))
     corners = np.stack([m.corners_map for m in scene.markings])
@@ -56,14 +54,14 @@ def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
     return np.nanmean(distance, axis=2).argmin(axis=1)
 
 
-def located_at(corners: np.ndarray, ray: np.ndarray) -> Located:
+def located_at(corners, ray):
     """Corners (n, 4, 2) that are known to a centimetre, along such rays."""
     count, everywhere = len(corners), np.ones((len(corners), 4), bool)
     covariance = np.tile(np.eye(2) * 1e-4, (count, 4, 1, 1))
     return Located(corners, covariance, ray, np.full(count, 2.4), everywhere, everywhere)
 
 
-def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Association, Located]:
+def tracks_under(rig, sightings, sigma_rad):
     located = locate(sightings, rig)
     near = located.range_m <= MAX_RANGE_M
     located = replace(located, valid=located.valid & near, informs=located.informs & near)
@@ -86,7 +84,7 @@ def test_no_track_mixes_two_markings_and_all_are_long_although_images_miss_some(
     assert np.median(np.bincount(tracks.group[grouped])) >= 8
 
 
-def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings, tracks: Association) -> None:
+def test_corner_orders_agree_within_a_track(scene, sightings, tracks):
     located = locate(sightings, true_rig(scene, sightings))
     true_corners = np.stack([m.corners_map for m in scene.markings])[true_marking(scene, sightings)]
     whole = np.ones((len(sightings), 4), dtype=bool)
@@ -99,7 +97,7 @@ def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings, 
     assert votes.max(axis=1).sum() >= 0.99 * votes.sum()
 
 
-def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings) -> None:
+def test_merging_leaves_one_group_per_marking(scene, sightings):
     rig = true_rig(scene, sightings)
     tracks, located = tracks_under(rig, sightings, 0.002)
     merged = merge_groups(tracks, sightings, fuse_groups(tracks, located, 0.0017), **MERGING)
@@ -113,14 +111,14 @@ def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings
     assert merged.count < tracks.count
 
 
-def test_two_markings_of_one_image_are_never_merged(sightings: Sightings) -> None:
+def test_two_markings_of_one_image_are_never_merged(sightings):
     together = sightings.subset(np.flatnonzero(sightings.image == sightings.image[0])[:2])
     association, corners = Association(np.array([0, 1]), np.zeros(2, int), 2), np.tile(SQUARE, (2, 1, 1))
     fused = fuse_groups(association, located_at(corners, corners + 5), 0.001)
     assert merge_groups(association, together, fused, **MERGING).count == 2
 
 
-def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_other_numbers() -> None:
+def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_other_numbers():
     association = Association(np.array([0, 1, 2, 1, -1]), np.arange(5) % 4, 3)
     kept = keep_rows(association, np.array([False, True, True, True, True]))
     assert (kept.group.tolist(), kept.count) == ([-1, 0, 1, 0, -1], 2)
@@ -132,7 +130,7 @@ def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_othe
     assert not same_groups(a, c)
 
 
-def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
+def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones():
     corners, ray = np.tile(SQUARE, (4, 1, 1)), np.full((4, 4, 2), 4.0)
     corners[3] += 0.8
     ray[3] = 14.0
@@ -140,7 +138,7 @@ def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
     assert np.abs(fused.corners_map[0] - corners[0]).max() < 0.02
 
 
-def test_merging_no_groups_gives_none(scene: Scene, sightings: Sightings) -> None:
+def test_merging_no_groups_gives_none(scene, sightings):
     none = keep_rows(
         tracks_under(true_rig(scene, sightings), sightings, 0.001)[0], np.zeros(len(sightings), dtype=bool)
     )
@@ -152,7 +150,7 @@ def test_merging_no_groups_gives_none(scene: Scene, sightings: Sightings) -> Non
     assert (merged.group == -1).all()
 
 
-def test_a_steady_turn_has_one_twist_everywhere() -> None:
+def test_a_steady_turn_has_one_twist_everywhere():
     """5 m/s on a circle of 10 m radius: half a radian a second to the left."""
     stamp_s = np.array([0.0, 0.2, 0.5, 0.6, 1.0])
     heading = 0.5 * stamp_s
@@ -164,5 +162,5 @@ def test_a_steady_turn_has_one_twist_everywhere() -> None:
     np.testing.assert_allclose(vehicle_twists(poses, stamp_s), expected, atol=1e-9)
 
 
-def test_a_single_pose_stands_still() -> None:
+def test_a_single_pose_stands_still():
     np.testing.assert_array_equal(vehicle_twists(np.eye(4)[None], np.zeros(1)), np.zeros((1, 6)))

@@ -3,8 +3,6 @@
 The images are made pixel by pixel from the ground, the other way round than the mosaic is.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

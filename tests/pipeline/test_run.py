@@ -1,11 +1,8 @@
 """The main job on a short rendered drive: images and poses in, map and calibrations out."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -25,22 +22,24 @@ from v2hdm.io.maps.evidence import read_residuals
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.result import write_trajectories
 from v2hdm.pipeline.run import run
-from v2hdm.records import Trajectory
+from v2hdm.records import Drive, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.verdict import Status
 
 
 @pytest.fixture(scope="module")
-def result(short_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(short_drive, tmp_path_factory):
     output = tmp_path_factory.mktemp("outputs")
     return run(run_config(short_drive, output, export=list(FORMATS), mosaic=True)).folder
 
 
 @pytest.mark.slow
-def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
+def test_every_method_is_judged_on_every_camera_set(result):
     metrics = json.loads((result / "metrics.json").read_text())
     assert set(metrics["results"]) == {"front", "rear", "both"}
     for methods in metrics["results"].values():
@@ -51,7 +50,7 @@ def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
     assert metrics["disturbances"]
 
 
-def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
+def test_a_good_drive_passes_and_every_file_says_so(result):
     verdict = json.loads((result / "metrics.json").read_text())["verdict"]
     assert verdict["status"] == "PASS", verdict["findings"]
     assert {"heading", "clock", "ground match"} <= {
@@ -62,9 +61,7 @@ def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
     assert "verdict: PASS" in (result / "run.log").read_text()
 
 
-def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
-    small_drive: Path, tmp_path: Path
-) -> None:
+def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(small_drive, tmp_path):
     drive = blind_copy(small_drive, tmp_path / "north")
     recorded = read_tum(drive / "poses.tum")
     poses = recorded.map_from_vehicle.copy()
@@ -79,7 +76,7 @@ def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
     assert metrics["verdict"]["status"] == "FAIL"
 
 
-def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> None:
+def test_the_optimisation_repairs_another_vehicles_calibration(result):
     metrics = json.loads((result / "metrics.json").read_text())
     both = metrics["results"]["both"]
     assert both["ENI"]["corner_rmse_m"] > 0.2
@@ -90,7 +87,7 @@ def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> 
         assert metrics["extrinsics"][camera]["rotation_error_deg"] < 0.2
 
 
-def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
+def test_the_files_of_a_result_can_be_read_back(result):
     hd_map = read_geojson(result / "map.geojson")
     metrics = json.loads((result / "metrics.json").read_text())
     assert len(hd_map.markings) == metrics["results"]["both"]["Opt"]["markings"]
@@ -118,7 +115,7 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
     assert "detected" in (result / "run.log").read_text()
 
 
-def test_paint_seen_from_above_is_sharp_after_the_optimisation(result: Path) -> None:
+def test_paint_seen_from_above_is_sharp_after_the_optimisation(result):
     sharpness = json.loads((result / "mosaic.json").read_text())["sharpness"]
     assert sharpness["edges"] > 20
     assert sharpness["edge_width_after_m"] < 0.08
@@ -126,7 +123,7 @@ def test_paint_seen_from_above_is_sharp_after_the_optimisation(result: Path) -> 
     assert cv2.imread(str(result / "mosaic_before_after.png")) is not None
 
 
-def test_lane_lines_run_as_the_drive_passed_them(result: Path, short_drive: Path) -> None:
+def test_lane_lines_run_as_the_drive_passed_them(result, short_drive):
     poses = np.array([image.map_from_vehicle for image in read_drive(short_drive).images])
     lanes = read_geojson(result / "map.geojson").lanes
     assert lanes
@@ -137,7 +134,7 @@ def test_lane_lines_run_as_the_drive_passed_them(result: Path, short_drive: Path
         assert (steps * headings).sum() > 0
 
 
-def blind_copy(drive: Path, target: Path) -> Path:
+def blind_copy(drive, target):
     """The drive, whose truth nobody knows."""
     shutil.copytree(drive, target, ignore=shutil.ignore_patterns("truth"))
     with description(target) as content:
@@ -154,9 +151,7 @@ def blind_copy(drive: Path, target: Path) -> Path:
     ],
     ids=["missing", "truncated", "of another size"],
 )
-def test_a_wrong_image_is_named_and_leaves_nothing_behind(
-    spoil: Callable[[Path], object], says: str, small_drive: Path, tmp_path: Path
-) -> None:
+def test_a_wrong_image_is_named_and_leaves_nothing_behind(spoil, says, small_drive, tmp_path):
     drive, output = blind_copy(small_drive, tmp_path / "drive"), tmp_path / "out"
     image = sorted(drive.rglob("*.jpg"))[2]
     spoil(image)
@@ -166,9 +161,7 @@ def test_a_wrong_image_is_named_and_leaves_nothing_behind(
     assert not output.exists() or not any(output.iterdir())
 
 
-def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
-    small_drive: Path, tmp_path: Path
-) -> None:
+def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(small_drive, tmp_path):
     drive = blind_copy(small_drive, tmp_path / "drive")
     for image in drive.rglob("*.jpg"):
         cv2.imwrite(str(image), np.full((360, 640, 3), 90, np.uint8))
@@ -198,15 +191,13 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
         ({"export": ["geojson", "shp"]}, "export: unknown format 'shp'"),
     ],
 )
-def test_what_cannot_work_is_refused_before_anything_is_read(
-    tmp_path: Path, changes: dict[str, object], named: str
-) -> None:
+def test_what_cannot_work_is_refused_before_anything_is_read(tmp_path, changes, named):
     with pytest.raises((ConfigError, DetectorError), match=re.escape(named)):
         run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_a_name_has_that_of_its_drive(small_drive: Path, tmp_path: Path) -> None:
+def test_a_run_without_a_name_has_that_of_its_drive(small_drive, tmp_path):
     drive = blind_copy(small_drive, tmp_path / "folder")
     assert run_name(run_config(drive, tmp_path, name=None)) == "small"
     with description(drive) as content:
@@ -215,12 +206,41 @@ def test_a_run_without_a_name_has_that_of_its_drive(small_drive: Path, tmp_path:
     assert run_name(run_config(drive, tmp_path, name="given")) == "given"
 
 
-def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:
+def test_a_run_that_both_renders_and_reads_is_refused(tmp_path):
     config = run_config(tmp_path, tmp_path / "out", simulate=short_port())
     with pytest.raises(ConfigError, match=r"drive\.path"):
         run(config)
 
 
-def test_a_single_camera_is_one_set_and_two_are_three(short_drive: Path) -> None:
+def test_a_single_camera_is_one_set_and_two_are_three(short_drive):
     assert list(camera_sets(read_drive(short_drive))) == ["front", "rear", "both"]
     assert list(camera_sets(read_drive(short_drive, ReadOptions(cameras=["rear"])))) == ["rear"]
+
+
+def poses(height_m=0.0, pitch_rad=0.0, forward_m=0.0):
+    """Three poses a metre apart, moved along themselves by ``forward_m``."""
+    out = np.tile(np.eye(4), (3, 1, 1))
+    zero = np.zeros(3)
+    out[:, :3, :3] = rotation_from_euler(zero, np.full(3, pitch_rad), zero)
+    out[:, :3, 3] = np.column_stack([np.arange(3.0), zero, np.full(3, height_m)])
+    moved = np.eye(4)
+    moved[0, 3] = forward_m
+    return np.asarray(out @ moved)
+
+
+def test_poses_that_were_laid_flat_are_written_at_their_recorded_height(tmp_path):
+    stamp_s = np.array([10.0, 10.5, 11.0])
+    recorded = Trajectory(stamp_s, poses(46.2, 0.02))
+    drive = Drive("d", tmp_path, {}, (), recorded=recorded)
+    sigma = np.tile([0.01, 0.02, 0.003, 1e-4, 2e-4, 3e-4], (3, 1))
+    seen = np.array([True, False, True])
+    visit = np.zeros(len(stamp_s), dtype=np.int64)
+    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {}, visit)
+    write_trajectories(adjusted, drive, tmp_path)
+    got = read_tum(tmp_path / "trajectory.tum")
+    np.testing.assert_allclose(got.stamp_s, stamp_s)
+    np.testing.assert_allclose(got.map_from_vehicle, poses(46.2, 0.02, 0.05), atol=1e-8)
+    header, first, second, _ = (tmp_path / "trajectory_sigma.csv").read_text().splitlines()
+    assert header == "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
+    assert first == "10.000000000,1,0.01,0.02,0.003,0.0001,0.0002,0.0003"
+    assert second.split(",")[1] == "0"

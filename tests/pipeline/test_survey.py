@@ -1,7 +1,5 @@
 """docs/survey.md does what it says: control points mend a drifted map, check points only tell."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -25,9 +23,8 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions, SurveyOptions
-from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.run import run
-from v2hdm.records import FloatArray, Trajectory
+from v2hdm.records import Trajectory
 from v2hdm.report.metrics import driven_past
 
 (DOCUMENTED,) = blocks("docs/survey.md", "sh")
@@ -42,15 +39,15 @@ class Site:
     folder: Path
 
     @property
-    def drive(self) -> Path:
+    def drive(self):
         return self.folder / "drives/mysite"
 
-    def config(self, output: Path, survey: SurveyOptions) -> RunConfig:
+    def config(self, output, survey):
         mapping, cache = MappingOptions(survey=survey), str(self.folder / "cache")
         return run_config(self.drive, output, mapping=mapping, all_maps=True, cache=cache)
 
 
-def drifted(recorded: Trajectory) -> Trajectory:
+def drifted(recorded):
     """Poses that are off by as much as 8 cm, more at the start than at the end."""
     poses = recorded.map_from_vehicle.copy()
     share = np.linspace(1.0, 0.6, len(poses))
@@ -58,7 +55,7 @@ def drifted(recorded: Trajectory) -> Trajectory:
     return Trajectory(recorded.stamp_s, poses)
 
 
-def survey(corners_map: FloatArray, kinds: list[str], origin: object, check_off_m: float = 0.0) -> str:
+def survey(corners_map, kinds, origin, check_off_m=0.0):
     """Every other point is a check point, those off by ``check_off_m`` more than their sigma."""
     rng = np.random.default_rng(8)
     measured = corners_map + SIGMA_M * rng.standard_normal(corners_map.shape)
@@ -71,7 +68,7 @@ def survey(corners_map: FloatArray, kinds: list[str], origin: object, check_off_
 
 
 @pytest.fixture(scope="module")
-def site(small_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Site:
+def site(small_drive, tmp_path_factory):
     site = Site(tmp_path_factory.mktemp("site"))
     shutil.copytree(small_drive, site.drive)
     drive = read_drive(site.drive)
@@ -94,7 +91,7 @@ def site(small_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Site:
 
 
 @pytest.fixture(scope="module")
-def documented(site: Site) -> tuple[Path, str]:
+def documented(site):
     """The result of the documented command, with every map, and what it printed."""
     (command,) = DOCUMENTED.lines
     settings = ["all_maps=true", "workers=1", "output=outputs", "name=short"]
@@ -104,13 +101,13 @@ def documented(site: Site) -> tuple[Path, str]:
     return site.folder / "outputs/short", printed.getvalue()
 
 
-def figures(result: Path) -> dict[str, float]:
+def figures(result):
     metrics = json.loads((result / "metrics.json").read_text())
     return dict(metrics["check_points"])
 
 
 @pytest.mark.slow
-def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented: tuple[Path, str]) -> None:
+def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented):
     result, printed = documented
     with (result / "check_points.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -127,9 +124,7 @@ def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented:
 
 
 @pytest.mark.slow
-def test_control_points_bring_check_points_down_to_what_map_and_survey_state(
-    site: Site, documented: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_control_points_bring_check_points_down_to_what_map_and_survey_state(site, documented, tmp_path):
     mended = figures(documented[0])
     left = figures(run(site.config(tmp_path, SurveyOptions(file=str(site.folder / "check.csv")))).folder)
     assert left["points"] == 20
@@ -141,9 +136,7 @@ def test_control_points_bring_check_points_down_to_what_map_and_survey_state(
 
 
 @pytest.mark.slow
-def test_check_points_touch_no_part_of_the_map(
-    site: Site, documented: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_check_points_touch_no_part_of_the_map(site, documented, tmp_path):
     moved = run(site.config(tmp_path, SurveyOptions(file=str(site.folder / "moved.csv"))))
     names = ["trajectory.tum", "trajectory_sigma.csv", "excluded.geojson"]
     names += [f"maps/{path.name}" for path in (documented[0] / "maps").iterdir()]
@@ -162,9 +155,7 @@ def test_check_points_touch_no_part_of_the_map(
         (("latitude_deg,longitude_deg", "x_m,y_m"), r"none of its 20 .*: 20 would as latitude and longitude"),
     ],
 )
-def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(
-    site: Site, swap: tuple[str, str], message: str, tmp_path: Path
-) -> None:
+def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(site, swap, message, tmp_path):
     wrong = tmp_path / "wrong.csv"
     wrong.write_text((site.folder / "points.csv").read_text().replace(*swap))
     with pytest.raises(DriveError, match=message) as caught:
@@ -173,7 +164,7 @@ def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path: Path) -> None:
+def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path):
     config = run_config(
         tmp_path / "no drive", tmp_path, mapping=MappingOptions(survey=SurveyOptions(file="none.csv"))
     )
@@ -181,7 +172,7 @@ def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path: P
         run(config)
 
 
-def test_places_on_the_earth_are_refused_for_a_drive_without_an_origin(site: Site, tmp_path: Path) -> None:
+def test_places_on_the_earth_are_refused_for_a_drive_without_an_origin(site, tmp_path):
     shutil.copytree(site.drive, tmp_path / "drives/mysite")
     with description(tmp_path / "drives/mysite") as content:
         del content["origin"], content["truth"]

@@ -1,46 +1,39 @@
-"""The random scenes: reproducible, varied, and labelled where the paint is."""
+"""Random scenes, views and hardships of training: reproducible, varied, labelled where the paint is."""
 
 from dataclasses import fields
 
+import cv2
 import numpy as np
 import pytest
 
+from train.augment import random_crop, random_photometry
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
-from train.scenes.hardships import (
-    Hardships,
-    things_beside,
-    tight_bend,
-)
-from train.scenes.paint import (
-    Bend,
-    RoadPaint,
-    port_paint,
-    random_brush,
-    rectangle,
-    rhombus,
-    street_paint,
-)
-from train.scenes.scenes import image_line, image_points, random_scene, training_sample
-from train.scenes.views import TrainingView, looking
+from train.scenes import scenes
+from train.scenes.hardships import Hardships, bleached, junction_approach, things_beside, tight_bend
+from train.scenes.paint import Bend, port_paint, random_brush, rectangle, rhombus, street_paint
+from train.scenes.scenes import TrainingSample, image_line, image_points, random_scene, training_sample
+from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
 from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
+from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex
-from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo, FloatArray
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE, CameraInfo
 from v2hdm.simulate.render.renderer import Motion, Optics
-from v2hdm.simulate.render.scene import box_footprint
+from v2hdm.simulate.render.scene import Ground, Paint, Scene, box_footprint
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 
 
-def test_a_seed_and_an_index_make_the_same_picture_again() -> None:
+def test_a_seed_and_an_index_make_the_same_picture_again():
     first, again = (training_sample(5, 3, 96, 64) for _ in range(2))
     np.testing.assert_array_equal(first.image, again.image)
     np.testing.assert_array_equal(first.labels, again.labels)
     assert (training_sample(5, 4, 96, 64).image != first.image).any()
 
 
-def test_streams_of_one_seed_are_the_same() -> None:
+def test_streams_of_one_seed_are_the_same():
     one, other = iter(RenderStream(TINY, 1)), iter(RenderStream(TINY, 1))
     for _ in range(5):
         (image, answers), (image_again, answers_again) = next(one), next(other)
@@ -50,17 +43,17 @@ def test_streams_of_one_seed_are_the_same() -> None:
         assert all(bool((a == b).all()) for a, b in zip(answers, answers_again, strict=True))
 
 
-def test_validation_shows_other_scenes_than_training() -> None:
+def test_validation_shows_other_scenes_than_training():
     image, _ = next(validation_pairs(TINY, 1, 1))
     assert (image.numpy() != training_sample(1, 0, 64, 32).image).any()
 
 
-def test_all_classes_are_seen_in_a_hundred_or_so_samples() -> None:
+def test_all_classes_are_seen_in_a_hundred_or_so_samples():
     seen = {int(c) for index in range(150) for c in np.unique(training_sample(2, index, 160, 96).labels)}
     assert seen == set(range(1 + len(PAINT_CLASSES)))
 
 
-def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them() -> None:
+def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
     brighter = []
     for index in range(40):
         sample = training_sample(7, index, 192, 96, difficulty=0.0)
@@ -73,7 +66,7 @@ def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them() -> Non
     assert np.mean(brighter) > 0.75
 
 
-def test_paint_polygons_are_convex_and_have_the_size_asked_for() -> None:
+def test_paint_polygons_are_convex_and_have_the_size_asked_for():
     scenes = [random_scene(np.random.default_rng(index)) for index in range(12)]
     polygons = [paint.polygon_map for scene, _ in scenes for paint in scene.paints]
     assert polygons
@@ -87,7 +80,7 @@ def test_paint_polygons_are_convex_and_have_the_size_asked_for() -> None:
     assert np.ptp(rectangle(np.zeros(2), 3.0, 0.15, np.pi / 2)[:, 1]) == pytest.approx(3.0)
 
 
-def test_lanes_lie_on_their_paint() -> None:
+def test_lanes_lie_on_their_paint():
     on_paint, seen = 0, 0
     for index in range(60):
         sample = training_sample(3, index, 192, 96, difficulty=0.0)
@@ -102,7 +95,7 @@ def test_lanes_lie_on_their_paint() -> None:
     assert 0.4 < on_paint / seen < 0.95, "dashes leave gaps, double lines are bare between"
 
 
-def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_that_goes_on() -> None:
+def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_that_goes_on():
     """Three metres about the end of a strand the line passes over; no paint is farther than half a double."""
     passing, one_of_two, doubles = 1.5, 0, 0
     for seed in range(60):
@@ -125,7 +118,7 @@ def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_
     assert one_of_two > 50
 
 
-def _solid_strands_about(road: RoadPaint, lane: FloatArray) -> list[tuple[float, float, float]]:
+def _solid_strands_about(road, lane):
     """Start, end and place beside the way of a straight line's solid strands; none if it has dashes."""
     about = [
         paint
@@ -138,7 +131,7 @@ def _solid_strands_about(road: RoadPaint, lane: FloatArray) -> list[tuple[float,
     return [(float(c[:, 0].min()), float(c[:, 0].max()), float(c[:, 1].mean())) for c in corners]
 
 
-def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one() -> None:
+def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one():
     several = 0
     for seed in range(150):
         rng = np.random.default_rng(seed)
@@ -153,7 +146,7 @@ def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one() -> None:
     assert several > 30
 
 
-def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature() -> None:
+def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature():
     bend = Bend(0.02)
     along = np.linspace(0, 40, 4001)
     points = bend.to_map(np.column_stack([along, np.zeros_like(along)]))
@@ -162,7 +155,7 @@ def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curva
     np.testing.assert_allclose(Bend(0.0).to_map(np.array([[7.0, -2.0]])), [[7.0, -2.0]])
 
 
-def test_a_bend_between_straights_is_an_arc_that_they_touch() -> None:
+def test_a_bend_between_straights_is_an_arc_that_they_touch():
     quarter = Bend(1 / 15, 5.0, 5.0 + 7.5 * np.pi)
     along = np.array([-3.0, 5.0, 5.0 + 7.5 * np.pi, 15.0 + 7.5 * np.pi])
     points = quarter.to_map(np.column_stack([along, [0.0, 0.0, 0.0, 2.0]]))
@@ -180,7 +173,7 @@ def test_a_bend_between_straights_is_an_arc_that_they_touch() -> None:
     )
 
 
-def test_tight_bends_turn_the_lines_and_keep_the_way_clear() -> None:
+def test_tight_bends_turn_the_lines_and_keep_the_way_clear():
     scenes = [random_scene(np.random.default_rng(k), 1.0, Hardships(tight_bends=1.0)) for k in range(20)]
     turned = []
     for scene, lanes in scenes:
@@ -222,7 +215,7 @@ def test_things_beside_markings_hide_paint_and_add_none(hard):
     assert any((plain.hidden != crowded.hidden).any() for plain, crowded in seen)
 
 
-def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera() -> None:
+def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera():
     paint = random_brush(np.random.default_rng(0), 0.5).paint(
         np.random.default_rng(1), DIAMOND, rhombus(np.array([9.0, 1.0]), 1.2, 0.6)
     )
@@ -245,7 +238,7 @@ def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera() -> N
     ("model", "coefficients"),
     [("plumb_bob", (-0.16, 0.024, 0.0, 0.0, 0.0)), ("plumb_bob", (0.0,) * 5), ("equidistant", (0.0,) * 4)],
 )
-def test_a_line_is_followed_to_the_borders_of_the_image(model: str, coefficients: tuple[float, ...]) -> None:
+def test_a_line_is_followed_to_the_borders_of_the_image(model, coefficients):
     """Points of a strong lens's image that a pinhole would see far outside of it belong to it, too."""
     intrinsic = np.array([[500.0, 0.0, 640.0], [0.0, 500.0, 260.0], [0.0, 0.0, 1.0]])
     info = CameraInfo("wide", 1280, 720, intrinsic, model, coefficients)
@@ -265,7 +258,7 @@ def test_a_line_is_followed_to_the_borders_of_the_image(model: str, coefficients
         np.testing.assert_allclose(on_ground[:, 1], left, atol=0.02)
 
 
-def test_what_a_folding_lens_would_show_twice_is_not_in_the_image() -> None:
+def test_what_a_folding_lens_would_show_twice_is_not_in_the_image():
     intrinsic = np.array([[300.0, 0.0, 320.0], [0.0, 300.0, 100.0], [0.0, 0.0, 1.0]])
     info = CameraInfo("folding", 640, 360, intrinsic, "plumb_bob", (-0.3, 0.0, 0.0, 0.0, 0.0))
     view = TrainingView(info, looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.0, 0.0), Optics(), Motion())
@@ -273,3 +266,138 @@ def test_what_a_folding_lens_would_show_twice_is_not_in_the_image() -> None:
     pixels = image_points(view, points)
     assert 0 < len(pixels) < 200
     assert (np.diff(pixels[:, 1]) < 0).all(), "farther along a line is farther up"
+
+
+def test_a_camera_that_looks_along_x_sees_the_road_ahead_below_its_axis():
+    cam_from_map = looking(np.array([0.0, 0.0, 2.0]), 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(cam_from_map @ [10.0, 3.0, 0.0, 1.0], [-3.0, 2.0, 10.0, 1.0], atol=1e-12)
+    tilted = looking(np.array([0.0, 0.0, 2.0]), 0.0, np.arctan2(2.0, 10.0), 0.0)
+    np.testing.assert_allclose((tilted @ [10.0, 0.0, 0.0, 1.0])[:2], 0.0, atol=1e-12)
+
+
+def test_camera_rotations_are_rotations():
+    for index in range(10):
+        rotation = random_view(np.random.default_rng(index), 64, 32).cam_from_map[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_a_camera_on_the_side_looks_across_the_way_at_a_place_that_it_passes():
+    place = np.array([12.0, 3.0])
+    for index in range(40):
+        rng = np.random.default_rng(index)
+        straight = random_view(rng, 128, 72)
+        assert turned_aside(rng, straight, [place], 0.0) is straight
+        assert turned_aside(rng, straight, [], 1.0) is straight
+        view = turned_aside(rng, straight, [place], 1.0)
+        forward, centre = view.cam_from_map[2, :3], -view.cam_from_map[:3, :3].T @ view.cam_from_map[:3, 3]
+        assert abs(forward[1]) > np.tan(ASIDE_RAD) * abs(forward[0])
+        before = -straight.cam_from_map[:3, :3].T @ straight.cam_from_map[:3, 3]
+        assert centre[2] == pytest.approx(before[2])
+        np.testing.assert_allclose(forward[2], straight.cam_from_map[2, 2], atol=1e-12)
+        assert (view.cam_from_map @ [*place, 0.0, 1.0])[2] > 0.5, "the place lies before the camera"
+        moved_map = view.cam_from_map[:3, :3].T @ view.motion.velocity_cam
+        np.testing.assert_allclose(moved_map[1:], 0.0, atol=1e-9)
+        assert np.linalg.norm(moved_map) == pytest.approx(np.linalg.norm(straight.motion.velocity_cam))
+
+
+@pytest.mark.parametrize(("painted", "answer"), [(LANE_DASH, STOP_LINE), (STOP_LINE, LANE_DASH)])
+def test_a_camera_on_the_side_is_to_take_dashes_for_stop_lines(monkeypatch, painted, answer):
+    paint = Paint(kind=painted, polygon_map=rectangle(np.array([12.0, 3.0]), 2.0, 0.3))
+    monkeypatch.setattr(scenes, "random_scene", lambda *_: (Scene(paints=(paint,)), []))
+    found = set()
+    for index in range(6):
+        found |= set(np.unique(training_sample(3, index, 320, 180, hardships=Hardships(aside=1.0)).labels))
+    assert found == {0, 1 + PAINT_CLASSES.index(answer)}
+
+
+def test_no_lens_folds_an_image_over_itself():
+    u, v = np.meshgrid(np.linspace(0, 1279, 33), np.linspace(0, 719, 19))
+    for index in range(200):
+        info = random_view(np.random.default_rng(index), 1280, 720).info
+        rays = undistort_points(info, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 2)
+        right, down = np.diff(rays, axis=1)[:-1], np.diff(rays, axis=0)[:, :-1]
+        turn = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
+        assert (turn > 0).all(), f"view {index}: neighbouring pixels change sides"
+
+
+def test_bleached_ground_keeps_its_tint_and_is_clipped_together_with_its_paint():
+    ground = Ground(albedo_bgr=(0.1, 0.12, 0.14))
+    lighter = bleached(np.random.default_rng(0), ground, 1.0)
+    assert 0.35 < max(lighter.albedo_bgr) < 0.55
+    np.testing.assert_allclose(np.array(lighter.albedo_bgr) / ground.albedo_bgr, lighter.albedo_bgr[0] / 0.1)
+    assert bleached(np.random.default_rng(0), ground, 0.0) is ground
+    samples = [(0.0, 2, index) for index in range(50)], [(1.0, 2, index) for index in range(50)]
+    clipped = [np.mean([_clipped_beside_paint(*sample) for sample in each]) for each in samples]
+    assert clipped[0] < 0.01
+    assert clipped[1] > 0.05
+
+
+def _clipped_beside_paint(share, seed, index):
+    """The share of the seam of ground about paint in which a channel is clipped, as the paint in it is."""
+    sample = training_sample(seed, index, 160, 96, 1.0, Hardships(bleached=share))
+    paint = (sample.labels > 0).astype(np.uint8)
+    about = (cv2.dilate(paint, np.ones((7, 7), np.uint8)) > 0) & (paint == 0)
+    return float((sample.image.max(axis=2) >= 250)[about].mean()) if about.any() else 0.0
+
+
+def test_a_junction_has_arrows_before_its_stop_line_and_a_crosswalk_behind_it():
+    kinds: list[str] = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        paints, ground = junction_approach(rng, random_brush(rng, 0.0), Bend(0.0))
+        along = {kind: [p.polygon_map[:, 0] for p in paints if p.kind == kind] for kind in PAINT_CLASSES}
+        assert len(along[STOP_LINE]) == 1
+        stop_m = along[STOP_LINE][0]
+        assert all(x.max() < stop_m.min() for x in along[ARROW])
+        assert all(x.min() > stop_m.max() for x in along[CROSSWALK_BAR])
+        assert all(inside_convex(ground, p.polygon_map).all() for p in paints if p.kind == CROSSWALK_BAR)
+        kinds += [paint.kind for paint in paints]
+    assert {ARROW, STOP_LINE, CROSSWALK_BAR} == set(kinds)
+
+
+def test_cameras_mounted_otherwise_keep_their_place_and_look_from_low_or_high():
+    heights = []
+    for seed in range(40):
+        view = random_view(np.random.default_rng(seed), 160, 96)
+        other = mounted_otherwise(np.random.default_rng(seed), view, 1.0)
+        before, after = camera_centre(view.cam_from_map), camera_centre(other.cam_from_map)
+        np.testing.assert_allclose(after[:2], before[:2], atol=1e-9)
+        np.testing.assert_array_equal(other.cam_from_map[:3, :3], view.cam_from_map[:3, :3])
+        heights.append(after[2])
+    low = [height for height in heights if height < 2]
+    assert 8 < len(low) < 32
+    assert 0.5 <= min(low) < max(low) <= 1.1
+    assert all(3.6 <= height <= 5 for height in heights if height >= 2)
+    view = random_view(np.random.default_rng(0), 160, 96)
+    assert mounted_otherwise(np.random.default_rng(0), view, 0.0) is view
+
+
+def test_crops_keep_image_labels_hidden_and_lanes_together():
+    labels = np.random.default_rng(0).integers(0, 5, (40, 60)).astype(np.uint8)
+    image = np.repeat(labels[..., None], 3, axis=2)
+    image[20, 30] = 250
+    whole = TrainingSample(image, labels, labels > 2, (np.array([[30.0, 20.0], [31.0, 10.0]]),))
+    rng = np.random.default_rng(1)
+    seen = 0
+    for _ in range(40):
+        crop = random_crop(rng, whole, 32, 16)
+        assert crop.image.shape == (16, 32, 3)
+        bright = crop.image[..., 1] == 250
+        np.testing.assert_array_equal(crop.image[..., 1][~bright], crop.labels[~bright])
+        np.testing.assert_array_equal(crop.hidden, crop.labels > 2)
+        for row, column in np.argwhere(bright):
+            np.testing.assert_array_equal(crop.lanes_px[0][0], [column, row])
+            seen += 1
+    assert seen > 3
+
+
+def test_photometry_changes_values_but_not_shape_or_type_or_its_input():
+    image = np.random.default_rng(0).integers(0, 256, (32, 48, 3)).astype(np.uint8)
+    before = image.copy()
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        out = random_photometry(rng, image)
+        assert out.shape == image.shape
+        assert out.dtype == np.uint8
+    np.testing.assert_array_equal(image, before)

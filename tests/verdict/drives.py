@@ -1,7 +1,5 @@
 """Tiny drives without images: a straight stretch and a circle to the left, at 5 m/s and 20 poses a second."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

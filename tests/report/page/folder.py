@@ -1,7 +1,5 @@
 """Result folders to make reports of: a drive past a few diamonds, drawn, and a site of any size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

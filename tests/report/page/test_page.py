@@ -1,12 +1,8 @@
 """What the page says is what the folder's files say, and what it lacks it tells."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
-from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,7 +14,7 @@ from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
 from v2hdm.io.maps.evidence import COLUMNS
-from v2hdm.records import DIAMOND, Drive, Marking
+from v2hdm.records import DIAMOND, Marking
 from v2hdm.report.outputs import write_json
 from v2hdm.report.page import pictures
 from v2hdm.report.page.document import document, write_page
@@ -27,41 +23,37 @@ from v2hdm.report.page.layers import ellipses
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def drive(tmp_path_factory):
     return make_result(tmp_path_factory.mktemp("page"))
 
 
 @pytest.fixture(scope="module")
-def result(drive: Drive) -> Path:
+def result(drive):
     return drive.root.parent / "result"
 
 
 @pytest.fixture(scope="module")
-def page(drive: Drive, result: Path) -> SimpleNamespace:
+def page(drive, result):
     return document(read_facts(result, drive))
 
 
-def test_the_page_begins_with_how_good_the_map_is(page: SimpleNamespace, result: Path, drive: Drive) -> None:
+def test_the_page_begins_with_how_good_the_map_is(page, result, drive):
     assert page.verdict.headline == "95 % of 12 markings within 2.1 cm; goal 5 cm"
     text = write_page(result, drive).read_text()
     first = re.search(r'class="says">([^<]*)<', text)
-    assert first is not None
     assert first[1] == "95 % of 12 markings within 2.1 cm; goal 5 cm."
 
 
-def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance() -> None:
+def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance():
     turned = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     one = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T
     half = ellipses(Marking(DIAMOND, DIAMOND_M, 3, np.kron(np.eye(4), one)))
-    assert half is not None
     # 5.991 is the 95 % quantile of chi-square with two degrees of freedom.
     assert half[:, :2] == pytest.approx(np.tile(np.sqrt(5.991) * np.array([0.02, 0.01]), (4, 1)), rel=1e-3)
     assert np.tan(half[:, 2]) == pytest.approx(np.full(4, np.tan(0.4)))
 
 
-def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(
-    result: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(result, drive, monkeypatch):
     from dataclasses import replace
 
     from v2hdm.records import HdMap, Truth
@@ -82,11 +74,10 @@ def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(
         truth=Truth(HdMap(tuple(true)), {}, np.empty((0, 4, 4)), np.empty((0, 1000)), (), {}),
     )
     table = tables.truth_table(facts)
-    assert table is not None
     assert abs(int(table.rows[-1][-1]) - 95) <= 1
 
 
-def test_key_figures_and_tables_state_what_the_files_do(page: SimpleNamespace) -> None:
+def test_key_figures_and_tables_state_what_the_files_do(page):
     figures = {one.name: (one.value, one.unit) for one in page.figures}
     assert figures["Markings"] == ("4", "")
     assert figures["Between neighbours"] == ("1.0", "cm")  # 2.45 x 0.004 m
@@ -101,9 +92,8 @@ def test_key_figures_and_tables_state_what_the_files_do(page: SimpleNamespace) -
     assert len(page.residuals) == 4
 
 
-def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result: Path, drive: Drive) -> None:
+def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result, drive):
     found = ground_residuals(read_facts(result, drive))
-    assert found is not None
     assert found.residual_px == pytest.approx(np.tile(SHIFT_PX, (80, 1)), abs=1e-4)
     # Straight ahead 0.3 px to the right are depth / 500 px times as many metres to the vehicle's right.
     ahead = np.isin(found.marking, (1, 4)) & (found.corner % 2 == 0)
@@ -113,9 +103,7 @@ def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result: Pa
     assert found.range_m.max() == pytest.approx(9.5, abs=0.1)
 
 
-def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_first(
-    result: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_first(result, drive, monkeypatch):
     facts = read_facts(result, drive)
     everything = pictures.pictures(facts)
     assert {"m1", "m2", "m3", "m4", "s6", "x0"} <= everything.keys()
@@ -128,17 +116,16 @@ def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_firs
     assert len([key for key in fewer if key.startswith("m")]) == 4
 
 
-def test_names_end_no_script_and_become_no_markup(tmp_path: Path) -> None:
+def test_names_end_no_script_and_become_no_markup(tmp_path):
     drive = make_result(tmp_path, kind=NASTY_NAME, status="WARN")
     text = write_page(tmp_path / "result", drive).read_text()
     assert "<img src=x" not in text
     assert text.count("</script>") == text.count("<script")
     embedded = re.search(r'id="map-data">(.*?)</script>', text, re.DOTALL)
-    assert embedded is not None
     assert NASTY_NAME in json.loads(embedded.group(1))["kinds"]
 
 
-def test_the_page_asks_for_nothing_beyond_itself(result: Path, drive: Drive) -> None:
+def test_the_page_asks_for_nothing_beyond_itself(result, drive):
     text = write_page(result, drive).read_text()
     assert "default-src 'none'" in text
     outside_scripts = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
@@ -147,13 +134,13 @@ def test_the_page_asks_for_nothing_beyond_itself(result: Path, drive: Drive) -> 
     assert "sourceMappingURL" not in text
 
 
-def test_the_same_folder_gives_the_same_page_to_the_byte(result: Path, drive: Drive) -> None:
+def test_the_same_folder_gives_the_same_page_to_the_byte(result, drive):
     page = write_page(result, drive).read_bytes()
     assert b"1 of 5 candidates (20 %) are not in the map." in page
     assert write_page(result, drive).read_bytes() == page
 
 
-def test_without_its_drive_the_page_says_what_it_lacks(result: Path) -> None:
+def test_without_its_drive_the_page_says_what_it_lacks(result):
     page = document(read_facts(result, None))
     assert page.pictures == {}
     assert "Make the report again with --drive." in write_page(result, None).read_text()
@@ -161,7 +148,7 @@ def test_without_its_drive_the_page_says_what_it_lacks(result: Path) -> None:
     assert len(page.map_data["markings"]) == 4
 
 
-def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path: Path) -> None:
+def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path):
     finding = {"check": "map", "status": "FAIL", "value": None, "limit": None, "unit": "",
                "says": "no map came of this drive", "about": "map"}  # fmt: skip
     verdict = {"status": "FAIL", "findings": [finding], "untold": [], "passed": []}
@@ -171,7 +158,7 @@ def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path: Path) -> None
     assert 'id="map"' not in text
 
 
-def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map(tmp_path: Path) -> None:
+def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map(tmp_path):
     drive = make_result(tmp_path)
     rows = [
         "id,x_map_m,y_map_m,marking,corner,dx_m,dy_m,distance_m,inside_95_percent,not_compared_because",
@@ -180,15 +167,12 @@ def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map
     ]
     (tmp_path / "result" / "check_points.csv").write_text("\n".join(rows) + "\n")
     page = document(read_facts(tmp_path / "result", drive))
-    assert page.check_points is not None
     first = dict(zip(page.check_points.headings, page.check_points.rows[0], strict=True))
     assert (first["point"], first["east (cm)"], first["north (cm)"]) == ("P1", "1.2", "−0.4")
     assert [one["off"] for one in page.map_data["checks"]] == [[0.0123, -0.004], [None, None]]
 
 
-def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypatch):
     from v2hdm.report.page import layers as ground
 
     drive = make_result(tmp_path)
@@ -210,21 +194,18 @@ def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(
     assert len(layer["src"]) <= 60_000
     shown = cv2.imdecode(np.frombuffer(base64.b64decode(layer["src"]), np.uint8), cv2.IMREAD_UNCHANGED)
     assert shown.shape[1] / shown.shape[0] == pytest.approx(800 / 600, rel=0.02)
-    assert page.ground is not None
     assert "6.0 cm wide before and 2.0 cm after: 3.0 times as sharp" in page.ground.caption
     (tmp_path / "result" / "mosaic.webp").unlink()
     with pytest.raises(MapFileError, match=r"mosaic\.webp: no picture"):
         document(read_facts(tmp_path / "result", drive))
 
 
-def test_a_map_of_thousands_is_written_in_seconds(tmp_path: Path) -> None:
+def test_a_map_of_thousands_is_written_in_seconds(tmp_path):
     make_site(tmp_path / "site", 3000)
     assert write_page(tmp_path / "site", None).stat().st_size < 4e6
 
 
-def test_the_door_finds_the_drive_and_names_what_is_wrong(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_door_finds_the_drive_and_names_what_is_wrong(tmp_path, capsys):
     make_result(tmp_path)
     result = tmp_path / "result"
     assert run(["report", str(result)]) == 0
@@ -242,7 +223,7 @@ def test_the_door_finds_the_drive_and_names_what_is_wrong(
     assert ",".join(COLUMNS) in capsys.readouterr().err
 
 
-def test_another_drive_than_that_of_the_result_is_refused(tmp_path: Path) -> None:
+def test_another_drive_than_that_of_the_result_is_refused(tmp_path):
     make_result(tmp_path / "a", name="one")
     make_result(tmp_path / "b", name="two")
     result = tmp_path / "a" / "result"
