@@ -19,6 +19,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     Image,
+    Marking,
     PoseNoise,
     Trajectory,
 )
@@ -155,3 +156,10 @@ def estimate(name: str = "front", **values: float) -> GroundEstimate:
         patches=None,
         seconds=3.0,
     )
+
+
+INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))
+
+
+def square_at(x, y):
+    return Marking("diamond", np.array([[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]), 5)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from tests.cameras import mounted
-from tests.verdict.test_solution import INFO, square_at
-from v2hdm.cli import terminal
+from tests.verdict.drives import INFO, square_at
+from v2hdm.cli.compose import Job
+from v2hdm.cli.map import _map
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions
@@ -33,7 +34,7 @@ def marking(number, shared_m=0.01, own_m=0.002):
     return replace(square_at(3.0 * number, 0.0), covariance_m2=covariance, relative_sigma_m=own_m)
 
 
-def mounted(covariance=SURE, pitch_deg=15.0):
+def calibrated(covariance=SURE, pitch_deg=15.0):
     return Calibration(INFO, mounted((1.0, 0.2, 2.4), pitch_deg, 10.0, 2.0), covariance)
 
 
@@ -41,7 +42,7 @@ def mapped(markings, calibration=None, position_m=0.003):
     still = np.tile(np.eye(4), (5, 1, 1))
     sigma, seen = np.full((5, 6), position_m), np.ones(5, dtype=bool)
     poses = AdjustedPoses(np.arange(5.0), still, still, sigma, seen, {}, np.zeros(5, dtype=np.int64))
-    calibrations = {"front": calibration or mounted()}
+    calibrations = {"front": calibration or calibrated()}
     return MethodResult("Opt", ("front",), HdMap(tuple(markings)), calibrations, poses=poses)
 
 
@@ -65,7 +66,7 @@ def test_a_good_map_passes_and_says_how_good_it_is_first():
 
 
 def test_a_straight_drive_with_70_cm_of_uncertainty_is_no_pass_and_names_the_mounting():
-    straight = mounted(np.diag([0.28**2] * 3 + [1e-4**2] * 3))
+    straight = calibrated(np.diag([0.28**2] * 3 + [1e-4**2] * 3))
     verdict = judged(mapped([marking(n, shared_m=0.28) for n in range(34)], straight))
     assert verdict.status is Status.WARN
     assert verdict.headline.startswith(
@@ -103,7 +104,7 @@ def test_what_the_map_leaves_out_as_too_uncertain_is_said_beside_the_share():
 
 def test_what_states_no_covariance_promises_nothing():
     unknown = [replace(marking(n), covariance_m2=None, relative_sigma_m=None) for n in range(3)]
-    for one in (mapped(unknown), mapped(unknown, mounted(None))):
+    for one in (mapped(unknown), mapped(unknown, calibrated(None))):
         verdict = judged(one)
         assert verdict.status is Status.WARN
         assert "within an unknown distance" in verdict.headline
@@ -114,8 +115,8 @@ def test_what_states_no_covariance_promises_nothing():
 def test_the_terminal_ends_with_how_good_the_map_is(monkeypatch, capsys):
     verdict = judged(mapped([marking(n, shared_m=0.05) for n in range(30)]))
     result = RunResult(Path("out"), {"results": {}}, (), verdict)
-    monkeypatch.setattr(terminal, "run", lambda *_: result)
-    assert terminal.run_on_terminal(RunConfig(name="yard"), "") is verdict
+    monkeypatch.setattr("v2hdm.pipeline.run.run", lambda *_: result)
+    assert _map(Job(RunConfig(name="yard"), "", None)) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     assert [line.split(":")[0] for line in lines] == ["WARN coarse (map)", "results in out", "verdict"]
     assert "95 % of 30 markings within 12 cm" in lines[-1]
@@ -149,7 +150,7 @@ def test_of_a_hundred_corners_95_are_within_the_radius(ratio):
 def test_a_mounting_moves_the_ground_ahead_as_far_as_its_covariance_says(pitch_deg, ahead_m):
     rng = np.random.default_rng(2)
     root = rng.normal(size=(6, 6)) * ([[0.01]] * 3 + [[0.001]] * 3)
-    calibration = mounted(root @ root.T, pitch_deg)
+    calibration = calibrated(root @ root.T, pitch_deg)
     cam_from_vehicle = calibration.cam_from_vehicle
     centre, axis = camera_centre(cam_from_vehicle), cam_from_vehicle[2, :3]
     level = axis[:2] / max(float(np.hypot(*axis[:2])), 1e-12)

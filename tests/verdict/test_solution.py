@@ -9,15 +9,15 @@ import pytest
 from tests.cameras import mounted
 from tests.mapping.scene import SceneOptions, make_scene
 from tests.report.yard import SURVEY_M, checked, point, yard
+from tests.verdict.drives import INFO, square_at
 from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
-from v2hdm.records import Calibration, CameraInfo, HdMap, Marking
+from v2hdm.records import Calibration, HdMap
 from v2hdm.site.candidates import Exclusion
 from v2hdm.verdict import Status
 from v2hdm.verdict.results.solution import check_inputs, check_solution
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
-INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02, bias_px=0.03)
 CLOCK = Contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
 LEVER = Contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
@@ -39,10 +39,6 @@ FINE = SolveEvidence(
 @pytest.fixture(scope="module")
 def drive():
     return make_scene(SceneOptions(length_m=20.0, turns=False)).drive
-
-
-def square_at(x, y):
-    return Marking("diamond", np.array([[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]), 5)
 
 
 def result(evidence=FINE, *markings, **changes):
