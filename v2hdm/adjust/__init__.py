@@ -5,6 +5,7 @@ inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hd
 residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
 """
 
+from v2hdm.adjust.noise import estimate_noise
 from v2hdm.adjust.observability import (
     Observability,
     PoseInnovations,
@@ -46,6 +47,7 @@ __all__ = [
     "SolveOptions",
     "Status",
     "Verdict",
+    "estimate_noise",
     "observability",
     "observed",
     "pose_innovations",

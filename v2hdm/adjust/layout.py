@@ -52,8 +52,9 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     )
 
 
-# Least step between frames, as a fraction of the correlation length.
-_MIN_STEP = 1e-4
+MIN_STEP = 1e-4
+"""Least step between frames, as a fraction of the distance over which a drift fades."""
+
 # Below this share of an error its white part is rounding left over from the drift.
 _MIN_WHITE_SHARE = 1e-3
 
@@ -119,7 +120,7 @@ def state_prior(
         memory = np.zeros(len(poses))
         if state.over_m:
             # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
-            memory[1:] = continued * np.exp(-np.maximum(step_m / over_m[1:, a], _MIN_STEP))
+            memory[1:] = continued * np.exp(-np.maximum(step_m / over_m[1:, a], MIN_STEP))
             for b, before in enumerate(components):
                 if before.over_m:
                     transition[1:, a, b] = memory[1:] * turn[:, state.column, before.column]

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from v2hdm.adjust import Status, select_model
+from v2hdm.adjust import Status, estimate_noise, select_model
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -27,8 +27,10 @@ from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
     Bundle,
+    Model,
     coarse_model,
     full_model,
+    pose_sigma_of,
     solve_bundle,
 )
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
@@ -74,6 +76,7 @@ class Optimiser:
             visits * (pose_noise,) if isinstance(pose_noise, PoseNoise) else tuple(pose_noise)
         )
         self._pose_noise = largest_noise(self._noise_of_visits)
+        self._pose_sigma = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._options = options
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self._variance_factor = 1.0
@@ -108,7 +111,8 @@ class Optimiser:
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
-        return bundle
+        progress("noise of the poses")
+        return self._weigh_poses(bundle)
 
     def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
@@ -127,8 +131,11 @@ class Optimiser:
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
-        model = full_model(self._noise_of_visits, self._options, "clock", bundle.model.variance_factor)
-        model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
+        model = replace(
+            self._full_model("clock"),
+            variance_factor=bundle.model.variance_factor,
+            clock_sigma_s=LOOSE_CLOCK_SIGMA_S,
+        )
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
@@ -169,7 +176,7 @@ class Optimiser:
         self.growth = tuple(mapper.growth)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
         self._reweigh(bundle)
-        return bundle
+        return self._weigh_poses(bundle)
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which observations are used."""
@@ -227,12 +234,24 @@ class Optimiser:
             self._cameras,
             coarse_model(rig, self._noise_of_visits, self._options)
             if coarse
-            else full_model(self._noise_of_visits, self._options, self._pose_model, self._variance_factor),
+            else self._full_model(self._pose_model),
         )
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
+
+    def _weigh_poses(self, bundle: Bundle) -> Bundle:
+        """The solve under the sigmas of the poses that ``bundle`` shows, in place of those that were stated."""
+        stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
+        self._pose_sigma = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
+        bundle = self._solve(bundle.association, self._usable(bundle.association, bundle.rig), bundle.rig)
+        self._reweigh(bundle)
+        return bundle
+
+    def _full_model(self, poses: str) -> Model:
+        model = full_model(self._noise_of_visits, self._options, poses, self._variance_factor)
+        return replace(model, pose_sigma=self._pose_sigma)
 
     def _reweigh(self, bundle: Bundle) -> None:
         """Scale the observations' variances as their residuals under ``bundle`` say."""
