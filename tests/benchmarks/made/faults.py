@@ -1,0 +1,229 @@
+"""What may be wrong with a made drive: each fault changes the world, or what was recorded of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from tests.benchmarks.made.world import World, make
+from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
+from v2hdm.records import FloatArray, Trajectory
+
+
+@dataclass(frozen=True)
+class Spoil:
+    """One wrong input.
+
+    Attributes:
+        name: of the fault.
+        cause: pattern that the name or the sentence of a finding must match to name the cause right; None
+            where the input is only unusual, and the map must be right.
+        change: spoils a world.
+        hidden_on_straight: pattern of the check that must say that a straight drive cannot tell.
+    """
+
+    name: str
+    cause: str | None
+    change: Callable[[World], World]
+    hidden_on_straight: str | None = None
+
+
+def _with_poses(world: World, change: Callable[[FloatArray], FloatArray]) -> World:
+    """Other recorded poses (P, 4, 4), at the same times."""
+    poses = change(world.recorded.map_from_vehicle.copy())
+    return replace(world, recorded=Trajectory(world.recorded.stamp_s, poses))
+
+
+def _with_stamps(world: World, change: Callable[[FloatArray], FloatArray]) -> World:
+    """Other stamps of the images, of all cameras alike."""
+    return replace(world, stamp_s={name: change(stamp_s) for name, stamp_s in world.stamp_s.items()})
+
+
+def _step(shift_m: float, world: World) -> World:
+    """The position steps halfway, and stays there."""
+    station = world.port.route.station_at(world.recorded.stamp_s)
+
+    def change(poses: FloatArray) -> FloatArray:
+        poses[station > world.station_m.mean(), :2, 3] += shift_m * np.array([0.6, 0.8])
+        return poses
+
+    return _with_poses(world, change)
+
+
+def _fast_clock(share: float, world: World) -> World:
+    """The images' clock runs fast, and was right when the drive began."""
+    return _with_stamps(world, lambda stamp_s: stamp_s[0] + (1 + share) * (stamp_s - stamp_s[0]))
+
+
+def _late(offset_s: float, world: World) -> World:
+    """Images were taken ``offset_s`` later than they say."""
+    return _with_stamps(world, lambda stamp_s: stamp_s - offset_s)
+
+
+def _jitter(sigma_s: float, world: World) -> World:
+    """Images are stamped when the operating system got to it: late by a random time."""
+    off = np.random.default_rng([world.recipe.seed, 5]).normal(0.0, sigma_s, len(world.taken_s))
+    return _with_stamps(
+        world, lambda stamp_s: np.maximum.accumulate(stamp_s + off) + 1e-6 * np.arange(len(off))
+    )
+
+
+def _jitter_of_poses(sigma_s: float, world: World) -> World:
+    """Poses are stamped when they arrived."""
+    stamp_s = world.recorded.stamp_s
+    off = np.random.default_rng([world.recipe.seed, 6]).normal(0.0, sigma_s, len(stamp_s))
+    jittered = np.maximum.accumulate(stamp_s + off) + 1e-6 * np.arange(len(off))
+    return replace(world, recorded=Trajectory(jittered, world.recorded.map_from_vehicle))
+
+
+def _counted(world: World) -> World:
+    """Stamps are counted from the first at the mean rate; the vehicle's speed, and with it the rate, varied."""
+    return _with_stamps(world, lambda stamp_s: np.linspace(stamp_s[0], stamp_s[-1], len(stamp_s)))
+
+
+def _knocked(camera: str, roll_pitch_yaw_deg: tuple[float, float, float], world: World) -> World:
+    """A camera is turned about the vehicle's axes, around its own centre, halfway."""
+    angles = (np.array([np.deg2rad(angle)]) for angle in roll_pitch_yaw_deg)
+    turn = rotation_from_euler(*angles)[0]
+    own = world.cam_from_vehicle[camera].copy()
+    centre = np.linalg.inv(own[0])[:3, 3]
+    turned = own[0, :3, :3] @ turn.T
+    own[world.second_half, :3, :3], own[world.second_half, :3, 3] = turned, -turned @ centre
+    return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: own})
+
+
+def _loaded(pitch_deg: float, world: World) -> World:
+    """Load pitches the body, with all cameras, in the second half."""
+    angle = np.where(world.second_half, np.deg2rad(pitch_deg), 0.0)
+    true, zero = world.map_from_vehicle.copy(), np.zeros(len(angle))
+    true[:, :3, :3] = true[:, :3, :3] @ rotation_from_euler(zero, angle, zero)
+    return replace(world, map_from_vehicle=true)
+
+
+def _course(world: World) -> World:
+    """The heading is the direction from the last position to this one."""
+
+    def change(poses: FloatArray) -> FloatArray:
+        moved = np.diff(poses[:, :2, 3], axis=0)
+        yaw = np.arctan2(moved[:, 1], moved[:, 0])
+        zero = np.zeros(len(poses))
+        poses[:, :3, :3] = rotation_from_euler(zero, zero, np.concatenate([yaw[:1], yaw]))
+        return poses
+
+    return _with_poses(world, change)
+
+
+def _foreign(world: World) -> World:
+    """The images of the middle third are those of a drive on the same route past other paint."""
+    port = replace(world.recipe.port, seed=world.recipe.seed + 10_000)
+    other = make(replace(world.recipe, port=port))
+    count = min(len(world.taken_s), len(other.taken_s))
+    return replace(world, elsewhere=(other, range(count // 3, 2 * count // 3)))
+
+
+def _lateral_m(world: World) -> FloatArray:
+    """Distance (J, 4) of the markings' corners from the route."""
+    points = world.corners_map[..., :2].reshape(-1, 2)
+    return world.port.route.distance_to(points).reshape(world.corners_map.shape[:2])
+
+
+def _crown(fall: float, world: World) -> World:
+    """The road falls to both sides of the vehicle's route."""
+    corners = world.corners_map.copy()
+    corners[..., 2] -= fall * _lateral_m(world)
+    return replace(world, corners_map=corners)
+
+
+def _grade(grade: float, world: World) -> World:
+    """The world tilted about the map's y axis: heights and attitudes are recorded as on a real slope."""
+    tilt = np.eye(4)
+    tilt[:3, :3] = rotation_from_euler(np.zeros(1), np.array([-np.arctan(grade)]), np.zeros(1))[0]
+    return _with_poses(world, lambda poses: tilt @ poses)
+
+
+def _unlevel(grade: float, world: World) -> World:
+    """The ground rises under poses that say level: the recorded attitude is the map's, not the road's."""
+    rise = world.corners_map[..., 0] * grade
+    corners = world.corners_map.copy()
+    corners[..., 2] += rise
+    true = world.map_from_vehicle.copy()
+    true[:, 2, 3] += grade * true[:, 0, 3]
+    return replace(world, corners_map=corners, map_from_vehicle=true)
+
+
+def _survey(shift_m: tuple[float, float, float], world: World) -> World:
+    """Surveyed centres of all cameras are off."""
+    cameras = {}
+    for name, camera in world.cameras.items():
+        prior = camera.centre_prior
+        assert prior is not None
+        centre = prior.centre_vehicle + np.array(shift_m)
+        cameras[name] = replace(camera, centre_prior=replace(prior, centre_vehicle=centre))
+    return replace(world, cameras=cameras)
+
+
+def _lever(ahead_m: float, left_m: float, world: World) -> World:
+    """The poses are those of an antenna."""
+
+    def change(poses: FloatArray) -> FloatArray:
+        poses[:, :3, 3] += (poses[:, :3, :3] @ np.array([ahead_m, left_m, 0.0])[:, None])[..., 0]
+        return poses
+
+    return _with_poses(world, change)
+
+
+def _lens(focal: float, right_px: float, world: World) -> World:
+    """``camera_info`` states another focal length and principal point than the lenses have."""
+    cameras = {}
+    for name, camera in world.cameras.items():
+        intrinsic = camera.info.intrinsic.copy()
+        intrinsic[[0, 1], [0, 1]] *= 1 + focal
+        intrinsic[0, 2] += right_px
+        cameras[name] = replace(camera, info=replace(camera.info, intrinsic=intrinsic))
+    return replace(world, cameras=cameras)
+
+
+def _heading(turn_deg: float, world: World) -> World:
+    """The recorded heading is off by a constant."""
+
+    def change(poses: FloatArray) -> FloatArray:
+        zero = np.zeros(len(poses))
+        poses[:, :3, :3] = rotation_from_euler(zero, zero, heading_rad(poses) + np.deg2rad(turn_deg))
+        return poses
+
+    return _with_poses(world, change)
+
+
+_CLOCK = "clock|stamp|late"
+_LEVER = "antenna|lever|survey|centre"
+
+SPOILS: Mapping[str, Spoil] = {
+    one.name: one
+    for one in (
+        Spoil("position step", "step|jump|position|fix", partial(_step, 0.06)),
+        Spoil("fast clock", "clock|drift.*stamp|rate|fast", partial(_fast_clock, 0.005), _CLOCK),
+        Spoil("clock jitter", "jitter|clock|stamp", partial(_jitter, 0.02)),
+        Spoil("jittered poses", "jitter|clock|stamp", partial(_jitter_of_poses, 0.02)),
+        Spoil("counted stamps", "count|clock|stamp", _counted, _CLOCK),
+        Spoil("late clock", _CLOCK, partial(_late, 0.03), _CLOCK),
+        Spoil("knocked camera", "knock|mounting|moved|turned", partial(_knocked, "front", (0.0, 0.5, 0.0))),
+        Spoil("knocked in yaw", "knock|mounting|moved|turned", partial(_knocked, "rear", (0.0, 0.0, 0.5))),
+        Spoil("load", "load|nose|pitch|mounting", partial(_loaded, -0.3)),
+        Spoil("course heading", "heading|course", _course),
+        Spoil("heading off", None, partial(_heading, 0.5)),
+        Spoil("foreign images", "foreign|other drive|another drive|images", _foreign),
+        Spoil("crown", "crown|cross-?fall|falls", partial(_crown, 0.02)),
+        Spoil("grade", None, partial(_grade, 0.01)),
+        Spoil("unlevel poses", "slope|grade|rises|pitch", partial(_unlevel, 0.01)),
+        Spoil("survey", "survey|centre", partial(_survey, (0.1, 0.0, 0.0)), "survey|centre|forward"),
+        Spoil("survey height", "survey|centre|height", partial(_survey, (0.0, 0.0, 0.1))),
+        Spoil("lever", _LEVER, partial(_lever, 1.2, 0.0), f"{_LEVER}|forward"),
+        Spoil("lever left", _LEVER, partial(_lever, 0.0, 0.3), f"{_LEVER}|left"),
+        Spoil("focal length", "focal|camera_info", partial(_lens, 0.02, 0.0)),
+        Spoil("principal point", "principal|camera_info", partial(_lens, 0.0, 20.0)),
+    )
+}
+"""All faults by their names."""
