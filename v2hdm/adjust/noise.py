@@ -1,50 +1,50 @@
-r"""How far the recorded poses err, and over which distance, by the drive itself: maximum marginal likelihood.
+r"""How far the recorded poses err, and over which distance, as the drive itself shows.
 
-Receivers state their errors badly, and a road's ground moves the vehicle in ways that nobody states. Yet a
-drive shows them: markings that were seen again and again have to lie still. With the estimated states s of the
-frames integrated out, the likelihood of the observations is maximised over the sigmas theta of their prior,
+Receivers state their errors badly, and a road moves the vehicle in ways that nobody states. Yet a drive shows
+them: markings that were seen again and again have to lie still. The errors of the poses are drawn from their
+posterior at the solution, where it is Gaussian, by the factors of :mod:`v2hdm.adjust.whitening`; their mean
+square gives a sigma, and the distance after which their autocorrelation has fallen to 1 / e the distance over
+which they fade. Under these the posterior is another one, so the two take turns, as in expectation and
+maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977). Moments are used in place of the likelihood of the
+Gauss-Markov process: real roads are smoother than it from image to image, and its likelihood, which hangs on
+these steps, makes far too long distances of that.
 
-.. math:: \hat\theta = \arg\max_\theta \log p(\theta) + \log \int p(u | s)\, p(s | \theta)\, ds,
-
-by expectation and maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977): states are drawn from their
-posterior at the solution, where it is Gaussian, by the factors of :mod:`v2hdm.adjust.whitening`, and theta
-makes the draws likeliest. What was stated is the prior: each sigma, and each distance over which a drift
-fades, is log-normal about it.
+What was stated is the prior. A route much longer than the distance over which errors fade overrules it; what
+images cannot see, such as an offset of the whole map, stays as stated.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import minimize_scalar
 
-from v2hdm.adjust.layout import MIN_STEP, state_components, state_prior
+from v2hdm.adjust.layout import state_components, state_prior
 from v2hdm.adjust.problem import POSE_STATES, Drift, PoseSigma, Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import factorise
 from v2hdm.records import FloatArray
 
-_SPREAD = math.log(2.5)
-"""Standard deviation of the logarithm of a true sigma about that of the stated one: a factor of 2.5."""
+_SPREAD = math.log(2.0)
+"""Standard deviation of the logarithm of a true sigma, or distance, about the stated one: a factor of two."""
 
-_OVER_SPREAD = math.log(8.0)
-"""The same of the distance over which a drift fades, which hardly anybody knows."""
-
-_MOST = math.log(100.0)
+_MOST = math.log(30.0)
 """Most that a sigma or distance is scaled by, as a logarithm."""
 
-_DRAWS = 12
-"""States drawn from the posterior: with hundreds of frames each sigma is known to a hundredth."""
+_DRAWS = 8
+"""Errors drawn from the posterior, each with its mirror image about the mean."""
 
-_ROUNDS = 12
-"""Most rounds of expectation and maximisation; they end when no sigma changes by more than ``_SETTLED``."""
+_ROUNDS = 4
+"""Rounds of drawing and estimating: sigmas move by a tenth in the third."""
 
-_SETTLED = 0.02
-"""Relative change of a sigma or distance that no longer matters."""
+_LEAST_STEP_M = 0.02
+"""Step between frames below which a vehicle stands."""
+
+_LEAST_LAGS = 8
+"""Steps of a route below which no distance can be estimated."""
 
 _GROUPS = {"position": (0, 1), "height": (2,), "roll_pitch": (3, 4), "heading": (5,)}
 """Axes of a frame's tangent whose errors are alike."""
@@ -58,13 +58,9 @@ class _Scales:
     drift: float = 0.0
     over: float = 0.0
 
-    def apart(self, other: _Scales) -> float:
-        """The largest relative change."""
-        return max(abs(a - b) for a, b in zip(vars(self).values(), vars(other).values(), strict=True))
-
 
 def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...]:
-    """The sigmas of each visit's poses that make the drive likeliest; as stated where nothing is estimated.
+    """The sigmas of each visit's poses that the drive shows; as stated where nothing is estimated.
 
     All visits' sigmas of a kind are scaled alike.
 
@@ -76,103 +72,95 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
     arrays, stated = descent.engine.arrays, problem.pose_sigmas
     if not arrays.states:
         return stated
-    scales = dict.fromkeys(_GROUPS, _Scales())
-    generator = torch.Generator()
+    scales, generator = dict.fromkeys(_GROUPS, _Scales()), torch.Generator()
     for _ in range(_ROUNDS):
-        transition, root = _prior(problem, arrays.states, scales)
-        like = arrays.state_transition.new_tensor
+        sigmas = tuple(_scaled(one, scales) for one in stated)
+        components = state_components(sigmas, tuple(POSE_STATES[axis] for axis in arrays.states))
+        prior = state_prior(problem.map_from_vehicle, components, problem.visit_of_frame)
+        transition, root = (arrays.state_transition.new_tensor(one) for one in prior)
         engine = descent.engine.over(
-            replace(arrays, state_transition=like(transition), state_information_root=like(root))
+            replace(arrays, state_transition=transition, state_information_root=root)
         )
         whitening = factorise(engine, descent.plan, descent.estimate, descent.robust)
         noise = torch.randn(_DRAWS, whitening.size, generator=generator.manual_seed(0), dtype=torch.float64)
         off = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]
         states = descent.estimate.frame_state + torch.stack([one.frame_state for one in off])
-        before, scales = scales, _likeliest(problem, arrays.states, states.cpu().numpy())
-        if all(one.apart(before[name]) < _SETTLED for name, one in scales.items()):
-            break
+        errors = np.zeros((*states.shape[:2], 6))
+        np.add.at(errors, (..., list(arrays.states)), states.cpu().numpy())
+        scales = {name: _scales(problem, errors, name) for name in _GROUPS}
     return tuple(_scaled(one, scales) for one in stated)
 
 
-def _prior(
-    problem: Problem, axes: Sequence[int], scales: Mapping[str, _Scales]
-) -> tuple[FloatArray, FloatArray]:
-    """Transition and inverse sigmas of the frames' states under scaled sigmas."""
-    sigmas = tuple(_scaled(one, scales) for one in problem.pose_sigmas)
-    components = state_components(sigmas, tuple(POSE_STATES[axis] for axis in axes))
-    return state_prior(problem.map_from_vehicle, components, problem.visit_of_frame)
+def _of_group(sigma: PoseSigma, name: str) -> tuple[float, Drift]:
+    """Sigma and drift of a group."""
+    axis = _GROUPS[name][0]
+    return float(sigma.by_state()[axis]), sigma.drift_by_state()[axis]
 
 
 def _scaled(stated: PoseSigma, scales: Mapping[str, _Scales]) -> PoseSigma:
     """A visit's sigmas, each multiplied by its scale."""
-
-    def total(sigma: float, drift: Drift, scale: _Scales) -> tuple[float, Drift]:
+    out = {}
+    for name, scale in scales.items():
+        sigma, drift = _of_group(stated, name)
         white = math.sqrt(max(sigma**2 - drift.sigma**2, 0.0)) * math.exp(scale.white)
         fading = Drift(drift.sigma * math.exp(scale.drift), drift.over_m * math.exp(scale.over))
-        return math.hypot(white, fading.sigma), fading
-
-    position_m, position = total(stated.position_m, stated.position_drift, scales["position"])
-    heading_rad, heading = total(stated.heading_rad, stated.heading_drift, scales["heading"])
-    attitude_rad, attitude = total(stated.roll_pitch_rad, stated.roll_pitch_drift, scales["roll_pitch"])
-    height_m = stated.height_m * math.exp(scales["height"].white)
+        out[name] = math.hypot(white, fading.sigma), fading
+    (position_m, position), (height_m, _) = out["position"], out["height"]
+    (attitude_rad, attitude), (heading_rad, heading) = out["roll_pitch"], out["heading"]
     return PoseSigma(position_m, heading_rad, attitude_rad, height_m, position, heading, attitude)
 
 
-def _likeliest(problem: Problem, axes: Sequence[int], drawn: FloatArray) -> dict[str, _Scales]:
-    """The scales under which the states (D, J, S) that were drawn are likeliest, by group."""
-    unscaled = dict.fromkeys(_GROUPS, _Scales())
-    _, root = _prior(problem, axes, unscaled)
-    first_drift = next((n for n in range(1, len(axes)) if axes[n] <= axes[n - 1]), len(axes))
+def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
+    """The scales of a group that errors (D, J, 6), drawn, call for."""
+    errors = drawn[:, :, _GROUPS[name]]
+    if name == "position":  # its drift keeps its direction in the map
+        errors = np.einsum("jab,djb->dja", problem.map_from_vehicle[:, :2, :2], errors)
+    stated = [_of_group(one, name) for one in problem.pose_sigmas]
+    drift_m2, total_m2 = np.mean([[drift.sigma**2, sigma**2] for sigma, drift in stated], axis=0)
+    over_m = float(np.mean([drift.over_m for _, drift in stated]))
+    correlation, step_m, path_m = _autocorrelation(problem, errors)
+    if not drift_m2 or len(correlation) < _LEAST_LAGS:
+        count = errors.shape[1] * errors.shape[2]
+        return _Scales(white=_shrunk(0.5 * math.log(correlation[0] / total_m2), 1 / (2 * count)))
+    fading, white = max(float(correlation[1]), 0.01 * correlation[0]), float(correlation[0] - correlation[1])
+    below = np.flatnonzero(correlation <= fading / math.e)
+    faded_m = step_m * float(below[0] if len(below) else len(correlation))
+    independent = errors.shape[2] * max(path_m / (2 * faded_m), 0.5)
+    return _Scales(
+        white=_shrunk(
+            0.5 * math.log(max(white, 1e-4 * correlation[0]) / max(total_m2 - drift_m2, 1e-4 * total_m2)),
+            1 / (2 * independent),
+        ),
+        drift=_shrunk(0.5 * math.log(fading / drift_m2), 1 / (2 * independent)),
+        over=_shrunk(math.log(faded_m / over_m), 1 / independent),
+    )
+
+
+def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, float, float]:
+    """Mean products of errors (D, J, a) that lie 0, 1, 2 ... steps apart, the step, and the path, m."""
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
-    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3]), axis=1)
-    turn = np.tile(np.eye(6), (len(poses), 1, 1))
-    turn[1:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
-    goes_on = np.diff(visit, prepend=-1) == 0
-    scales = {}
-    for name, group in _GROUPS.items():
-        white = [n for n in range(first_drift) if axes[n] in group]
-        fading = [n for n in range(first_drift, len(axes)) if axes[n] in group]
-        scale = _Scales()
-        if white:
-            squares = np.mean(np.sum((drawn[:, :, white] * root[:, white]) ** 2, axis=(1, 2)))
-            scale = replace(scale, white=_scale_of(float(squares), len(root) * len(white)))
-        if fading:
-            drift = [one.drift_by_state()[axes[fading[0]]] for one in problem.pose_sigmas]
-            sigma, over_m = (
-                np.array([getattr(one, key) for one in drift])[visit] for key in ("sigma", "over_m")
-            )
-            own = drawn[:, :, fading]
-            columns = [axes[n] for n in fading]
-            before = np.einsum("jab,djb->dja", turn[:, columns][:, :, columns], np.roll(own, 1, axis=1))
-
-            def profile(over: float) -> tuple[float, float]:
-                """Negative log posterior at the best sigma for a distance, and that sigma, as scales."""
-                memory = goes_on * np.exp(-np.maximum(step_m / (over_m * math.exp(over)), MIN_STEP))
-                width = np.sqrt(1 - memory**2)
-                new = (own - memory[:, None] * before) / (sigma * width)[:, None]
-                count = own[0].size
-                squares = float(np.mean(np.sum(new**2, axis=(1, 2))))
-                best = _scale_of(squares, count)
-                loss = (
-                    count * best
-                    + math.exp(-2 * best) * squares / 2
-                    + own.shape[2] * float(np.log(width).sum())
-                )
-                return loss + best**2 / (2 * _SPREAD**2) + (over / _OVER_SPREAD) ** 2 / 2, best
-
-            found = minimize_scalar(lambda over: profile(over)[0], bounds=(-_MOST, _MOST), method="bounded")
-            scale = replace(scale, drift=profile(found.x)[1], over=float(found.x))
-        scales[name] = scale
-    return scales
+    products, counts, path_m, step_m = np.zeros(0), np.zeros(0), 0.0, 1.0
+    moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(visit) == 0]
+    step_m = max(float(np.median(moved)) if len(moved) else 0.0, _LEAST_STEP_M)
+    for own in (visit == number for number in range(problem.visit_count)):
+        place = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(poses[own][:, :2, 3], axis=0), axis=1))]
+        )
+        grid = np.arange(0.0, place[-1] + step_m / 2, step_m)
+        nearest = np.abs(place[None] - grid[:, None]).argmin(axis=1)
+        even = errors[:, own][:, nearest]
+        size = 2 * len(grid)
+        spectrum = np.abs(np.fft.rfft(even, size, axis=1)) ** 2
+        found = np.fft.irfft(spectrum, size, axis=1)[:, : len(grid)].mean(axis=(0, 2))
+        lags = max(len(products), len(found))
+        products = np.pad(products, (0, lags - len(products))) + np.pad(found, (0, lags - len(found)))
+        counts = np.pad(counts, (0, lags - len(counts))) + np.pad(
+            np.arange(len(grid), 0, -1), (0, lags - len(found))
+        )
+        path_m += float(place[-1])
+    return products / counts, step_m, path_m
 
 
-def _scale_of(squares: float, count: int) -> float:
-    """The likeliest logarithm a of a sigma's scale, for the sum of ``count`` squares in stated sigmas.
-
-    Minimises count a + exp(-2 a) squares / 2 + a^2 / (2 spread^2) by Newton's method.
-    """
-    a = 0.5 * math.log(max(squares, 1e-12) / count)
-    for _ in range(20):
-        pull = math.exp(-2 * a) * squares
-        a -= (count - pull + a / _SPREAD**2) / (2 * pull + 1 / _SPREAD**2)
-    return min(max(a, -_MOST), _MOST)
+def _shrunk(logarithm: float, variance: float) -> float:
+    """An estimated logarithm of a scale, drawn towards 0, what was stated, as its variance asks for."""
+    return float(np.clip(logarithm * _SPREAD**2 / (_SPREAD**2 + variance), -_MOST, _MOST))

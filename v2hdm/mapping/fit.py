@@ -33,6 +33,9 @@ def contradictions(
             one.value,
             one.sigma,
             one.sigmas,
+            one.p_value,
+            one.gain,
+            one.image_share,
         )
         for one in found
     )

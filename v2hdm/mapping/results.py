@@ -27,8 +27,7 @@ class Contradiction:
 
     ``fault`` of ``cameras``, along ``axis`` 0 to 2 of the vehicle (survey, lever) or the map (slope, datum),
     ``about`` the class of a known size and its length, a surveyed point, or the visit of a clock. ``value``
-    is true minus stated, in s, m, rad or a share, with the ``sigma`` of this drive, inf where it is
-    unobservable; ``sigmas`` is the value in sigmas, by its chi-square.
+    is true minus stated, in s, m, rad or a share; the rest is as in :class:`v2hdm.adjust.ScoreTest`.
     """
 
     fault: Fault
@@ -38,6 +37,9 @@ class Contradiction:
     value: float
     sigma: float
     sigmas: float
+    p_value: float
+    gain: float
+    image_share: float
 
 
 @dataclass(frozen=True)
