@@ -51,6 +51,7 @@ from v2hdm.workers import share_out
 
 CLEAN = "nothing"
 _INSIDE = float(chi2.ppf(0.95, 1))
+_MOUNTING = ("height", "roll", "pitch", "yaw")
 _LEVEL = 0.01  # of the tests whether p-values are uniform
 _REFUSED, _CRASHED = "refused", "CRASHED"
 
@@ -59,7 +60,8 @@ _REFUSED, _CRASHED = "refused", "CRASHED"
 class Row:
     """What became of one drive.
 
-    ``tests`` are the score tests: kind, p-value, value, sigma. ``errors`` are squared, in sigmas, by quantity.
+    ``tests`` are the score tests: kind, p-value, value, sigma. ``errors`` are squared, in sigmas, by
+    quantity. ``seconds`` are of the CPU.
     """
 
     seed: int
@@ -67,6 +69,7 @@ class Row:
     name: str
     spoil: str
     default_noise: bool
+    road: bool
     status: str
     findings: list[dict[str, Any]] = field(default_factory=list)
     untold: list[dict[str, Any]] = field(default_factory=list)
@@ -104,10 +107,10 @@ def map_one(job: _Job) -> Row:
     truth = truth_of(world, drive, visibility)
     about: dict[str, Any] = {
         "seed": seed, "route": recipe.route, "name": recipe.port.name, "spoil": spoil,
-        "default_noise": recipe.default_noise,
-        "drawn": {**asdict(recipe.poses), **asdict(recipe.detector)},
+        "default_noise": recipe.default_noise, "road": recipe.road is not None,
+        "drawn": recipe.as_figures(),
     }  # fmt: skip
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     sets = camera_sets(drive)
     if not alone:
         sets = dict(list(sets.items())[-1:])
@@ -116,11 +119,11 @@ def map_one(job: _Job) -> Row:
         findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
-        return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.perf_counter() - begin_s)
+        return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)
     except Exception as error:  # what a benchmark of robustness is for
         crash = {"check": _CRASHED, "says": f"{type(error).__name__}: {error}", "status": _CRASHED}
-        return Row(**about, status=_CRASHED, findings=[crash], seconds=time.perf_counter() - begin_s)
-    seconds = time.perf_counter() - begin_s
+        return Row(**about, status=_CRASHED, findings=[crash], seconds=time.process_time() - begin_s)
+    seconds = time.process_time() - begin_s
     verdict = Verdict.of(findings)
     best = list(methods.values())[-1][BEST]
     expected = driven_past(drive, truth, tuple(drive.cameras))
@@ -178,16 +181,17 @@ def _sentence(finding: dict[str, Any]) -> str:
 
 def line(row: Row, clean: Row | None) -> str:
     """A drive as it is printed, against itself without the fault."""
-    inside = " ".join(f"{share:.2f}" for share in _shares([row]).values())
+    shares = _shares([row])
+    inside = " ".join(f"{shares[name]:.2f}" for name in ("corners", "sides", "distances", "mountings"))
     mark = ""
     if clean is not None:
         wrong, told, named = judge(row, clean)
         mark = (
             f"{'wrong' if wrong else 'right'} {'told' if told else 'SILENT' if wrong else 'pass'} {named:6}| "
         )
-    noise = "default" if row.default_noise else "stated "
+    noise = ("default" if row.default_noise else "stated") + (", road" if row.road else "")
     return (
-        f"{row.seed:5d} {row.name} {row.route:8}| {noise} | {row.spoil:16}| {row.status:7}| {mark}"
+        f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
         f"{100 * row.rmse_m:6.2f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
         f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}"
     )
@@ -208,9 +212,9 @@ def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
 
 def _shares(rows: Iterable[Row]) -> dict[str, float]:
     """By quantity, the share of errors inside the 95 % region."""
-    out = {}
-    for name in QUANTITIES:
-        errors = np.concatenate([[], *(row.errors.get(name, []) for row in rows)])
+    quantities, out = {**{name: (name,) for name in QUANTITIES}, "mountings": _MOUNTING}, {}
+    for name, parts in quantities.items():
+        errors = np.concatenate([[], *(row.errors.get(part, []) for row in rows for part in parts)])
         out[name] = float(np.mean(errors <= _INSIDE)) if len(errors) else float("nan")
     return out
 
@@ -237,39 +241,39 @@ def summary_of_right(rows: Sequence[Row]) -> list[str]:
         lines.append(
             f"{kind:22s}{len(p):6d}{uniform:10.2g}{min(p):10.1g}{np.mean(np.array(p) < 0.05):9.2f}{mark}"
         )
-    lines.append(f"{'inside 95 %':22s}" + " ".join(f"{name:>9s}" for name in QUANTITIES))
+    lines.append(f"{'inside 95 %':22s}" + " ".join(f"{name:>9s}" for name in (*QUANTITIES, "mountings")))
     for name, own in (
         ("noise stated", [row for row in rows if not row.default_noise]),
         ("noise by default", [row for row in rows if row.default_noise]),
+        ("attitude recorded", [row for row in rows if row.road]),
         ("all", rows),
     ):
         lines.append(f"{name:22s}" + " ".join(f"{share:9.3f}" for share in _shares(own).values()))
     rmse = np.array([row.rmse_m for row in rows])
     lines.append(
-        f"corner RMSE, median {100 * np.nanmedian(rmse):.2f} cm, recall {np.nanmean([r.recall for r in rows]):.3f}, "
-        f"{np.mean([row.seconds for row in rows]):.1f} s a drive"
+        f"corner RMSE, median {100 * np.nanmedian(rmse):.2f} cm, recall "
+        f"{np.nanmean([r.recall for r in rows]):.3f}, {np.mean([row.seconds for row in rows]):.1f} s a drive"
     )
     return lines
 
 
 def summary_of_spoilt(rows: Sequence[Row], clean: dict[int, Row]) -> list[str]:
     """By fault, how many maps are wrong, silently, and when the true cause is named."""
-    lines = [
-        f"{'fault':18s}{'drives':>7s}{'wrong':>7s}{'SILENT':>7s}{'told':>6s}{'first':>6s}{'later':>6s}{'never':>6s}"
-    ]
+    columns = ("drives", "wrong", "SILENT", "told", "first", "later", "never")
+    lines = [f"{'fault':18s}" + "".join(f"{column:>7s}" for column in columns)]
     for spoil in dict.fromkeys(row.spoil for row in rows):
         own = [row for row in rows if row.spoil == spoil]
         judged = [judge(row, clean[row.seed]) for row in own]
         named = Counter(when for _, _, when in judged)
         lines.append(
             f"{spoil:18s}{len(own):7d}{sum(wrong for wrong, _, _ in judged):7d}"
-            f"{sum(wrong and not told for wrong, told, _ in judged):7d}{sum(told for _, told, _ in judged):6d}"
-            f"{named['first']:6d}{named['later']:6d}{named['never']:6d}"
+            f"{sum(wrong and not told for wrong, told, _ in judged):7d}"
+            f"{sum(told for _, told, _ in judged):7d}"
+            f"{named['first']:7d}{named['later']:7d}{named['never']:7d}"
         )
         said = Counter(finding["check"] for row in own for finding in row.findings)
-        lines.append(
-            "    " + (", ".join(f"{check} {count}" for check, count in said.most_common()) or "nothing")
-        )
+        checks = ", ".join(f"{check} {count}" for check, count in said.most_common())
+        lines.append(f"    {checks or 'nothing'}")
     return lines
 
 
@@ -279,7 +283,7 @@ def _start_worker() -> None:
 
 
 def measure(jobs: Sequence[_Job], workers: int, verbose: bool) -> list[Row]:
-    """Map all drives; prints a line as each is finished. Clean drives come before spoilt ones of their seed."""
+    """Map all drives; prints a line as each is finished. A clean drive comes before its spoilt ones."""
     rows: list[Row] = []
     clean: dict[int, Row] = {}
 

@@ -34,7 +34,7 @@ _IMAGES = 42  # stream of a seed
 
 @dataclass(frozen=True)
 class Projected:
-    """The corners of all markings in one image: ``px`` (J, 4, 2), ``inside`` (J, 4), ``distance_m`` (J, 4)."""
+    """The corners of all markings in one image: ``px`` (J, 4, 2), ``inside`` and ``distance_m`` (J, 4)."""
 
     px: FloatArray
     inside: BoolArray

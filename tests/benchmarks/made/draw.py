@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -14,15 +15,16 @@ from v2hdm.simulate.port.config import CameraConfig
 
 ROUTES = ("straight", "bends", "turning")
 
-_DRAWN = 31  # stream of a seed that belongs to what is drawn here; a port's own are small numbers
+_DRAWN, _ROAD = 31, 32  # streams of a seed; a port's own are small numbers
+_ROAD_SHARE = 1 / 3  # of the drives that have one
 
 
 @dataclass(frozen=True)
 class PoseErrors:
     """How recorded poses differ from true ones; standard deviations per axis, lengths of correlation in m.
 
-    White parts are drawn anew at every recorded pose, drifts are Gauss-Markov processes along the route. Roll,
-    pitch and heave are those of a smooth road under a vehicle whose receiver records neither.
+    White parts are drawn anew at every recorded pose, drifts are Gauss-Markov processes along the route.
+    Roll, pitch and heave are those of a smooth road under a vehicle whose receiver records neither.
     """
 
     position_white_m: float
@@ -75,8 +77,30 @@ class DetectorErrors:
 
 
 @dataclass(frozen=True)
+class RoadShape:
+    """Ground that is not level, under a receiver that records height, roll and pitch.
+
+    Attributes:
+        slope: standard deviation of its grade, and of its fall across the route.
+        slope_over_m: length over which these change.
+        mount_rad: roll and pitch of the receiver on the vehicle.
+        height_drift_m: of the recorded height, over the length over which positions drift.
+    """
+
+    slope: float
+    slope_over_m: float
+    mount_rad: tuple[float, float]
+    height_drift_m: float
+
+
+@dataclass(frozen=True)
 class Recipe:
-    """All that is drawn of one right drive; ``default_noise``: the user states no noise of the poses."""
+    """All that is drawn of one right drive.
+
+    ``default_noise``: the user states no noise of the poses. ``road`` is None for level ground under a
+    receiver that records neither height nor roll and pitch; else it records these, with the errors of roll
+    and pitch that ``poses`` has, beside the vehicle's sway.
+    """
 
     seed: int
     route: str
@@ -84,6 +108,11 @@ class Recipe:
     poses: PoseErrors
     detector: DetectorErrors
     default_noise: bool
+    road: RoadShape | None
+
+    def as_figures(self) -> dict[str, Any]:
+        """What was drawn, for the record."""
+        return {**asdict(self.poses), **asdict(self.detector), "road": self.road and asdict(self.road)}
 
     @property
     def name(self) -> str:
@@ -112,7 +141,20 @@ def draw(seed: int, route: str | None = None) -> Recipe:
         false=float(rng.uniform(0.0, 0.03)),
         cut=float(rng.uniform(0.0, 0.02)),
     )
-    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise)
+    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
+
+
+def _road(seed: int, poses: PoseErrors) -> RoadShape | None:
+    rng = np.random.default_rng([seed, _ROAD])
+    if rng.random() > _ROAD_SHARE:
+        return None
+    roll, pitch = rng.normal(0.0, 0.003, 2)
+    return RoadShape(
+        slope=_log_uniform(rng, 5e-4, 4e-3),
+        slope_over_m=_log_uniform(rng, 20.0, 50.0),
+        mount_rad=(float(roll), float(pitch)),
+        height_drift_m=1.5 * poses.position_drift_m,
+    )
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

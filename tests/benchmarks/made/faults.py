@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from tests.benchmarks.made.world import World, make
+from tests.benchmarks.made.world import World, beside, make
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import FloatArray, Trajectory
 
@@ -66,21 +66,23 @@ def _late(offset_s: float, world: World) -> World:
 def _jitter(sigma_s: float, world: World) -> World:
     """Images are stamped when the operating system got to it: late by a random time."""
     off = np.random.default_rng([world.recipe.seed, 5]).normal(0.0, sigma_s, len(world.taken_s))
-    return _with_stamps(
-        world, lambda stamp_s: np.maximum.accumulate(stamp_s + off) + 1e-6 * np.arange(len(off))
-    )
+    return _with_stamps(world, lambda stamp_s: _rising(stamp_s + off))
 
 
 def _jitter_of_poses(sigma_s: float, world: World) -> World:
     """Poses are stamped when they arrived."""
     stamp_s = world.recorded.stamp_s
     off = np.random.default_rng([world.recipe.seed, 6]).normal(0.0, sigma_s, len(stamp_s))
-    jittered = np.maximum.accumulate(stamp_s + off) + 1e-6 * np.arange(len(off))
-    return replace(world, recorded=Trajectory(jittered, world.recorded.map_from_vehicle))
+    return replace(world, recorded=Trajectory(_rising(stamp_s + off), world.recorded.map_from_vehicle))
+
+
+def _rising(stamp_s: FloatArray) -> FloatArray:
+    """Stamps (N,) that rise by a microsecond at least, as those of a queue do."""
+    return np.maximum.accumulate(stamp_s) + 1e-6 * np.arange(len(stamp_s))
 
 
 def _counted(world: World) -> World:
-    """Stamps are counted from the first at the mean rate; the vehicle's speed, and with it the rate, varied."""
+    """Stamps are counted from the first at the mean rate, which varied with the vehicle's speed."""
     return _with_stamps(world, lambda stamp_s: np.linspace(stamp_s[0], stamp_s[-1], len(stamp_s)))
 
 
@@ -109,11 +111,16 @@ def _course(world: World) -> World:
     def change(poses: FloatArray) -> FloatArray:
         moved = np.diff(poses[:, :2, 3], axis=0)
         yaw = np.arctan2(moved[:, 1], moved[:, 0])
-        zero = np.zeros(len(poses))
-        poses[:, :3, :3] = rotation_from_euler(zero, zero, np.concatenate([yaw[:1], yaw]))
-        return poses
+        return _turned(poses, np.concatenate([yaw[:1], yaw]) - heading_rad(poses))
 
     return _with_poses(world, change)
+
+
+def _turned(poses: FloatArray, by_rad: FloatArray) -> FloatArray:
+    """Poses (P, 4, 4), turned to the left on the spot by angles (P,)."""
+    zero = np.zeros(len(poses))
+    poses[:, :3, :3] = rotation_from_euler(zero, zero, by_rad) @ poses[:, :3, :3]
+    return poses
 
 
 def _foreign(world: World) -> World:
@@ -124,34 +131,26 @@ def _foreign(world: World) -> World:
     return replace(world, elsewhere=(other, range(count // 3, 2 * count // 3)))
 
 
-def _lateral_m(world: World) -> FloatArray:
-    """Distance (J, 4) of the markings' corners from the route."""
-    points = world.corners_map[..., :2].reshape(-1, 2)
-    return world.port.route.distance_to(points).reshape(world.corners_map.shape[:2])
-
-
 def _crown(fall: float, world: World) -> World:
     """The road falls to both sides of the vehicle's route."""
     corners = world.corners_map.copy()
-    corners[..., 2] -= fall * _lateral_m(world)
+    _, left_m = beside(world.port.route, corners[..., :2].reshape(-1, 2))
+    corners[..., 2] -= fall * np.abs(left_m).reshape(corners.shape[:2])
     return replace(world, corners_map=corners)
 
 
-def _grade(grade: float, world: World) -> World:
-    """The world tilted about the map's y axis: heights and attitudes are recorded as on a real slope."""
+def _grade(grade: float, world: World, heights: bool = True) -> World:
+    """The world tilted about the map's y axis: recorded as on a real slope, or without the heights."""
     tilt = np.eye(4)
     tilt[:3, :3] = rotation_from_euler(np.zeros(1), np.array([-np.arctan(grade)]), np.zeros(1))[0]
-    return _with_poses(world, lambda poses: tilt @ poses)
 
+    def change(poses: FloatArray) -> FloatArray:
+        tilted = tilt @ poses
+        if not heights:
+            tilted[:, 2, 3] = 0.0
+        return tilted
 
-def _unlevel(grade: float, world: World) -> World:
-    """The ground rises under poses that say level: the recorded attitude is the map's, not the road's."""
-    rise = world.corners_map[..., 0] * grade
-    corners = world.corners_map.copy()
-    corners[..., 2] += rise
-    true = world.map_from_vehicle.copy()
-    true[:, 2, 3] += grade * true[:, 0, 3]
-    return replace(world, corners_map=corners, map_from_vehicle=true)
+    return _with_poses(world, change)
 
 
 def _survey(shift_m: tuple[float, float, float], world: World) -> World:
@@ -188,13 +187,7 @@ def _lens(focal: float, right_px: float, world: World) -> World:
 
 def _heading(turn_deg: float, world: World) -> World:
     """The recorded heading is off by a constant."""
-
-    def change(poses: FloatArray) -> FloatArray:
-        zero = np.zeros(len(poses))
-        poses[:, :3, :3] = rotation_from_euler(zero, zero, heading_rad(poses) + np.deg2rad(turn_deg))
-        return poses
-
-    return _with_poses(world, change)
+    return _with_poses(world, lambda poses: _turned(poses, np.full(len(poses), np.deg2rad(turn_deg))))
 
 
 _CLOCK = "clock|stamp|late"
@@ -217,7 +210,7 @@ SPOILS: Mapping[str, Spoil] = {
         Spoil("foreign images", "foreign|other drive|another drive|images", _foreign),
         Spoil("crown", "crown|cross-?fall|falls", partial(_crown, 0.02)),
         Spoil("grade", None, partial(_grade, 0.01)),
-        Spoil("unlevel poses", "slope|grade|rises|pitch", partial(_unlevel, 0.01)),
+        Spoil("no heights", "slope|grade|height", partial(_grade, 0.01, heights=False)),
         Spoil("survey", "survey|centre", partial(_survey, (0.1, 0.0, 0.0)), "survey|centre|forward"),
         Spoil("survey height", "survey|centre|height", partial(_survey, (0.0, 0.0, 0.1))),
         Spoil("lever", _LEVER, partial(_lever, 1.2, 0.0), f"{_LEVER}|forward"),
