@@ -24,7 +24,8 @@ class PoseErrors:
     """How recorded poses differ from true ones; standard deviations per axis, lengths of correlation in m.
 
     White parts are drawn anew at every recorded pose, drifts are Gauss-Markov processes along the route.
-    Roll, pitch and heave are those of a smooth road under a vehicle whose receiver records neither.
+    Roll, pitch and heave are those of a ``smooth`` road under a vehicle whose receiver records neither; else
+    Gauss-Markov processes, too.
     """
 
     position_white_m: float
@@ -37,6 +38,7 @@ class PoseErrors:
     roll_pitch_over_m: float
     heave_m: float
     heave_over_m: float
+    smooth: bool = True
 
     def as_stated(self) -> PoseNoise:
         """A data sheet that states them as they are."""
@@ -109,6 +111,12 @@ class Recipe:
     detector: DetectorErrors
     default_noise: bool
     road: RoadShape | None
+
+    def as_modelled(self) -> Recipe:
+        """The same with all errors stated as they are, and none that the product does not reckon with."""
+        poses = replace(self.poses, smooth=False)
+        detector = replace(self.detector, sigma_spread=0.0, stated_factor=1.0, missed=0.0, false=0.0, cut=0.0)
+        return replace(self, poses=poses, detector=detector, default_noise=False, road=None)
 
     def as_figures(self) -> dict[str, Any]:
         """What was drawn, for the record."""

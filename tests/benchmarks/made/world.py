@@ -136,8 +136,9 @@ def _driven(recipe: Recipe, port: Port, ground: Ground, stamp_s: FloatArray) -> 
     """Where the vehicle (N, 4, 4) truly was at times (N,)."""
     errors, station = recipe.poses, port.route.station_at(stamp_s)
     rng = np.random.default_rng([recipe.seed, _TRUE])
-    sway = smooth_noise(station, errors.roll_pitch_rad, errors.roll_pitch_over_m, rng, 2)
-    heave = smooth_noise(station, errors.heave_m, errors.heave_over_m, rng)[:, 0]
+    noise = smooth_noise if errors.smooth else _rough_noise
+    sway = noise(station, errors.roll_pitch_rad, errors.roll_pitch_over_m, rng, 2)
+    heave = noise(station, errors.heave_m, errors.heave_over_m, rng, 1)[:, 0]
     grade, fall = (np.interp(station, ground.station_m, own) for own in (ground.grade, ground.fall))
     position = np.column_stack(
         [port.route.points_at(station), ground.height_at(station, np.zeros(len(station))) + heave]
@@ -181,6 +182,15 @@ def smooth_noise(
     smooth = gaussian_filter1d(white, width, axis=0, truncate=4.0)[margin : margin + len(grid_m)]
     smooth *= sigma * np.sqrt(2.0 * np.sqrt(np.pi) * width)
     return np.column_stack([np.interp(at_m, grid_m, column) for column in smooth.T])
+
+
+def _rough_noise(
+    at_m: FloatArray, sigma: float, over_m: float, rng: np.random.Generator, columns: int
+) -> FloatArray:
+    """A Gauss-Markov process (N, columns) at places (N,) in any order."""
+    order, out = np.argsort(at_m), np.empty((len(at_m), columns))
+    out[order] = correlated_noise(at_m[order], sigma, over_m, rng, columns)
+    return out
 
 
 def poses_of(position: FloatArray, roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:
