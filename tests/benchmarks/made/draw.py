@@ -16,6 +16,7 @@ from v2hdm.simulate.port.config import CameraConfig
 ROUTES = ("straight", "bends", "turning")
 
 _DRAWN, _ROAD = 31, 32  # streams of a seed; a port's own are small numbers
+_LEAST_LEFT_M = 30.0  # of a route for another bend
 _ROAD_SHARE = 1 / 3  # of the drives that have one
 
 
@@ -215,8 +216,9 @@ def _pieces(rng: np.random.Generator, route: str) -> list[list[float]]:
     if route == "straight":
         return [[length_m, 0.0]]
     sharpest_deg = {"bends": (8.0, 35.0), "turning": (50.0, 95.0)}[route]
-    pieces, left_m = [[float(rng.uniform(8.0, 16.0)), 0.0]], length_m
-    while left_m > 0:
+    pieces = [[float(rng.uniform(8.0, 16.0)), 0.0]]
+    left_m = length_m - pieces[0][0]
+    while len(pieces) < 2 or left_m > _LEAST_LEFT_M:
         bend_m, turn_deg = float(rng.uniform(14.0, 24.0)), float(rng.uniform(*sharpest_deg))
         straight_m = float(rng.uniform(6.0, 25.0))
         pieces += [[bend_m, turn_deg * float(rng.choice([-1.0, 1.0]))], [straight_m, 0.0]]
