@@ -159,7 +159,7 @@ def _road(seed: int, poses: PoseErrors) -> RoadShape | None:
         return None
     roll, pitch = rng.normal(0.0, 0.003, 2)
     return RoadShape(
-        slope=_log_uniform(rng, 5e-4, 4e-3),
+        slope=_log_uniform(rng, 3e-4, 2e-3),
         slope_over_m=_log_uniform(rng, 20.0, 50.0),
         mount_rad=(float(roll), float(pitch)),
         height_drift_m=1.5 * poses.position_drift_m,
