@@ -245,9 +245,12 @@ def _shares(rows: Iterable[Row]) -> dict[str, float]:
 def summary_of_right(rows: Sequence[Row]) -> list[str]:
     """Failed drives, whether p-values are uniform, and coverage, of drives without a fault."""
     status = Counter(row.status for row in rows)
-    failed = [row for row in rows if row.status not in ("PASS", "WARN")]
     lines = [f"right drives: {len(rows)}, " + ", ".join(f"{count} {name}" for name, count in status.items())]
-    lines += [f"  failed {row.seed} ({row.name} {row.route}): {row.first}" for row in failed]
+    lines += [
+        f"  {row.status} {row.seed} ({row.name} {row.route}, {100 * row.rmse_m:.1f} cm): {row.first}"
+        for row in rows
+        if row.status != "PASS"
+    ]
     said = Counter(finding["check"] for row in rows for finding in row.findings)
     lines.append(
         "raised: " + (", ".join(f"{check} {count}" for check, count in said.most_common()) or "nothing")
