@@ -28,12 +28,13 @@ _BORDER_PX = 4.0
 _HIDDEN_PX = 200.0  # sigma of a corner in the direction that the image's border hides
 _NEAR_M = 0.3
 _BISECTIONS = 12
+_TANGENT = 0.98  # share of the way to the border, from which on a side is straight
 _IMAGES = 42  # stream of a seed
 
 
 @dataclass(frozen=True)
 class Projected:
-    """The corners of all markings in one image: ``px`` (J, 4, 2), ``inside`` (J, 4), ``distance_m`` (J, 4)."""
+    """The corners of all markings in one image: ``px`` (J, 4, 2), ``inside`` and ``distance_m`` (J, 4)."""
 
     px: FloatArray
     inside: BoolArray
@@ -144,11 +145,12 @@ def _at_border(
         middle = 0.5 * (low + high)
         point = project(lens, cam_from_map, (start + middle * (end - start))[None, None])
         low, high = (middle, high) if point.inside[0, 0] else (low, middle)
-    px = project(lens, cam_from_map, (start + low * (end - start))[None, None]).px[0, 0]
+    # The direction of the side where it leaves the image: the lens bends it on the way there.
+    shares = np.array([_TANGENT * low, low])[:, None]
+    before, px = project(lens, cam_from_map, (start + shares * (end - start))[None]).px[0]
     if len(beside) == 2:  # a tip of which the border hides all: two sides may end there or beyond
         return px, _HIDDEN_PX**2 * np.eye(2)
-    along = px - seen.px[j, beside[0]]
-    along = along / max(float(np.linalg.norm(along)), 1e-6)
+    along = (px - before) / max(float(np.linalg.norm(px - before)), 1e-9)
     return px, _HIDDEN_PX**2 * np.outer(along, along) + sigma_px**2 * np.eye(2)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -14,15 +15,18 @@ from v2hdm.simulate.port.config import CameraConfig
 
 ROUTES = ("straight", "bends", "turning")
 
-_DRAWN = 31  # stream of a seed that belongs to what is drawn here; a port's own are small numbers
+_DRAWN, _ROAD = 31, 32  # streams of a seed; a port's own are small numbers
+_LEAST_LEFT_M = 30.0  # of a route for another bend
+_ROAD_SHARE = 1 / 3  # of the drives that have one
 
 
 @dataclass(frozen=True)
 class PoseErrors:
     """How recorded poses differ from true ones; standard deviations per axis, lengths of correlation in m.
 
-    White parts are drawn anew at every recorded pose, drifts are Gauss-Markov processes along the route. Roll,
-    pitch and heave are those of a smooth road under a vehicle whose receiver records neither.
+    White parts are drawn anew at every recorded pose, drifts are Gauss-Markov processes along the route.
+    Roll, pitch and heave are those of a ``smooth`` road under a vehicle whose receiver records neither; else
+    Gauss-Markov processes, too.
     """
 
     position_white_m: float
@@ -35,6 +39,7 @@ class PoseErrors:
     roll_pitch_over_m: float
     heave_m: float
     heave_over_m: float
+    smooth: bool = True
 
     def as_stated(self) -> PoseNoise:
         """A data sheet that states them as they are."""
@@ -75,8 +80,30 @@ class DetectorErrors:
 
 
 @dataclass(frozen=True)
+class RoadShape:
+    """Ground that is not level, under a receiver that records height, roll and pitch.
+
+    Attributes:
+        slope: standard deviation of its grade, and of its fall across the route.
+        slope_over_m: length over which these change.
+        mount_rad: roll and pitch of the receiver on the vehicle.
+        height_drift_m: of the recorded height, over the length over which positions drift.
+    """
+
+    slope: float
+    slope_over_m: float
+    mount_rad: tuple[float, float]
+    height_drift_m: float
+
+
+@dataclass(frozen=True)
 class Recipe:
-    """All that is drawn of one right drive; ``default_noise``: the user states no noise of the poses."""
+    """All that is drawn of one right drive.
+
+    ``default_noise``: the user states no noise of the poses. ``road`` is None for level ground under a
+    receiver that records neither height nor roll and pitch; else it records these, with the errors of roll
+    and pitch that ``poses`` has, beside the vehicle's sway.
+    """
 
     seed: int
     route: str
@@ -84,6 +111,17 @@ class Recipe:
     poses: PoseErrors
     detector: DetectorErrors
     default_noise: bool
+    road: RoadShape | None
+
+    def as_modelled(self) -> Recipe:
+        """The same with all errors stated as they are, and none that the product does not reckon with."""
+        poses = replace(self.poses, smooth=False)
+        detector = replace(self.detector, sigma_spread=0.0, stated_factor=1.0, missed=0.0, false=0.0, cut=0.0)
+        return replace(self, poses=poses, detector=detector, default_noise=False, road=None)
+
+    def as_figures(self) -> dict[str, Any]:
+        """What was drawn, for the record."""
+        return {**asdict(self.poses), **asdict(self.detector), "road": self.road and asdict(self.road)}
 
     @property
     def name(self) -> str:
@@ -112,7 +150,20 @@ def draw(seed: int, route: str | None = None) -> Recipe:
         false=float(rng.uniform(0.0, 0.03)),
         cut=float(rng.uniform(0.0, 0.02)),
     )
-    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise)
+    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
+
+
+def _road(seed: int, poses: PoseErrors) -> RoadShape | None:
+    rng = np.random.default_rng([seed, _ROAD])
+    if rng.random() > _ROAD_SHARE:
+        return None
+    roll, pitch = rng.normal(0.0, 0.003, 2)
+    return RoadShape(
+        slope=_log_uniform(rng, 3e-4, 2e-3),
+        slope_over_m=_log_uniform(rng, 20.0, 50.0),
+        mount_rad=(float(roll), float(pitch)),
+        height_drift_m=1.5 * poses.position_drift_m,
+    )
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -165,8 +216,9 @@ def _pieces(rng: np.random.Generator, route: str) -> list[list[float]]:
     if route == "straight":
         return [[length_m, 0.0]]
     sharpest_deg = {"bends": (8.0, 35.0), "turning": (50.0, 95.0)}[route]
-    pieces, left_m = [[float(rng.uniform(8.0, 16.0)), 0.0]], length_m
-    while left_m > 0:
+    pieces = [[float(rng.uniform(8.0, 16.0)), 0.0]]
+    left_m = length_m - pieces[0][0]
+    while len(pieces) < 2 or left_m > _LEAST_LEFT_M:
         bend_m, turn_deg = float(rng.uniform(14.0, 24.0)), float(rng.uniform(*sharpest_deg))
         straight_m = float(rng.uniform(6.0, 25.0))
         pieces += [[bend_m, turn_deg * float(rng.choice([-1.0, 1.0]))], [straight_m, 0.0]]

@@ -9,19 +9,20 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
-from tests.benchmarks.made.draw import PoseErrors, Recipe
+from tests.benchmarks.made.draw import Recipe
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.drive.road import lay_flat
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, Image, PoseNoise, Trajectory, Truth
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.route import correlated_noise
+from v2hdm.simulate.port.route import Route, correlated_noise
 
 MAX_GAP_S = 0.5
 """As users read drives."""
 
-_TRUE, _RECORDED = 40, 41  # streams of a seed
+_TRUE, _RECORDED, _ROAD = 40, 41, 43  # streams of a seed
 _GRID_M = 0.1
 
 
@@ -75,50 +76,104 @@ class World:
 def make(recipe: Recipe) -> World:
     """The world of a right drive."""
     port = build_port(recipe.port)
-    route, taken_s = port.route, port.driven.stamp_s
-    poses_s = port.driven.recorded.stamp_s
-    station = route.station_at(taken_s)
-    rng = np.random.default_rng([recipe.seed, _TRUE])
-    errors, level = recipe.poses, np.zeros(len(poses_s))
-    sway = smooth_noise(station, errors.roll_pitch_rad, errors.roll_pitch_over_m, rng, 2)
-    heave = smooth_noise(station, errors.heave_m, errors.heave_over_m, rng)[:, 0]
-    true = poses_of(np.column_stack([route.points_at(station), heave]), *sway.T, route.yaw_at(station))
-    points, yaw = _recorded(port, poses_s, errors, np.random.default_rng([recipe.seed, _RECORDED]))
-    recorded = poses_of(np.column_stack([points, level]), level, level, yaw)
+    route, taken_s, poses_s = port.route, port.driven.stamp_s, port.driven.recorded.stamp_s
+    ground = Ground.of(recipe, port)
+    true = _driven(recipe, port, ground, np.concatenate([taken_s, poses_s]))
     corners = np.array([marking.corners_map for marking in port.hd_map.markings]).reshape(-1, 4, 2)
+    height_m = ground.height_at(*beside(route, corners.reshape(-1, 2))).reshape(-1, 4, 1)
     return World(
         recipe=recipe,
         port=port,
         lenses={name: camera.info for name, camera in port.cameras.items()},
         taken_s=taken_s,
-        map_from_vehicle=true,
+        map_from_vehicle=true[: len(taken_s)],
         cam_from_vehicle={
             name: np.tile(matrix, (len(taken_s), 1, 1)) for name, matrix in port.cam_from_vehicle.items()
         },
-        corners_map=np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2),
+        corners_map=np.concatenate([corners, height_m], axis=2),
         cameras=port.cameras,
         stamp_s=dict.fromkeys(port.cameras, taken_s),
-        recorded=Trajectory(poses_s, recorded),
-        pose_noise=PoseNoise.as_far_as_stated() if recipe.default_noise else errors.as_stated(),
+        recorded=Trajectory(poses_s, _recorded(recipe, port, poses_s, true[len(taken_s) :])),
+        pose_noise=PoseNoise.as_far_as_stated() if recipe.default_noise else recipe.poses.as_stated(),
     )
 
 
-def _recorded(
-    port: Port, stamp_s: FloatArray, errors: PoseErrors, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Points (P, 2) and headings (P,) as a receiver measures them."""
-    station = port.route.station_at(stamp_s)
+@dataclass(frozen=True)
+class Ground:
+    """The ground along the route: ``height_m``, ``grade``, ``fall`` (N,) to the right, at ``station_m``."""
+
+    station_m: FloatArray
+    height_m: FloatArray
+    grade: FloatArray
+    fall: FloatArray
+
+    @classmethod
+    def of(cls, recipe: Recipe, port: Port) -> Ground:
+        """Level where no shape of the road was drawn."""
+        station = port.route.station_m
+        level = np.zeros(len(station))
+        if recipe.road is None:
+            return cls(station, level, level, level)
+        rng = np.random.default_rng([recipe.seed, _ROAD])
+        grade, fall = smooth_noise(station, recipe.road.slope, recipe.road.slope_over_m, rng, 2).T
+        rise = 0.5 * (grade[1:] + grade[:-1]) * np.diff(station)
+        return cls(station, np.concatenate([[0.0], np.cumsum(rise)]), grade, fall)
+
+    def height_at(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
+        """Height (K,) at stations, ``left_m`` (K,) to the left of the route."""
+        height, fall = (np.interp(station_m, self.station_m, own) for own in (self.height_m, self.fall))
+        return np.asarray(height + fall * left_m)
+
+
+def beside(route: Route, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Stations (K,) of the route nearest to points (K, 2), and how far (K,) these lie to the left of it."""
+    _, nearest = cKDTree(route.points_map).query(points_map)
+    off, yaw = points_map - route.points_map[nearest], route.yaw_rad[nearest]
+    return route.station_m[nearest], off[:, 1] * np.cos(yaw) - off[:, 0] * np.sin(yaw)
+
+
+def _driven(recipe: Recipe, port: Port, ground: Ground, stamp_s: FloatArray) -> FloatArray:
+    """Where the vehicle (N, 4, 4) truly was at times (N,)."""
+    errors, station = recipe.poses, port.route.station_at(stamp_s)
+    rng = np.random.default_rng([recipe.seed, _TRUE])
+    noise = smooth_noise if errors.smooth else _rough_noise
+    sway = noise(station, errors.roll_pitch_rad, errors.roll_pitch_over_m, rng, 2)
+    heave = noise(station, errors.heave_m, errors.heave_over_m, rng, 1)[:, 0]
+    grade, fall = (np.interp(station, ground.station_m, own) for own in (ground.grade, ground.fall))
+    position = np.column_stack(
+        [port.route.points_at(station), ground.height_at(station, np.zeros(len(station))) + heave]
+    )
+    return poses_of(
+        position, np.arctan(fall) + sway[:, 0], sway[:, 1] - np.arctan(grade), port.route.yaw_at(station)
+    )
+
+
+def _recorded(recipe: Recipe, port: Port, stamp_s: FloatArray, true: FloatArray) -> FloatArray:
+    """Poses (P, 4, 4) as a receiver measures the ``true`` ones, at times (P,)."""
+    errors, station = recipe.poses, port.route.station_at(stamp_s)
+    rng = np.random.default_rng([recipe.seed, _RECORDED])
     off = correlated_noise(station, errors.position_drift_m, errors.position_over_m, rng, 2)
     off += rng.normal(0.0, errors.position_white_m, off.shape)
-    turn = correlated_noise(station, errors.heading_drift_rad, errors.heading_over_m, rng)[:, 0]
-    turn += rng.normal(0.0, errors.heading_white_rad, turn.shape)
-    return port.route.points_at(station) + off, port.route.yaw_at(station) + turn
+    yaw = port.route.yaw_at(station)
+    yaw += correlated_noise(station, errors.heading_drift_rad, errors.heading_over_m, rng)[:, 0]
+    yaw += rng.normal(0.0, errors.heading_white_rad, yaw.shape)
+    height_m, tilt = np.zeros(len(stamp_s)), np.zeros((len(stamp_s), 2))
+    road = recipe.road
+    if road is not None:
+        height_m = (
+            true[:, 2, 3] + correlated_noise(station, road.height_drift_m, errors.position_over_m, rng)[:, 0]
+        )
+        pitch, roll = -np.arcsin(true[:, 2, 0]), np.arctan2(true[:, 2, 1], true[:, 2, 2])
+        tilt = np.column_stack([roll, pitch]) + road.mount_rad
+        tilt += correlated_noise(station, errors.roll_pitch_rad, errors.roll_pitch_over_m, rng, 2)
+    points = port.route.points_at(station) + off
+    return poses_of(np.column_stack([points, height_m]), *tilt.T, yaw)
 
 
 def smooth_noise(
     at_m: FloatArray, sigma: float, over_m: float, rng: np.random.Generator, columns: int = 1
 ) -> FloatArray:
-    """A smooth stationary process (N, columns) at places (N,): its correlation is exp(-d^2 / (2 over_m^2))."""
+    """A smooth stationary process (N, columns) at places (N,), correlated by exp(-d^2 / (2 over_m^2))."""
     grid_m = np.arange(at_m.min(), at_m.max() + 2 * _GRID_M, _GRID_M)
     # A Gaussian filter of width w makes white noise a process that is correlated over sqrt(2) w.
     width = over_m / np.sqrt(2.0) / _GRID_M
@@ -127,6 +182,15 @@ def smooth_noise(
     smooth = gaussian_filter1d(white, width, axis=0, truncate=4.0)[margin : margin + len(grid_m)]
     smooth *= sigma * np.sqrt(2.0 * np.sqrt(np.pi) * width)
     return np.column_stack([np.interp(at_m, grid_m, column) for column in smooth.T])
+
+
+def _rough_noise(
+    at_m: FloatArray, sigma: float, over_m: float, rng: np.random.Generator, columns: int
+) -> FloatArray:
+    """A Gauss-Markov process (N, columns) at places (N,) in any order."""
+    order, out = np.argsort(at_m), np.empty((len(at_m), columns))
+    out[order] = correlated_noise(at_m[order], sigma, over_m, rng, columns)
+    return out
 
 
 def poses_of(position: FloatArray, roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:
