@@ -22,13 +22,14 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
-from v2hdm.adjust.score_tests import Fault, ScoreTest, score_faults
+from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.validation import Excluded, Verdict
 
 __all__ = [
+    "CHANGES",
     "MODELS",
     "ControlPoints",
     "Drift",

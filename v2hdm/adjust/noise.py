@@ -87,7 +87,7 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
         states = descent.estimate.frame_state + torch.stack([one.frame_state for one in off])
         errors = np.zeros((*states.shape[:2], 6))
         np.add.at(errors, (..., list(arrays.states)), states.cpu().numpy())
-        scales = {name: _scales(problem, errors, name) for name in _GROUPS}
+        scales |= {name: _scales(problem, errors, name) for name in ("height", "roll_pitch", "heading")}
     return tuple(_scaled(one, scales) for one in stated)
 
 

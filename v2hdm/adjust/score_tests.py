@@ -30,11 +30,19 @@ from scipy import stats
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.model import Estimate, Gradient, camera_offset, prior_residuals, rigid, robustified
+from v2hdm.adjust.model import (
+    Estimate,
+    Gradient,
+    camera_offset,
+    points_in_camera,
+    prior_residuals,
+    rigid,
+    robustified,
+)
 from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
-from v2hdm.geometry.tensors import exp, inverse
+from v2hdm.geometry.tensors import NEAR_M, exp, inverse
 from v2hdm.records import FloatArray
 
 _STEP = 1e-3
@@ -48,6 +56,12 @@ _LEAST_P = 1e-300
 
 _STRETCHES = 24
 """Stretches that the route is divided into: several metres each, longer than most errors go together."""
+
+_STRETCHES_PER_CHANGE = 2
+"""Stretches from one frame at which inputs may change to the next."""
+
+_LEAST_SPEED_MPS = 0.5
+"""Below it a vehicle has no course."""
 
 _LAGS = 1
 """Neighbours of a stretch that err along with it."""
@@ -63,10 +77,15 @@ class Fault(Enum):
     """An input that may be wrong, and the unit of its value."""
 
     CLOCK = "clock"  # images were taken later than they say
+    CLOCK_DRIFT = "clock drift"  # and ever later: by so much from the first to the last
     FOCAL = "focal"  # share by which the focal length is longer than stated
     DISTORTION = "distortion"  # first radial coefficient
     PRINCIPAL = "principal"  # point of the image on the optical axis
     SLOPE = "slope"  # of the ground, which the poses do not know of
+    CROWN = "crown"  # fall of the ground to both sides of the route
+    COURSE = "course"  # heading is the direction of motion of a point so far ahead of the rear axle
+    STEP = "step"  # recorded positions are off by so much from a time on
+    KNOCK = "knock"  # a camera is turned by so much from a time on; all of them by load
     SURVEY = "survey"  # of one camera's centre
     LEVER = "lever"  # all centres alike: from the point that the poses are of
     SIZE = "size"  # known lengths of one value
@@ -76,21 +95,23 @@ class Fault(Enum):
     @property
     def unit(self) -> str:
         """Of the value and its sigma."""
-        return _UNITS[self]
+        return _UNITS.get(self, "m")
 
 
 _UNITS = {
     Fault.CLOCK: "s",
+    Fault.CLOCK_DRIFT: "s",
     Fault.FOCAL: "",
     Fault.DISTORTION: "",
     Fault.PRINCIPAL: "px",
     Fault.SLOPE: "rad",
-    Fault.SURVEY: "m",
-    Fault.LEVER: "m",
-    Fault.SIZE: "m",
-    Fault.CONTROL: "m",
-    Fault.DATUM: "m",
+    Fault.CROWN: "",
+    Fault.KNOCK: "rad",
 }
+
+
+CHANGES = (Fault.STEP, Fault.KNOCK)
+"""Faults that begin at some time, which is unknown."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +121,10 @@ class ScoreTest:
     Attributes:
         fault: what would be wrong.
         camera: of which camera of the problem; -1 for all together.
-        axis: along which axis, 0 to 2: of the vehicle (survey, lever), of the map (slope, datum), of the
-            image (principal).
-        item: which of the problem's control points, known lengths or (clock) visits; -1 for none or all.
+        axis: along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope,
+            datum, step), of the image (principal).
+        item: which of the problem's control points, known lengths or (clock) visits, or the frame from which
+            on inputs are wrong (step, knock); -1 for none or all.
         value: by how much, true minus stated.
         sigma: how well the drive observes it, by what its stretches disagree; inf where it cannot.
         p_value: how often a drive without the fault would show as large a value, 1 where it is unobservable.
@@ -373,13 +395,13 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     answers = [_Answer.to(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
     said = [one.disagreement for one in answers if one.is_observable]
     usual = float(np.median(said)) if said else 1.0
-    found = [one.test(usual) for one in answers]
+    found = _likeliest_changes([one.test(usual) for one in answers])
     found += _control_points(problem, solution, usual)
     return tuple(sorted(found, key=lambda test: -test.gain))
 
 
 def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
-    cameras = range(arrays.camera_count)
+    cameras, changes = range(arrays.camera_count), _changes(arrays)
     groups = [*([-1] if arrays.camera_count > 1 else []), *cameras]
     for camera in groups:
         if problem.twist_vehicle is not None:
@@ -391,8 +413,20 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.DISTORTION, _lens(camera, 1), camera)
         for axis in (0, 1):
             yield _Hypothesis(Fault.PRINCIPAL, _principal(problem, camera, axis), camera, axis)
+        if problem.twist_vehicle is not None:
+            yield _Hypothesis(Fault.CLOCK_DRIFT, _moving(_drift_motion(problem, camera)), camera)
+        for frame in changes:
+            for axis in (1, 2):
+                yield _Hypothesis(
+                    Fault.KNOCK, _moving(_knock_motion(camera, axis, frame)), camera, axis, frame
+                )
     for axis in (0, 1):
         yield _Hypothesis(Fault.SLOPE, _moving(_slope_motion(axis)), axis=axis)
+        for frame in changes:
+            yield _Hypothesis(Fault.STEP, _moving(_step_motion(axis, frame)), axis=axis, item=frame)
+    yield _Hypothesis(Fault.CROWN, _crown)
+    if problem.twist_vehicle is not None:
+        yield _Hypothesis(Fault.COURSE, _moving(_course_motion(problem)))
     if bool((arrays.centre_information_root > 0).any()):
         for axis in range(3):
             for camera in cameras:
@@ -404,6 +438,21 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
             yield _Hypothesis(Fault.DATUM, _datum(axis), axis=axis)
     for item, length_m in enumerate(torch.unique(arrays.lengths.length_m)):
         yield _Hypothesis(Fault.SIZE, _size(arrays.lengths.length_m == length_m), item=item)
+
+
+def _likeliest_changes(found: list[ScoreTest]) -> list[ScoreTest]:
+    """Of inputs that may change at many frames only the likeliest, which had so many chances."""
+    kept, changes = [one for one in found if one.fault not in CHANGES], {}
+    for one in found:
+        if one.fault in CHANGES:
+            changes.setdefault((one.fault, one.camera, one.axis), []).append(one)
+    for chances in changes.values():
+        best = max(chances, key=lambda one: one.gain)
+        many = len(chances)
+        kept.append(
+            replace(best, p_value=min(many * best.p_value, 1.0), gain=best.gain - float(np.log(many)))
+        )
+    return kept
 
 
 def _control_points(problem: Problem, solution: Solution, usual: float) -> Iterator[ScoreTest]:
@@ -484,6 +533,87 @@ def _clock_motion(problem: Problem, camera: int, visit: int) -> Callable[[Arrays
         return out
 
     return motion
+
+
+def _changes(arrays: Arrays) -> list[int]:
+    """Frames at which inputs may change: where every other stretch of a session begins, but its first."""
+    stretch = _stretches(arrays)
+    begins = (stretch.diff() > 0).nonzero()[:, 0] + 1
+    return [int(j) for j in begins[1::_STRETCHES_PER_CHANGE] if arrays.visit[j] == arrays.visit[j - 1]]
+
+
+def _drift_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
+    """A clock that is right in the middle, and off by half the value at either end."""
+    frames = len(problem.map_from_vehicle)
+    late = np.linspace(-0.5, 0.5, frames)[:, None]
+    twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * late)
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[slice(None) if camera < 0 else camera] = twist.to(out.device)
+        return out
+
+    return motion
+
+
+def _course_motion(problem: Problem) -> Callable[[Arrays], Tensor]:
+    """A heading that is the course of a point ahead of the rear axle: it slips by the curvature of the path."""
+    twist = np.asarray(problem.twist_vehicle)
+    speed = np.hypot(twist[:, 0], twist[:, 1])
+    curvature = np.where(speed > _LEAST_SPEED_MPS, twist[:, 5] / np.maximum(speed, _LEAST_SPEED_MPS), 0.0)
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[..., 5] = -torch.as_tensor(curvature).to(out.device)
+        return out
+
+    return motion
+
+
+def _step_motion(axis: int, frame: int) -> Callable[[Arrays], Tensor]:
+    """Positions that are recorded short along an axis of the map, from a frame to the end of its session."""
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[..., :3] = arrays.vehicle_from_map[:, :3, axis]
+        return out * _since(arrays, frame)
+
+    return motion
+
+
+def _knock_motion(camera: int, axis: int, frame: int) -> Callable[[Arrays], Tensor]:
+    """A camera that turns about its own centre; load turns all of them, about the rear axle."""
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        turn = torch.eye(3, dtype=out.dtype, device=out.device)[axis]
+        chosen = slice(None) if camera < 0 else slice(camera, camera + 1)
+        out[chosen, :, 3:] = turn
+        if camera >= 0:
+            out[chosen, :, :3] = torch.linalg.cross(arrays.centre[chosen], turn.expand(1, 3))[:, None]
+        return out * _since(arrays, frame)
+
+    return motion
+
+
+def _since(arrays: Arrays, frame: int) -> Tensor:
+    """1 for the frames (J, 1) from ``frame`` to the end of its session, else 0."""
+    later = torch.arange(arrays.frame_count, device=arrays.visit.device) >= frame
+    return (later & (arrays.visit == arrays.visit[frame])).to(arrays.centre.dtype)[:, None]
+
+
+def _crown(bench: _Bench) -> Rows:
+    """Corners that lie lower by the value times their distance from the route."""
+    arrays, estimate = bench.arrays, bench.whitening.estimate
+    frames = arrays.vehicle_from_map.inverse()
+    nearest = torch.cdist(estimate.corners_map, frames[:, :2, 3].contiguous()).argmin(dim=1)
+    away = estimate.corners_map - frames[nearest, :2, 3]
+    aside = (away * frames[nearest, :2, 1]).sum(1).abs()[arrays.corner.long()]
+    poses = bench.whitening.engine.poses(estimate).flatten(0, 1)[arrays.pair.long()]
+    up, points = poses[:, :3, 2], points_in_camera(poses, estimate.corners_map[arrays.corner.long()])
+    depth = points[:, 2:].clamp(min=NEAR_M)
+    moved = -aside[:, None] * (up[:, :2] - points[:, :2] / depth * up[:, 2:]) / depth
+    return {"observations": bench.whiten(moved.T)}
 
 
 def _slope_motion(axis: int) -> Callable[[Arrays], Tensor]:

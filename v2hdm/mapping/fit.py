@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.adjust import Fault, ScoreTest
+from v2hdm.adjust import CHANGES, Fault, ScoreTest
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.results import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
 from v2hdm.mapping.stated import name_of
@@ -20,16 +20,19 @@ CELL_OBSERVATIONS = 40
 
 
 def contradictions(
-    bundle: Bundle, found: Sequence[ScoreTest], visits: Sequence[str] = ()
+    bundle: Bundle, found: Sequence[ScoreTest], frame_s: FloatArray, visits: Sequence[str] = ()
 ) -> tuple[Contradiction, ...]:
-    """``found`` in the bundle's problem, in the words of the user's inputs; several ``visits`` are named."""
+    """``found`` in the bundle's problem, whose frames were taken at ``frame_s`` (J,), in the user's words.
+
+    Several ``visits`` are named.
+    """
     names = tuple(bundle.camera_index)
     return tuple(
         Contradiction(
             one.fault,
             names if one.camera < 0 else (names[one.camera],),
             one.axis,
-            _about(bundle, one, visits),
+            _about(bundle, one, frame_s, visits),
             one.value,
             one.sigma,
             one.sigmas,
@@ -111,7 +114,9 @@ def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
     return max(biases, default=0.0)
 
 
-def _about(bundle: Bundle, test: ScoreTest, visits: Sequence[str]) -> str:
+def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, visits: Sequence[str]) -> str:
+    if test.fault in CHANGES:
+        return f"from {frame_s[test.item]:.1f} s on"
     if test.fault is Fault.CLOCK and test.item >= 0 and visits:
         return f"in {visits[test.item]}"
     if test.fault is Fault.SIZE:

@@ -8,6 +8,7 @@ such as the focal length, stays and is reported.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,7 +34,7 @@ from v2hdm.mapping.fit import (
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import Contradiction, SolveEvidence
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.records import Drive, FloatArray, ImageDetections
 
 _log = logging.getLogger(__name__)
 
@@ -41,23 +42,44 @@ CONTRADICTED_SIGMAS = 5.0
 """From so many sigmas an input is contradicted: clean drives stay below 3 (docs/verdict.md), and one in two
 million would exceed it by chance."""
 
-_LIMITS: Mapping[Fault, tuple[float, float]] = {
-    Fault.CLOCK: (0.005, 0.02),
-    Fault.FOCAL: (0.003, 0.01),
-    Fault.DISTORTION: (0.002, 0.02),
-    Fault.PRINCIPAL: (5.0, 10.0),
-    Fault.SLOPE: (0.002, 0.003),
-    Fault.SURVEY: (0.03, 1.0),
-    Fault.LEVER: (0.03, 1.0),
-    Fault.SIZE: (0.01, 0.05),
-    Fault.CONTROL: (0.02, 0.05),
-    Fault.DATUM: (0.02, 0.05),
-}
-"""In the fault's unit: the value below which an input is as good as a drive needs it, however sure the drive
-is, and the sigma up to which a drive observes it. A less observable fault is nearly what something else can
-be, and takes up what is left of other errors: of k1 on a straight street (.04), say."""
 
-OBSERVABLE_SIGMA = {fault: sigma for fault, (_, sigma) in _LIMITS.items()}
+@dataclass(frozen=True)
+class _Size:
+    """Sizes of a fault, in its unit.
+
+    Attributes:
+        least: below it an input is as good as a drive needs it, however sure the drive is.
+        sigma: up to which a drive observes it. A less observable fault is nearly what something else can be,
+            and takes up what is left of other errors: of k1 on a straight street (.04), say.
+        usual: that it has where an input is wrong: half of all are smaller.
+        most: that is physical. What calls for more is wrong in a way that nobody has foreseen.
+    """
+
+    least: float
+    sigma: float
+    usual: float
+    most: float
+
+
+_SIZES: Mapping[Fault, _Size] = {
+    Fault.CLOCK: _Size(0.005, 0.02, 0.05, 5.0),
+    Fault.CLOCK_DRIFT: _Size(0.01, 0.02, 0.05, 5.0),
+    Fault.FOCAL: _Size(0.003, 0.01, 0.02, 1.0),
+    Fault.DISTORTION: _Size(0.002, 0.02, 0.05, 1.0),
+    Fault.PRINCIPAL: _Size(5.0, 10.0, 20.0, 500.0),
+    Fault.SLOPE: _Size(0.002, 0.003, 0.01, 0.3),
+    Fault.CROWN: _Size(0.005, 0.005, 0.02, 0.15),
+    Fault.COURSE: _Size(0.3, 0.3, 1.0, 10.0),
+    Fault.STEP: _Size(0.03, 0.02, 0.1, 100.0),
+    Fault.KNOCK: _Size(0.002, 0.002, 0.01, 1.0),
+    Fault.SURVEY: _Size(0.03, 1.0, 0.1, 20.0),
+    Fault.LEVER: _Size(0.03, 1.0, 0.5, 20.0),
+    Fault.SIZE: _Size(0.01, 0.05, 0.05, 10.0),
+    Fault.CONTROL: _Size(0.02, 0.05, 0.1, 1e3),
+    Fault.DATUM: _Size(0.02, 0.05, 0.1, 1e3),
+}
+
+OBSERVABLE_SIGMA = {fault: size.sigma for fault, size in _SIZES.items()}
 """Sigma, in the fault's unit, up to which a drive observes it."""
 
 LOOSE_CENTRE_SIGMA_M = 10.0
@@ -142,15 +164,24 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             left = _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
-        corrected.append(contradictions(settled, (worst,), visit_names(drive))[0])
+        corrected.append(_in_words(settled, (worst,), inputs)[0])
         _warn(inputs, corrected[-1])
         inputs = left
     # 4. Choose the pose model, solve without outliers and conclude.
     optimised = optimiser.finish(settled, progress)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
-    suspected = contradictions(settled, found, visit_names(drive))
+    suspected = _in_words(settled, found, inputs)
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, evidence), optimised
+
+
+def _in_words(settled: Bundle, found: Sequence[ScoreTest], inputs: Inputs) -> tuple[Contradiction, ...]:
+    return contradictions(settled, found, _frame_s(settled, inputs.sightings), visit_names(inputs.drive))
+
+
+def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
+    """When the frames (J,) of a bundle's problem were taken, s."""
+    return sightings.stamp_s[np.unique(sightings.frame[settled.row])]
 
 
 def _warn(inputs: Inputs, one: Contradiction) -> None:
@@ -168,9 +199,9 @@ def visit_names(drive: Drive) -> tuple[str, ...]:
 
 
 def _score_tests(bundle: Bundle, drive: Drive) -> tuple[ScoreTest, ...]:
-    """The inputs that can be tested and were stated at all, the most contradicted first."""
-    found = score_faults(bundle.problem, bundle.solution)
-    return tuple(one for one in found if _is_stated(one, bundle, drive))
+    """The inputs that can be tested and were stated at all, the likeliest cause first."""
+    found = [one for one in score_faults(bundle.problem, bundle.solution) if _is_stated(one, bundle, drive)]
+    return tuple(sorted(found, key=lambda one: -log_odds(one)))
 
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
@@ -214,7 +245,6 @@ def _evidence(
     factors, window_s = along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
     innovations = pose_innovations(settled.solution)
     largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
-    frames_s = sightings.stamp_s[np.unique(sightings.frame[settled.row])]
     return SolveEvidence(
         score_tests=found,
         corrected=tuple(corrected),
@@ -226,7 +256,7 @@ def _evidence(
         window_s=window_s,
         pose_innovations=innovations.rms(),
         worst_innovation=float(largest.max()),
-        worst_innovation_s=float(frames_s[int(largest.argmax())]),
+        worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
         clock_s=_clocks(final),
     )
 
@@ -247,8 +277,19 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
 
 def is_contradicted(one: ScoreTest | Contradiction) -> bool:
     """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
-    least, sigma = _LIMITS[one.fault]
-    return one.sigma <= sigma and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > least
+    size = _SIZES[one.fault]
+    return one.sigma <= size.sigma and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > size.least
+
+
+def is_physical(one: ScoreTest | Contradiction) -> bool:
+    """Whether an input can be off by so much; if not, something else is wrong that nobody has foreseen."""
+    return abs(one.value) <= _SIZES[one.fault].most
+
+
+def log_odds(one: ScoreTest | Contradiction) -> float:
+    """How likely a fault is the cause: the gain of its likelihood on stretches that the others predict, and
+    its size, of which a Cauchy distribution about the usual one is expected."""
+    return one.gain - math.log1p((one.value / _SIZES[one.fault].usual) ** 2)
 
 
 def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
