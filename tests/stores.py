@@ -10,7 +10,6 @@ from typing import Any
 import fsspec
 import pytest
 
-from v2hdm.store import remote
 from v2hdm.store.remote import RemoteFolder
 
 
@@ -19,12 +18,6 @@ def memory() -> Iterator[RemoteFolder]:
     """An empty store in memory."""
     yield RemoteFolder.at(f"memory://{secrets.token_hex(4)}/place", "output=")
     fsspec.filesystem("memory").store.clear()
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seconds become hundredths."""
-    monkeypatch.setattr(remote, "_WAITS_S", (0.01, 0.01))
 
 
 @pytest.fixture(scope="session")

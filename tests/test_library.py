@@ -32,7 +32,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What the examples name: the library, a rendered drive, its result, and a folder to write to."""
     folder = tmp_path_factory.mktemp("library")
     port = v2hdm.simulate_port(folder)
-    result = v2hdm.map_drive(port, workers=1)
+    result = v2hdm.map_drive(port, accuracy_goal_cm=10.0, workers=1)
     survey_camera(folder, port, read_truth(port))
     public = {name: getattr(v2hdm, name) for name in v2hdm.__all__}
     own = {"folder": folder, "port": port, "result": result, "points": folder / "points.csv"}

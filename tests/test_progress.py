@@ -6,7 +6,8 @@ import io
 
 from rich.console import Console
 
-from v2hdm.progress import progress_lines, share_of_work
+from train.bar import share_of_work
+from v2hdm.progress import progress_lines
 
 
 def test_a_log_has_a_line_when_a_task_begins_and_ends() -> None:

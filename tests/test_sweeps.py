@@ -1,4 +1,4 @@
-"""A sweep does each of its jobs, wherever its launcher runs them, in a folder of its own."""
+"""A sweep does each of its jobs, in a folder of its own."""
 
 from __future__ import annotations
 
@@ -14,28 +14,18 @@ from v2hdm.errors import ConfigError
 COMMAND = Command("export", "Exports.")
 
 
-def sweep(folder: Path, launcher: str) -> list[str]:
-    if launcher == "joblib":
-        pytest.importorskip(
-            "hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed"
-        )
-    line = ("--multirun", "checkpoint=a", "opset=18,19", f"hydra/launcher={launcher}")
-    places = (f"output={folder / 'net.onnx'}", f"hydra.sweep.dir={folder}")
-    return [*line, *places]
+def sweep(folder: Path) -> list[str]:
+    return ["--multirun", "checkpoint=a", "opset=18,19", f"output={folder / 'net.onnx'}"]
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(
-    launcher: str, tmp_path: Path
-) -> None:
+def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(tmp_path: Path) -> None:
     def work(job: Job) -> int:
         folder = Path(job.folder(str(tmp_path)))
         folder.mkdir()
-        (folder / "opset").write_text(str(job.composed.opset))
-        return 3 if job.composed.opset == 19 else 0
+        (folder / "opset").write_text(str(job.settings.opset))
+        return 3 if job.settings.opset == 19 else 0
 
-    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path, launcher)) == 3
+    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path), "") == 3
     written = {path.parent.name: path.read_text() for path in tmp_path.glob("*/opset")}
     assert written == {"0-opset=18": "18", "1-opset=19": "19"}
 
@@ -46,10 +36,10 @@ def test_a_job_that_fails_names_itself_and_the_others_go_on(
     done: list[int] = []
 
     def work(job: Job) -> None:
-        if job.composed.opset == 18:
+        if job.settings.opset == 18:
             raise ConfigError("not this one")
-        done.append(job.composed.opset)
+        done.append(job.settings.opset)
 
-    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path, "basic")) == 2
+    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path), "") == 2
     assert done == [19]
     assert "error: job 0-opset=18: not this one" in capsys.readouterr().err.splitlines()

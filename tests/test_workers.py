@@ -45,7 +45,7 @@ def test_results_come_in_the_order_of_the_jobs() -> None:
 def test_a_failure_is_raised_here_and_tells_where_it_happened() -> None:
     with pytest.raises(DriveError, match=r"[ab]\.jpg: damaged") as caught:
         share_out(refuse, ["a.jpg", "b.jpg"], 2, nothing, (), print)
-    assert "in refuse" in caught.value.__notes__[0]
+    assert "in refuse" in str(caught.value.__cause__)
 
 
 def test_a_failure_of_the_start_is_raised_here() -> None:

@@ -118,9 +118,8 @@ def test_with_pose_errors_it_is_near_the_batch_and_the_batch_itself_once_adjuste
     options = SolveOptions(loss="none")
     grown = grow(problem, options)
     assert farthest(grown, problem, options) < 2.0
-    solution = grown.adjust()
+    grown.adjust()
     assert farthest(grown, problem, options) < 0.01
-    np.testing.assert_allclose(grown.map_from_vehicle, solution.map_from_vehicle, atol=1e-12)
 
 
 def test_a_clock_offset_is_found_along():
@@ -154,21 +153,6 @@ def test_a_marking_seen_again_is_re_estimated_from_all_it_was_ever_seen_in():
     for marking, sighted in later.items():
         grown.observe(marking, sighted)
     assert farthest(grown, problem, PAPER) < 0.01
-
-
-def test_a_forgotten_marking_leaves_no_trace():
-    problem = whole_markings(street().problem)
-    markings = by_marking(problem)
-    without, with_and_back = (IncrementalMap(problem, PAPER) for _ in range(2))
-    for marking, sighted in enumerate(markings[:9]):
-        without.observe(marking, sighted)
-        with_and_back.observe(marking, sighted)
-    with_and_back.observe(99, markings[9])
-    assert np.abs(with_and_back.cam_from_vehicle - without.cam_from_vehicle).max() > 1e-4
-    with_and_back.forget(99)
-    np.testing.assert_allclose(with_and_back.cam_from_vehicle, without.cam_from_vehicle, atol=2e-6)
-    with pytest.raises(AdjustError, match="marking 99 is not in the map"):
-        with_and_back.corners_map(99)
 
 
 def test_a_marking_that_cannot_be_re_estimated_stays_as_it_was():

@@ -53,8 +53,8 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() 
     curvature, slope = (high - 2 * middle + low) / step**2, (high - low) / (2 * step)
     one = found_of(problem, Fault.FOCAL, -1)
     assert one.value == pytest.approx(-slope / curvature, rel=0.05)
-    assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.05)
-    assert one.gain == pytest.approx(slope**2 / (2 * curvature), rel=0.1)
+    assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.3), "by what the stretches disagree"
+    assert 0 < one.gain < slope**2 / (4 * curvature), "stretches that the others predict gain less"
     assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
 
 
@@ -63,7 +63,7 @@ def test_a_late_clock_is_found_and_named_first() -> None:
     found = score_faults(late, solve(late, OPTIONS))
     assert (found[0].fault, found[0].camera) == (Fault.CLOCK, 0)
     assert found[0].value == pytest.approx(0.06, abs=0.01)
-    assert found[0].sigmas > 10
+    assert found[0].sigmas > 7
 
 
 def test_a_survey_is_held_against_what_the_drive_says_without_it() -> None:

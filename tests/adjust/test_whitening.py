@@ -88,7 +88,7 @@ def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree):
     pattern = find_pattern(count, cliques, least_degree)
     arrow = TiledMatrix.zeros(pattern, size, tip, torch.zeros((), dtype=torch.float64))
     tiles = arrow.tiles
-    for tile in (*arrow.diagonal, arrow.tip):
+    for tile in (*(tiles[k, k] for k in range(count)), arrow.tip):
         tile += 50 * torch.eye(len(tile), dtype=torch.float64)
     for column in range(count):
         tiles[TIP, column].normal_(generator=generator)

@@ -256,7 +256,7 @@ def optimise(drive: Drive, detections: Sequence[ImageDetections]) -> Optimised:
     cameras = tuple(drive.cameras)
     sightings = collect_sightings(drive, detections, cameras)
     views = views_of(drive, cameras)
-    optimiser = Optimiser(sightings, views, drive.cameras, drive.pose_noise, MappingOptions())
+    optimiser = Optimiser(sightings, views, drive.cameras, drive.noises, MappingOptions())
     return optimiser.run(optimiser.initial_tracks())
 
 

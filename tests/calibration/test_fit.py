@@ -22,7 +22,7 @@ NAMES = tuple(f"P{n}" for n in range(1, 11))
 
 def fit(px: FloatArray, places: FloatArray, noise: Noise, starts: int = 1) -> Fit:
     points = SurveyedPoints(Path("points.csv"), NAMES, NAMES, px, places)
-    return fit_mountings(Seen.of(points, INFO, noise), starts)[0]
+    return fit_mountings(Seen.of(points.points_px, points.points_vehicle, INFO, noise), starts)[0]
 
 
 def by_tangent(places: FloatArray) -> FloatArray:
@@ -90,7 +90,7 @@ def test_the_ipm_is_off_as_its_sigma_says() -> None:
 def test_slopes_are_those_of_the_residual() -> None:
     px, places = clicked(1)
     points = SurveyedPoints(Path("points.csv"), NAMES, NAMES, px, places)
-    seen = Seen.of(points, INFO, Noise())
+    seen = Seen.of(points.points_px, points.points_vehicle, INFO, Noise())
     for start in (mounting(), mounting((0.0, -80.0, 170.0))):  # before and behind the camera
         steps = 1e-6 * np.eye(6)
         expected = np.stack(
@@ -109,7 +109,7 @@ def test_one_wrong_point_is_named_and_moves_nothing(moved: tuple[int, float, flo
     others = np.arange(10) != wrong
     np.testing.assert_array_equal(found.is_right, others)
     without = fit_mountings(
-        Seen.of_pixels(px[others], places[others], INFO, Noise()), starts=4
+        Seen.of(px[others], places[others], INFO, Noise()), starts=4
     )[0]  # fmt: skip
     np.testing.assert_allclose(found.cam_from_vehicle, without.cam_from_vehicle, atol=1e-4)
     off = residuals(found)
@@ -135,7 +135,7 @@ def test_a_wrong_focal_length_is_told_with_its_size() -> None:
     longer = INFO.intrinsic * [[1.04, 1, 1], [1, 1.04, 1], [1, 1, 1]]
     info = type(INFO)("front", 1280, 720, longer, INFO.distortion_model, INFO.distortion)
     px, places = clicked(2)
-    tested = lens(fit_mountings(Seen.of_pixels(px, places, info, Noise()))[0])
+    tested = lens(fit_mountings(Seen.of(px, places, info, Noise()))[0])
     assert tested.probability < 1e-4
     assert tested.focal[0] == pytest.approx(1 / 1.04 - 1, abs=0.012)
     right = lens(fit(px, places, Noise()))
@@ -167,5 +167,5 @@ def test_cameras_that_look_any_way_through_any_lens_are_found(where: str, model:
     ipm = facing_ipm(ipm_from_extrinsic(info, truth), ahead[:2])
     places = apply_in_front(ipm, undistort_points(info, px))
     assert np.isfinite(places).all()
-    found = fit_mountings(Seen.of_pixels(px, places, info, Noise()), starts=1)[0]
+    found = fit_mountings(Seen.of(px, places, info, Noise()), starts=1)[0]
     np.testing.assert_allclose(found.cam_from_vehicle, truth, atol=1e-5)

@@ -17,11 +17,11 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration import write_camera_info
 from v2hdm.io.trajectory import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
-from v2hdm.store.cache import code_key
+from v2hdm.store.cache import checked, code_key
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text
 from v2hdm.store.inputs import LIST
 from v2hdm.store.lock import IN_USE, STAGES
-from v2hdm.store.pruning import LEFT, items_of, remove_damaged
+from v2hdm.store.pruning import DRIVES, LEFT, items_of
 
 IMAGES = 16
 """Of the drive's one camera: enough for a map, few enough for a second or two a run."""
@@ -264,7 +264,8 @@ def cache_defects(cache: Path) -> list[str]:
         if path.is_file() and path not in known and IN_USE not in path.as_posix()
     ]
     left = [item.path.name for item in items if item.kind == LEFT]
-    damaged = [item.path.name for item in remove_damaged(items)]
+    entries = [item.path for item in items if item.kind not in (DRIVES, LEFT)]
+    damaged = [path.name for path in entries if checked(path.read_bytes()) is None]
     return [
         f"{what} in the cache: {names[:3]}"
         for what, names in (("half", left), ("damaged", damaged), ("strange", strange))

@@ -58,8 +58,8 @@ def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path: Path) -> Non
 
     def write() -> int:
         try:
-            with geotiff(tmp_path / "a.tif", canvas, None) as mosaic:
-                mosaic.put(Sheet(0, 0, seen))
+            with geotiff(tmp_path / "a.tif", canvas, None) as put:
+                put(Sheet(0, 0, seen))
         except OSError:
             return 2
         return 0

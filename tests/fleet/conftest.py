@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from tests.stores import quick as quick
 from tests.stores import s3 as s3
 from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.config import RouteConfig, YardConfig

@@ -17,10 +17,9 @@ pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 from tests.fleet.run_files import written
 from v2hdm.errors import DriveError, WorkerError
-from v2hdm.fleet.executor import RayExecutor
 from v2hdm.fleet.plan import Row, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.workers import map_drive
+from v2hdm.fleet.workers import RayExecutor, map_drive
 from v2hdm.pipeline.run import run
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
@@ -51,7 +50,7 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
     died = tmp_path / "died"
 
     def mapping(*arguments: Any) -> Any:
-        import v2hdm.fleet.executor as executor
+        import v2hdm.fleet.workers as executor
 
         done = executor._done
 
@@ -117,7 +116,7 @@ def test_what_is_wrong_in_a_task_is_told_as_by_one_process(
     def dies() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
-    monkeypatch.setattr("v2hdm.fleet.executor.RETRIES", 0)
+    monkeypatch.setattr("v2hdm.fleet.workers.RETRIES", 0)
     executor = RayExecutor(2, str(tmp_path))
     waits = [executor.begin(work) for work in (refuses, dies)]
     with pytest.raises(DriveError, match="cannot be read"):

@@ -14,7 +14,7 @@ from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
-from v2hdm.mapping.bundle import full_model, solve_bundle
+from v2hdm.mapping.bundle import full_model, pose_sigma_of, solve_bundle
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, SizeOptions, check_options
 from v2hdm.mapping.stated import known_lengths
@@ -57,11 +57,13 @@ def test_a_joint_solve_keeps_to_the_sizes() -> None:
     sightings = collect_sightings(scene.drive, scene.detections, ("front", "rear"))
     views = views_of(scene.drive, ("front", "rear"))
     options = MappingOptions(pose_model="heave")
-    optimiser = Optimiser(sightings, views, scene.drive.cameras, scene.drive.pose_noise, options)
+    optimiser = Optimiser(sightings, views, scene.drive.cameras, scene.drive.noises, options)
     bundle = optimiser.run(optimiser.initial_tracks()).bundle
     spread = []
     for sizes in (SizeOptions(), SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)):
-        model = full_model([scene.drive.pose_noise], replace(options, known_sizes=sizes), "heave")
+        model = full_model(
+            [pose_sigma_of(scene.drive.pose_noise)], replace(options, known_sizes=sizes), "heave"
+        )
         usable = sightings.valid & (bundle.association.group >= 0)[:, None]
         solved = solve_bundle(
             sightings, bundle.association, usable, bundle.rig, scene.drive.cameras, model
@@ -81,7 +83,7 @@ def test_a_map_that_grows_marking_by_marking_keeps_to_the_sizes() -> None:
     views, noise = views_of(scene.drive, ("front", "rear")), scene.drive.pose_noise
     sizes = SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)
     options = MappingOptions(mode="incremental", pose_model="heave", known_sizes=sizes)
-    solved = Optimiser(sightings, views, scene.drive.cameras, noise, options).grow()
+    solved = Optimiser(sightings, views, scene.drive.cameras, (noise,), options).grow()
     assert solved.problem.lengths is not None
     long_m = np.array([_diagonals(c)[0] for c in solved.corners_map if np.isfinite(c).all()])
     near = long_m[np.abs(long_m - true[0]) < 0.15 * true[0]]

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.mapping.scene import MOUNTS, extrinsic
-from v2hdm.association.ground import Views, easy_views
-from v2hdm.association.sightings import Rig
+from v2hdm.association.ground import Views
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import Camera, CameraInfo, Marking
-from v2hdm.site.looks import Paint, Pictures, learn_paint
+from v2hdm.site.looks import Observer, Paint, learn_paint
 
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])
 INFO = CameraInfo("front", 1280, 720, INTRINSIC, "plumb_bob", (-0.1, 0.02, 1e-4, -2e-4, 0.0))
@@ -56,35 +56,31 @@ def image(pose: np.ndarray, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 @pytest.fixture(scope="module")
-def pictures() -> Pictures:
+def observer() -> Observer:
     rng, route = np.random.default_rng(0), poses()
     made = {k: image(route[k], rng) for k in range(len(route))}
-    frames = np.arange(len(route))
-    rig = Rig(INTRINSIC[None], MOUNT[None], route)
-    return Pictures(
-        made.__getitem__, Views(frames, np.zeros(len(route), dtype=np.int64), frames), (CAMERA,), rig
-    )
+    frames, none = np.arange(len(route)), np.zeros(0, dtype=np.int64)
+    seen = none, none, none, none, np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros((0, 4), dtype=bool)
+    sightings = Sightings(("front",), 0.1 * frames, route, *seen, ("diamond",), np.zeros_like(frames))
+    views, rig = Views(frames, np.zeros_like(frames), frames), Rig(INTRINSIC[None], MOUNT[None], route)
+    return Observer(sightings, views, (CAMERA,), rig, 0.0, made.__getitem__)
 
 
-def contrasts_of(pictures: Pictures) -> tuple[Paint, np.ndarray]:
-    def near(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return easy_views(pictures.views, pictures.rig, [CAMERA], corners, 12.0)
-
+def contrasts_of(observer: Observer) -> tuple[Paint, np.ndarray]:
     outlines = DIAMOND + PLACES[:, None]
     mapped = [Marking("diamond", c, 9) for k, c in enumerate(outlines) if k not in (GONE, HIDDEN)]
-    found = learn_paint(pictures, mapped, PLACES, near)
-    return found["diamond"], pictures.contrasts(outlines, *near(outlines))
+    return learn_paint(observer, mapped, PLACES)["diamond"], observer.contrasts(outlines)
 
 
-def test_paint_stands_out_and_bare_ground_does_not(pictures: Pictures) -> None:
-    paint, contrast = contrasts_of(pictures)
+def test_paint_stands_out_and_bare_ground_does_not(observer: Observer) -> None:
+    paint, contrast = contrasts_of(observer)
     assert paint.painted[0] == pytest.approx(np.log(130 / 60), abs=0.15)
     assert paint.bare[0] == pytest.approx(0.0, abs=0.03)
     assert contrast[GONE] == pytest.approx(0.0, abs=0.05)
 
 
-def test_a_gone_marking_is_told_from_a_hidden_and_from_a_worn_one(pictures: Pictures) -> None:
-    paint, contrast = contrasts_of(pictures)
+def test_a_gone_marking_is_told_from_a_hidden_and_from_a_worn_one(observer: Observer) -> None:
+    paint, contrast = contrasts_of(observer)
     odds = paint.log_bare(contrast) - paint.log_there(contrast)
     assert odds[GONE] > 1.5
     assert odds[HIDDEN] < 0.0
@@ -92,7 +88,6 @@ def test_a_gone_marking_is_told_from_a_hidden_and_from_a_worn_one(pictures: Pict
     assert paint.log_bare(worn) - paint.log_there(worn) < -1.5
 
 
-def test_too_few_markings_say_nothing_of_paint(pictures: Pictures) -> None:
+def test_too_few_markings_say_nothing_of_paint(observer: Observer) -> None:
     few = [Marking("diamond", DIAMOND + place, 9) for place in PLACES[:3]]
-    none = np.zeros(0, dtype=np.int64)
-    assert learn_paint(pictures, few, PLACES, lambda corners: (none, none)) == {}
+    assert learn_paint(observer, few, PLACES) == {}

@@ -82,7 +82,7 @@ def sightings(scene: Scene) -> Sightings:
 
 def optimiser_of(scene: Scene, sightings: Sightings, options: MappingOptions) -> Optimiser:
     drive = scene.drive
-    return Optimiser(sightings, views_of(drive, CAMERAS), drive.cameras, drive.pose_noise, options)
+    return Optimiser(sightings, views_of(drive, CAMERAS), drive.cameras, drive.noises, options)
 
 
 def test_corners_on_a_line_inform_and_are_no_points(sightings: Sightings) -> None:

@@ -58,7 +58,7 @@ def adjusted(scene: Scene, survey: SurveyOptions, one_by_one: bool = False) -> F
     sightings = collect_sightings(scene.drive, scene.detections, ("front",))
     options = MappingOptions(pose_model="full", survey=survey)
     views, drive = views_of(scene.drive, ("front",)), scene.drive
-    optimiser = Optimiser(sightings, views, drive.cameras, drive.pose_noise, options)
+    optimiser = Optimiser(sightings, views, drive.cameras, drive.noises, options)
     settled = optimiser.grow() if one_by_one else optimiser.settle(optimiser.initial_tracks())
     corners = optimiser.finish(settled).bundle.corners_map.reshape(-1, 2)
     return corners[np.isfinite(corners).all(axis=1)]

@@ -371,9 +371,9 @@ def test_mgrs_coordinates_are_those_of_utm_within_the_square(tmp_path: Path) -> 
 def test_places_of_the_world_are_in_their_grid_squares(
     latitude_deg: float, longitude_deg: float, square: str, metres: tuple[int, int]
 ) -> None:
-    found = grid_places(np.array([longitude_deg]), np.array([latitude_deg]))
-    assert found.square == square
-    np.testing.assert_allclose(found.local, [metres], atol=1.0)
+    found, local = grid_places(np.array([longitude_deg]), np.array([latitude_deg]))
+    assert found == square
+    np.testing.assert_allclose(local, [metres], atol=1.0)
 
 
 def test_an_mgrs_projector_across_grid_squares_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -77,8 +77,8 @@ def test_the_projection_agrees_with_the_tangent_plane_to_a_millimetre() -> None:
 
 def test_without_an_origin_the_geotiff_says_that_it_belongs_nowhere_on_the_earth(tmp_path: Path) -> None:
     canvas = Canvas(np.array([0.0, 5.12]), 0.02, 256, 256)
-    with geotiff(tmp_path / "mosaic.tif", canvas, None) as file:
-        file.put(Sheet(0, 0, np.full((256, 256, 4), 255, dtype=np.uint8)))
+    with geotiff(tmp_path / "mosaic.tif", canvas, None) as put:
+        put(Sheet(0, 0, np.full((256, 256, 4), 255, dtype=np.uint8)))
     with rasterio.open(tmp_path / "mosaic.tif") as file:
         assert not file.crs.is_geographic
         assert not file.crs.is_projected

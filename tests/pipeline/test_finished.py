@@ -12,16 +12,14 @@ import pytest
 from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import finished
 from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
-from v2hdm.pipeline.finished import RunResult, note_finished, take_or_make
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
+from v2hdm.pipeline.run import RunResult, note_finished, take_or_make
+from v2hdm.store import remote
 from v2hdm.store.cache import StageCache, code_key, key_of
 from v2hdm.store.remote import RemoteFolder, download
 from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 
 def quiet(*_: object) -> None:
@@ -32,9 +30,7 @@ def quiet(*_: object) -> None:
 def config(memory: RemoteFolder, tmp_path: Path) -> RunConfig:
     make_drive(tmp_path / "drive")
     drive = DriveConfig(path=str(tmp_path / "drive"))
-    return RunConfig(
-        drive=drive, output=f"{memory}/results", cache=f"{memory}/cache", local_cache=str(tmp_path / "local")
-    )
+    return RunConfig(drive=drive, output=f"{memory}/results", cache=str(tmp_path / "local"))
 
 
 class Work:
@@ -65,7 +61,7 @@ def test_a_result_goes_to_its_place_and_is_kept_there(
     there = memory.below("results/example")
     assert there.read("maps/map.geojson") == str(config.mapping.max_range_m).encode()
     assert not (tmp_path / "local" / "uploads").exists()
-    elsewhere = replace(config, local_cache=str(tmp_path / "other machine"))
+    elsewhere = replace(config, cache=str(tmp_path / "other machine"))
     taken, kept = take_or_make(elsewhere, work, True, quiet)
     assert kept
     assert (taken.place, taken.metrics, taken.verdict) == (made.place, made.metrics, made.verdict)
@@ -85,7 +81,7 @@ def test_a_result_whose_upload_failed_is_not_made_again(
         raise ConfigError("no network")
 
     with monkeypatch.context() as patch:
-        patch.setattr(finished, "upload", gone)
+        patch.setattr(remote, "upload", gone)
         with pytest.raises(ConfigError, match="no network"):
             take_or_make(config, work, True, quiet)
     assert not memory.below("results").listed()
@@ -98,7 +94,7 @@ def test_what_another_finishes_meanwhile_is_taken(config: RunConfig, tmp_path: P
     first, second = Work(), Work()
 
     def after_another(local: RunConfig, cache: StageCache) -> RunResult:
-        elsewhere = replace(config, local_cache=str(tmp_path / "other machine"))
+        elsewhere = replace(config, cache=str(tmp_path / "other machine"))
         assert not take_or_make(elsewhere, first, True, quiet)[1]
         return second(local, cache)
 
@@ -111,15 +107,15 @@ def test_what_another_finishes_meanwhile_is_taken(config: RunConfig, tmp_path: P
 def test_two_processes_of_a_machine_do_not_upload_one_result_at_once(
     config: RunConfig, memory: RemoteFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    upload = finished.upload
+    upload = remote.upload
 
     def slowly(*arguments: Any) -> None:
-        monkeypatch.setattr(finished, "upload", upload)
+        monkeypatch.setattr(remote, "upload", upload)
         with pytest.raises(ConfigError, match="is being written by process"):
             take_or_make(config, Work(), True, quiet)
         upload(*arguments)
 
-    monkeypatch.setattr(finished, "upload", slowly)
+    monkeypatch.setattr(remote, "upload", slowly)
     assert not take_or_make(config, Work(), True, quiet)[1]
     assert memory.below("results/example").read("maps/map.geojson")
 
@@ -130,6 +126,11 @@ def test_what_is_not_ours_is_reported_before_any_work(config: RunConfig, memory:
     with pytest.raises(ConfigError, match="no results of ours"):
         take_or_make(config, work, True, quiet)
     assert not work.done
+
+
+def test_a_cache_at_a_store_is_refused(config: RunConfig, memory: RemoteFolder) -> None:
+    with pytest.raises(ConfigError, match=r"cache=memory.*: is a URL; give a folder"):
+        take_or_make(replace(config, cache=f"{memory}/cache"), Work(), True, quiet)
 
 
 def test_a_folder_named_by_a_url_is_that_folder(config: RunConfig, tmp_path: Path) -> None:

@@ -22,8 +22,7 @@ from v2hdm.pipeline import detections
 from v2hdm.pipeline import inspect as inspection
 from v2hdm.pipeline import run as running
 from v2hdm.pipeline.config import DriveConfig, RunConfig
-from v2hdm.pipeline.finished import RunResult
-from v2hdm.pipeline.run import run
+from v2hdm.pipeline.run import RunResult, run
 from v2hdm.store.pruning import items_of
 
 SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")

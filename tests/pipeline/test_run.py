@@ -99,8 +99,8 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
         calibration = read_calibration(result / f"calibration_{camera}.yaml")
         assert calibration.covariance is not None
         assert np.linalg.det(calibration.cam_from_vehicle[:3, :3]) == pytest.approx(1.0)
-        for form in CALIBRATION_FORMATS.values():
-            text = (result / f"calibration_{camera}" / f"{camera}_{form.ending}").read_text()
+        for ending, _ in CALIBRATION_FORMATS.values():
+            text = (result / f"calibration_{camera}" / f"{camera}_{ending}").read_text()
             assert "# drive: short\n# date: " in text
     for one in FORMATS.values():
         assert (result / one.file.format(name="map")).stat().st_size > 1000

@@ -27,11 +27,9 @@ from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
-from v2hdm.store.cache import CodecError, StageCache, decode, encode, entry_name
-from v2hdm.store.remote import RemoteFolder
+from v2hdm.store.cache import CodecError, StageCache, decode, encode
 
 KEY = "ab" * 32
-NAME = entry_name("stage", KEY)
 
 
 def made(cache: StageCache, value: list[int]) -> list[int]:
@@ -171,41 +169,6 @@ def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_n
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
     assert "install the map extra, pip install 'v2hdm[map]'" in done.stdout, done.stderr
     assert (tmp_path / "drawn" / "a.jpg").is_file()
-
-
-def test_what_one_machine_has_made_another_takes_and_keeps(memory: RemoteFolder, tmp_path: Path) -> None:
-    assert made(StageCache(tmp_path / "one", memory), [1]) == [1]
-    assert made(StageCache(tmp_path / "two", memory), [2]) == [1]
-    memory.remove(NAME)
-    assert made(StageCache(tmp_path / "two", memory), [3]) == [1]
-    assert made(StageCache(tmp_path / "three", memory), [4]) == [4]
-
-
-def test_what_is_damaged_at_a_store_is_made_anew(memory: RemoteFolder, tmp_path: Path) -> None:
-    made(StageCache(tmp_path / "one", memory), [1])
-    memory.write(NAME, (memory.read(NAME) or b"")[:-1] + b"x")
-    assert made(StageCache(tmp_path / "two", memory), [2]) == [2]
-    assert made(StageCache(tmp_path / "three", memory), [3]) == [2]
-
-
-def test_what_is_of_this_machine_alone_does_not_go_to_a_store(memory: RemoteFolder, tmp_path: Path) -> None:
-    assert made(StageCache(tmp_path, memory).local, [1]) == [1]
-    assert not memory.listed()
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_store_that_fails_is_reported_once_and_work_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Gone:
-        def __getattr__(self, name: str) -> Any:
-            raise OSError("no route to host")
-
-    cache = StageCache(tmp_path, RemoteFolder(Gone(), "b", "s3://b/cache", "cache="))
-    assert made(cache, [1]) == [1]
-    cache.put("other", KEY, str, "x")
-    assert len([one for one in caplog.records if "goes on without" in one.message]) == 1
-    assert made(StageCache(tmp_path), [2]) == [1]
 
 
 @dataclass(frozen=True)

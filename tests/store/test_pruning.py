@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from v2hdm.cli.main import run
-from v2hdm.store.cache import StageCache, entry_name
+from v2hdm.store.cache import StageCache
 from v2hdm.store.folders import LIST, note_use
 from v2hdm.store.lock import IN_USE, in_use
 from v2hdm.store.pruning import DRIVES, items_of, prune
-from v2hdm.store.remote import RemoteFolder
 
 KEYS = [f"{number:064x}" for number in range(4)]
 
@@ -144,18 +143,11 @@ def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path: Path) 
     assert not (folder / "drive.yaml").exists()
 
 
-def test_the_command_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_lists_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["cache", "list", "--cache", str(cache)]) == 0
     assert "detect" in capsys.readouterr().out
-    path = StageCache(cache).path("detect", KEYS[1])
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert run(["cache", "verify", "--cache", str(cache)]) == 0
-    printed = capsys.readouterr().out
-    assert str(path) in printed
-    assert "read 4 entries, 1 of them damaged" in printed
-    assert not path.exists()
     assert run(["cache", "prune", "--cache", str(cache), "--gb", "0"]) == 0
-    assert "removed 3 entries" in capsys.readouterr().out
+    assert "removed 4 entries" in capsys.readouterr().out
     assert not left(cache)
 
 
@@ -172,21 +164,3 @@ def test_the_command_reports_in_one_line(
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
-
-
-def test_the_command_lists_verifies_and_prunes_a_store(
-    memory: RemoteFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for key in KEYS[:3]:
-        memory.write(entry_name("detect", key), b"no entry")
-    StageCache(tmp_path, memory).put("map", KEYS[0], bytes, bytes(1000))
-    memory.write("stages/detect/notes", b"mine")
-    memory.write("notes", b"mine")
-    assert run(["cache", "list", "--cache", str(memory)]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert [line.split()[:2] for line in printed[1:]] == [["detect", "3"], ["map", "1"], ["all", "4"]]
-    assert run(["cache", "verify", "--cache", str(memory)]) == 0
-    assert "read 4 entries, 3 of them damaged" in capsys.readouterr().out
-    assert run(["cache", "prune", "--cache", str(memory), "--gb", "0"]) == 0
-    assert "removed 1 entries" in capsys.readouterr().out
-    assert set(memory.listed()) == {"stages/detect/notes", "notes"}

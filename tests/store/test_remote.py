@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from v2hdm.cli.compose import Job
 from v2hdm.errors import ConfigError
@@ -54,43 +53,27 @@ def test_a_token_changes_with_the_object(memory: RemoteFolder) -> None:
 
 
 class Failing:
-    """A store whose calls fail so often."""
+    """A store whose calls fail."""
 
-    def __init__(self, *failures: Exception) -> None:
-        self.failures = list(failures)
+    def __init__(self, failure: Exception) -> None:
+        self._failure = failure
 
     def cat_file(self, path: str) -> bytes:
-        if self.failures:
-            raise self.failures.pop(0)
-        return path.encode()
+        raise self._failure
 
 
-@pytest.mark.usefixtures("quick")
-def test_what_fails_for_a_moment_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
-    failing = Failing(OSError("reset by peer"), TimeoutError())
-    assert RemoteFolder(failing, "b", "s3://b", "output=").read("a") == b"b/a"
-    assert [one.levelname for one in caplog.records] == ["WARNING"] * 2
-
-
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
-    ("failures", "says", "left"),
+    ("failure", "says"),
     [
-        (
-            [OSError("no route\nto host")] * 4,
-            "s3://b/a: does not work .no route to host.; check the network",
-            1,
-        ),
-        ([PermissionError("Forbidden")] * 2, "Forbidden.; check the credentials", 1),
-        ([type("NoCredentialsError", (Exception,), {})("none found")] * 2, "none found.; check the cred", 1),
+        (OSError("no route\nto host"), "s3://b/a: does not work .no route to host.; check the network"),
+        (PermissionError("Forbidden"), "Forbidden.; check the credentials"),
+        (type("NoCredentialsError", (Exception,), {})("none found"), "none found.; check the cred"),
     ],
 )
-def test_what_goes_on_failing_is_one_line(failures: list[Exception], says: str, left: int) -> None:
-    failing = Failing(*failures)
+def test_what_fails_is_one_line(failure: Exception, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as told:
-        RemoteFolder(failing, "b", "s3://b", "output=").read("a")
+        RemoteFolder(Failing(failure), "b", "s3://b", "output=").read("a")
     assert "\n" not in str(told.value)
-    assert len(failing.failures) == left
 
 
 @pytest.mark.parametrize(
@@ -154,7 +137,7 @@ def test_a_url_where_only_paths_are_written_is_told_and_not_made_a_folder(
             write(Path("s3://bucket/results")),
         ):
             pass
-    job = Job(OmegaConf.create(), "0-a=b")
+    job = Job(None, "", "0-a=b")
     with pytest.raises(ConfigError, match="a sweep writes to folders of this machine"):
         job.folder("s3://bucket/results")
     assert not list(tmp_path.iterdir())

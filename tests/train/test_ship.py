@@ -11,13 +11,13 @@ from export.onnx_file import export_checkpoint
 from models.judge import Judge
 from tests.train.small import tiny, train
 from train import fit_judge, fit_lane_score, ship, shipment
+from train.bar import Share
 from train.checkpoint import load_checkpoint
 from train.exported import read_exported
 from train.shipment import Order
 from v2hdm.detection import weights
 from v2hdm.detection.classifier import AMONG, SHAPES
 from v2hdm.detection.evidence import CHANNELS, FEATURES
-from v2hdm.progress import Share
 
 
 @pytest.fixture

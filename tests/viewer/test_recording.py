@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
 from v2hdm.pipeline.run import run
 from v2hdm.records import ImageDetections
+from v2hdm.store.cache import StageCache
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]
@@ -166,6 +166,6 @@ def test_images_are_shown_as_they_are_looked_at(small_drive: Path, tmp_path: Pat
             shown.append([one.image for one in detections])
 
     for _ in range(2):
-        context = replace(Context.of(tmp_path, workers=1), viewer=Watching())
+        context = Context(StageCache(tmp_path), workers=1, viewer=Watching())
         detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), context)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from v2hdm.adjust.layout import state_components, state_prior
+from v2hdm.adjust.layout import state_prior
 from v2hdm.adjust.problem import POSE_STATES, Drift, PoseSigma, Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import factorise
@@ -72,11 +72,11 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
     arrays, stated = descent.engine.arrays, problem.pose_sigmas
     if not arrays.states:
         return stated
+    states_of = tuple(POSE_STATES[axis] for axis in arrays.states)
     scales, generator = dict.fromkeys(_GROUPS, _Scales()), torch.Generator()
     for _ in range(_ROUNDS):
         sigmas = tuple(_scaled(one, scales) for one in stated)
-        components = state_components(sigmas, tuple(POSE_STATES[axis] for axis in arrays.states))
-        prior = state_prior(problem.map_from_vehicle, components, problem.visit_of_frame)
+        _, *prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
         transition, root = (arrays.state_transition.new_tensor(one) for one in prior)
         engine = descent.engine.over(
             replace(arrays, state_transition=transition, state_information_root=root)
@@ -86,8 +86,9 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
         off = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]
         states = descent.estimate.frame_state + torch.stack([one.frame_state for one in off])
         errors = np.zeros((*states.shape[:2], 6))
-        np.add.at(errors, (..., list(arrays.states)), states.cpu().numpy())
-        scales |= {name: _scales(problem, errors, name) for name in ("height", "roll_pitch", "heading")}
+        for column, axis in enumerate(arrays.states):
+            errors[..., axis] += states[..., column].cpu().numpy()
+        scales = {name: _scales(problem, errors, name) for name in _GROUPS}
     return tuple(_scaled(one, scales) for one in stated)
 
 

@@ -69,7 +69,7 @@ _LAGS = 1
 _DRAWS = 16
 """Draws of the model's own noise: what the stretches would disagree by is known to a tenth."""
 
-_PRIOR_FREEDOM = 4.0
+_PRIOR_FREEDOM = 15.0
 """Degrees of freedom that the usual disagreement of a drive's stretches counts for in each test."""
 
 
@@ -110,6 +110,11 @@ _UNITS = {
 }
 
 
+def sigmas_of(p_value: float) -> float:
+    """The standard deviations at which a normal distribution has a two-sided p-value."""
+    return float(stats.norm.isf(max(p_value, _LEAST_P) / 2))
+
+
 CHANGES = (Fault.STEP, Fault.KNOCK)
 """Faults that begin at some time, which is unknown."""
 
@@ -146,7 +151,7 @@ class ScoreTest:
     @property
     def sigmas(self) -> float:
         """The standard deviations at which a normal distribution has this p-value."""
-        return float(stats.norm.isf(max(self.p_value, _LEAST_P) / 2))
+        return sigmas_of(self.p_value)
 
 
 Rows = dict[str, Tensor]
@@ -230,7 +235,7 @@ class _Bench:
         return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
 
     def efficient(self, column: Rows) -> Rows:
-        """A fault's column less what all that is estimated can do in its place: z = J_p - J_y H^-1 J_y' J_p."""
+        """A fault's column less what is estimated in its place: z = J_p - J_y H^-1 J_y' J_p."""
         engine, step = self.whitening.engine, _STEP * self._coupling(column)
         high, low = (
             _rows(engine.arrays, one, engine.residuals(engine.poses(one), one.corners_map) * self.root)
@@ -260,7 +265,8 @@ class _Bench:
             seen = engine.pull(estimate, column["observations"] * self.root)
             pairs = zip(vars(gradient).values(), vars(seen).values(), strict=True)
             gradient = Gradient(*(one + other for one, other in pairs))
-        return self.whitening.whiten(gradient)
+        whitened: Tensor = self.whitening.whiten(gradient)
+        return whitened
 
     def by_stretch(self, one: Rows, other: Rows) -> FloatArray:
         """The product of two columns, (G + 1,): by stretch, and of the priors that belong to none."""
@@ -301,7 +307,8 @@ def _stretches(arrays: Arrays) -> Tensor:
         share = along / along.max().clamp(min=1e-9)
         out[own] = count + (share * _STRETCHES).long().clamp(max=_STRETCHES - 1)
         count += _STRETCHES
-    return torch.unique(out, return_inverse=True)[1]
+    stretch: Tensor = torch.unique(out, return_inverse=True)[1]
+    return stretch
 
 
 @dataclass(frozen=True)
@@ -357,7 +364,7 @@ class _Answer:
         return self._apart(self.score) / max(float(by_model), 1e-300)
 
     def _apart(self, score: FloatArray) -> float:
-        """Square sum of what is left of scores (G + 1,); neighbouring stretches err alike (Bartlett's weights)."""
+        """Square sum of what is left of scores (G + 1,); neighbours err alike (Bartlett's weights)."""
         off = (score - score.sum() / self.information.sum() * self.information)[:-1]
         lags = range(1, _LAGS + 1)
         together = sum(2 * (1 - lag / (_LAGS + 1)) * float(off[lag:] @ off[:-lag]) for lag in lags)
@@ -390,7 +397,7 @@ class _Answer:
 
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
-    """Every fault that ``problem`` can have, each tested by itself at its ``solution``; the likeliest first."""
+    """Every fault that ``problem`` can have, each tested at its ``solution``; largest gain first."""
     bench = _Bench.at(solution.covariance.whitening)
     answers = [_Answer.to(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
     said = [one.disagreement for one in answers if one.is_observable]
@@ -442,7 +449,8 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
 
 def _likeliest_changes(found: list[ScoreTest]) -> list[ScoreTest]:
     """Of inputs that may change at many frames only the likeliest, which had so many chances."""
-    kept, changes = [one for one in found if one.fault not in CHANGES], {}
+    kept = [one for one in found if one.fault not in CHANGES]
+    changes: dict[tuple[Fault, int, int], list[ScoreTest]] = {}
     for one in found:
         if one.fault in CHANGES:
             changes.setdefault((one.fault, one.camera, one.axis), []).append(one)
@@ -557,7 +565,7 @@ def _drift_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
 
 
 def _course_motion(problem: Problem) -> Callable[[Arrays], Tensor]:
-    """A heading that is the course of a point ahead of the rear axle: it slips by the curvature of the path."""
+    """A heading that is the course of a point ahead of the rear axle: it slips as the path bends."""
     twist = np.asarray(problem.twist_vehicle)
     speed = np.hypot(twist[:, 0], twist[:, 1])
     curvature = np.where(speed > _LEAST_SPEED_MPS, twist[:, 5] / np.maximum(speed, _LEAST_SPEED_MPS), 0.0)

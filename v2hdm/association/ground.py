@@ -30,8 +30,7 @@ _HORIZON_M2 = 1e4
 _SYMBOL_RANGE_M = 16.0
 """Distance from the vehicle, m, beyond which a symbol's place is too vague to speak against a neighbour."""
 
-_BORDER_PX = 10.0
-"""Width of the image's border, px, within which a marking may be cut."""
+_BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,10 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
     known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
-    centre, points = corners_map.mean(axis=1), _middle_line(corners_map)
+    centre, sides = corners_map.mean(axis=1), (corners_map + np.roll(corners_map, -1, axis=1)) / 2
+    across = sides[:, 2:] - sides[:, :2]
+    way = across[np.arange(len(across)), np.argmax(np.linalg.norm(across, axis=2), axis=1)]
+    points = centre[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None]
     for ground in outlines_on_ground(symbols, rig):
         if ground is None:
             continue
@@ -129,15 +131,6 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
             ]
             count[group] += 2 * sum(inside) > len(inside)
     return count
-
-
-def _middle_line(corners_map: FloatArray) -> FloatArray:
-    """Five points (G, 5, 2) spread evenly over the longer middle lines of quadrilaterals (G, 4, 2)."""
-    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
-    across = np.stack([sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1]], axis=1)
-    longer = np.argmax(np.linalg.norm(across, axis=2), axis=1)
-    way = across[np.arange(len(across)), longer]
-    return np.asarray(corners_map.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None])
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
@@ -176,11 +169,7 @@ def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
 
 
 def easy_views(
-    views: Views,
-    rig: Rig,
-    cameras: Sequence[Camera],
-    corners_map: FloatArray,
-    within_m: float | None = None,
+    views: Views, rig: Rig, cameras: Sequence[Camera], corners_map: FloatArray, within_m: float | None = None
 ) -> tuple[IntArray, IntArray]:
     """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
 
@@ -218,13 +207,10 @@ def _sees(
 ) -> NDArray[np.bool_]:
     """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
     corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners_map)
-    if within_m is None:
-        inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
-    else:
-        away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
-        inside = np.asarray(away_m <= within_m).all(axis=1)
+    away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
+    near = inside_convex(camera.roi_vehicle, corners_vehicle) if within_m is None else away_m <= within_m
     pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
     limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
     with np.errstate(invalid="ignore"):
         on_image = ((pixel > _BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
-    return np.asarray(inside & on_image)
+    return np.asarray(near.all(axis=1) & on_image)

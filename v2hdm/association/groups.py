@@ -29,13 +29,10 @@ _LEAST_DEPTH_M = 1.0
 LEAST_TOLERANCE_M = 0.05
 """How far corners of one shape may deviate, m, however small the marking is."""
 
-_CORNER_FLOOR_M = 0.001
-"""Floor of a corner's sigma where groups are fused, m."""
+_CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
+_HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls
 
-_HUBER_SIGMAS = 2.0
-"""Residual in sigmas from which a sighting's weight in its group falls."""
-
-OPEN_END_M = 10.0
+_OPEN_END_M = 10.0
 """Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
 
 
@@ -132,7 +129,7 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     point = association.in_group_order(located.valid) & grouped
     noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
     on_line = known_elsewhere(association, located.valid, located.informs)
-    noise[on_line] = line_only(noise[on_line], OPEN_END_M)
+    noise[on_line] = line_only(noise[on_line], _OPEN_END_M)
     covariance = association.in_group_order(noise) + _CORNER_FLOOR_M**2 * np.eye(2)
     information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
     corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)
@@ -140,8 +137,7 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     size = association.count * 4 + 1
     weight = informs.astype(float)
     for _ in range(3):
-        total = np.zeros((size, 2, 2))
-        vector = np.zeros((size, 2))
+        total, vector = np.zeros((size, 2, 2)), np.zeros((size, 2))
         weighted = information * weight[..., None, None]
         np.add.at(total, corner, weighted)
         np.add.at(vector, corner, (weighted @ points[..., None])[..., 0])
@@ -153,11 +149,8 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
         weight = informs * np.minimum(1.0, _HUBER_SIGMAS / distance)
     seen = np.bincount(corner[point], minlength=size)[:-1]
     mean[~solvable] = np.nan
-    return FusedGroups(
-        corners_map=mean[:-1].reshape(-1, 4, 2),
-        covariance_m2=spread[:-1].reshape(-1, 4, 2, 2),
-        seen=seen.reshape(-1, 4).astype(np.int64),
-    )
+    covariance_m2 = spread[:-1].reshape(-1, 4, 2, 2)
+    return FusedGroups(mean[:-1].reshape(-1, 4, 2), covariance_m2, seen.reshape(-1, 4).astype(np.int64))
 
 
 def in_view(
@@ -192,28 +185,39 @@ def merge_groups(
 ) -> Association:
     """Merge groups of one class and shape that coincide in the map, nearest pairs first.
 
-    Two groups with a sighting in the same image are two markings and are never merged.
-
-    Args:
-        association: the groups to merge.
-        sightings: the table that they index.
-        fused: where the groups lie.
-        floor_m: sigma added to each position for what shifts whole groups: extrinsic, RTK drift.
-        gate_sigmas: largest distance of two groups in sigmas.
-        max_distance_m: largest distance of two groups in metres.
-        shape_tolerance: largest deviation of a corner as a fraction of the marking's diameter.
+    Two groups with a sighting in the same image are two markings and are never merged. Groups coincide within
+    ``gate_sigmas`` and ``max_distance_m``, where ``floor_m`` is added to each position's sigma for what
+    shifts whole groups (extrinsic, RTK drift); ``shape_tolerance`` is the largest deviation of a corner as a
+    fraction of the marking's diameter.
     """
-    if not association.count:
+    usable = np.flatnonzero(fused.valid.sum(axis=1) >= 2)
+    centre = np.nanmean(fused.corners_map[usable], axis=1)
+    # Of a drive of a few images the extrinsic is hardly known, and rays may meet the ground nowhere.
+    somewhere = np.isfinite(centre).all(axis=1)
+    usable, centre = usable[somewhere], centre[somewhere]
+    if not len(usable):
         return association
-    pairs, shifts, distance = _coinciding_pairs(
-        association, sightings, fused, floor_m, gate_sigmas, max_distance_m, shape_tolerance
-    )
+    kind = group_kinds(association, sightings)
+    size_m = diameters(fused.corners_map, fused.valid)
+    # Centres over different valid corners differ by up to half a diameter.
+    reach_m = max_distance_m + 0.5 * float(np.max(size_m[usable]))
+    a, b = usable[cKDTree(centre).query_pairs(reach_m, output_type="ndarray")].T
+    found = align(fused.corners_map[a], fused.valid[a], fused.corners_map[b], fused.valid[b])
+    covariance = _mean_covariance(fused, a) + _mean_covariance(fused, b) + 2 * floor_m**2 * np.eye(2)
+    solved = np.linalg.solve(covariance, found.offset[..., None])[..., 0]
+    distance = np.sqrt(np.sum(found.offset * solved, axis=-1))
+    tolerance_m = np.maximum(shape_tolerance * np.maximum(size_m[a], size_m[b]), LEAST_TOLERANCE_M)
+    accepted = (kind[a] == kind[b]) & (distance <= gate_sigmas) & (found.deformation_m <= tolerance_m)
+    accepted &= np.linalg.norm(found.offset, axis=-1) <= max_distance_m
     root = np.arange(association.count)
     # Corner c of the root is corner (c + turn) mod 4 of the group.
     turn = np.zeros(association.count, dtype=np.int64)
-    images = _images_of_groups(association, sightings)
-    for p in np.argsort(distance, kind="stable"):
-        (a, b), s = pairs[p], shifts[p]
+    images: list[set[int]] = [set() for _ in root]
+    for group, image in zip(association.group.tolist(), sightings.image.tolist(), strict=True):
+        if group >= 0:
+            images[group].add(image)
+    pairs = zip(*(of[accepted] for of in (distance, a, b, found.shift)), strict=True)
+    for _, a, b, s in sorted(pairs, key=lambda pair: float(pair[0])):
         root_a, root_b = root[a], root[b]
         if root_a == root_b or not images[root_a].isdisjoint(images[root_b]):
             continue
@@ -223,12 +227,8 @@ def merge_groups(
         images[root_a] |= images[root_b]
     kept, number = np.unique(root, return_inverse=True)
     grouped = association.group >= 0
-    safe = np.where(grouped, association.group, 0)
-    return Association(
-        group=np.where(grouped, number[safe], -1),
-        shift=(association.shift + np.where(grouped, turn[safe], 0)) % 4,
-        count=len(kept),
-    )
+    shift = (association.shift + np.where(grouped, turn[association.group], 0)) % 4
+    return Association(np.where(grouped, number[association.group], -1), shift, len(kept))
 
 
 def group_kinds(association: Association, sightings: Sightings) -> IntArray:
@@ -239,57 +239,11 @@ def group_kinds(association: Association, sightings: Sightings) -> IntArray:
     return np.asarray(votes.argmax(axis=1))
 
 
-def _coinciding_pairs(
-    association: Association,
-    sightings: Sightings,
-    fused: FusedGroups,
-    floor_m: float,
-    gate_sigmas: float,
-    max_distance_m: float,
-    shape_tolerance: float,
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs (P, 2) of groups that may be one marking, their shifts (P,) and distances (P,) in sigmas."""
-    usable = np.flatnonzero(fused.valid.sum(axis=1) >= 2)
-    centre = np.nanmean(fused.corners_map[usable], axis=1)
-    # Of a drive of a few images the extrinsic is hardly known, and rays may meet the ground nowhere.
-    somewhere = np.isfinite(centre).all(axis=1)
-    usable, centre = usable[somewhere], centre[somewhere]
-    kind = group_kinds(association, sightings)
-    size_m = diameters(fused.corners_map, fused.valid)
-    # Centres over different valid corners differ by up to half a diameter.
-    reach_m = max_distance_m + 0.5 * float(np.max(size_m[usable], initial=0.0))
-    pairs = usable[cKDTree(centre).query_pairs(reach_m, output_type="ndarray")] if len(usable) else _NO_PAIRS
-    a, b = pairs[:, 0], pairs[:, 1]
-    found = align(fused.corners_map[a], fused.valid[a], fused.corners_map[b], fused.valid[b])
-    covariance = _mean_covariance(fused, a) + _mean_covariance(fused, b) + 2 * floor_m**2 * np.eye(2)
-    solved = np.linalg.solve(covariance, found.offset[..., None])[..., 0]
-    distance = np.sqrt(np.sum(found.offset * solved, axis=-1))
-    tolerance_m = np.maximum(shape_tolerance * np.maximum(size_m[a], size_m[b]), LEAST_TOLERANCE_M)
-    accepted = (
-        (kind[a] == kind[b])
-        & (distance <= gate_sigmas)
-        & (np.linalg.norm(found.offset, axis=-1) <= max_distance_m)
-        & (found.deformation_m <= tolerance_m)
-    )
-    return pairs[accepted], found.shift[accepted], distance[accepted]
-
-
-_NO_PAIRS: IntArray = np.zeros((0, 2), dtype=np.int64)
-
-
 def _mean_covariance(fused: FusedGroups, groups: IntArray) -> FloatArray:
     """Mean covariance (P, 2, 2) of the seen corners of ``groups``."""
     valid = fused.valid[groups][..., None, None]
     covariance = np.where(valid, fused.covariance_m2[groups], 0.0)
     return np.asarray(covariance.sum(axis=1) / np.maximum(valid.sum(axis=1), 1))
-
-
-def _images_of_groups(association: Association, sightings: Sightings) -> list[set[int]]:
-    images: list[set[int]] = [set() for _ in range(association.count)]
-    for group, image in zip(association.group.tolist(), sightings.image.tolist(), strict=True):
-        if group >= 0:
-            images[group].add(image)
-    return images
 
 
 _REACH_M = 4.0
@@ -298,8 +252,7 @@ _REACH_M = 4.0
 _MOST_SQUARED = 16.0
 """Squared distance, in sigmas, up to which a sighting fits: four corners on lines have as many freedoms."""
 
-_CLEARER_BY = 9.0
-"""How much worse any other marking, or order of corners, must fit, in squared sigmas."""
+_CLEARER_BY = 9.0  # how much worse any other marking, or order of corners, must fit, in squared sigmas
 
 
 def attach(

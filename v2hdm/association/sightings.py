@@ -57,26 +57,27 @@ def collect_symbols(
     frame_of_image: IntArray,
 ) -> Symbols:
     """The symbols that the images of some cameras show, lens distortion removed."""
-    camera, frame, outlines, kinds = [], [], [], []
-    for found in detections:
-        name = drive.images[found.image].camera
-        if name not in camera_index:
-            continue
-        for marking in found.markings:
-            if len(marking.outline_px) >= 3:
-                camera.append(camera_index[name])
-                frame.append(int(frame_of_image[found.image]))
-                kinds.append(marking.kind)
-                outlines.append(undistort_points(drive.cameras[name].info, marking.outline_px))
-    indices = np.array(camera, dtype=np.int64), np.array(frame, dtype=np.int64)
-    return Symbols(*indices, tuple(outlines), tuple(kinds))
+    rows = [
+        (found.image, name, marking)
+        for found in detections
+        if (name := drive.images[found.image].camera) in camera_index
+        for marking in found.markings
+        if len(marking.outline_px) >= 3
+    ]
+    return Symbols(
+        camera=np.array([camera_index[name] for _, name, _ in rows], dtype=np.int64),
+        frame=frame_of_image[np.array([image for image, _, _ in rows], dtype=np.int64)],
+        outlines_pinhole_px=tuple(
+            undistort_points(drive.cameras[name].info, marking.outline_px) for _, name, marking in rows
+        ),
+        kinds=tuple(marking.kind for _, _, marking in rows),
+    )
 
 
-SIDE_SIGMA_PX = 3.0
+_SIDE_SIGMA_PX = 3.0
 """Largest sigma across, px, of a corner that is known to lie on a line; a vaguer one says next to nothing."""
 
-POINT_SIGMA_PX = 10.0
-"""Largest sigma, px, that a detector states for a corner that it takes for a point."""
+_POINT_SIGMA_PX = 10.0  # largest sigma, px, that a detector states for a corner that it takes for a point
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Sightings:
         finite = np.asarray(np.isfinite(self.covariance_px).all(axis=(2, 3)))
         finite &= np.isfinite(self.corners_pinhole_px).all(axis=2)
         variance = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance_px, np.eye(2)))
-        line = (variance[..., 0] <= SIDE_SIGMA_PX**2) & (variance[..., 1] > POINT_SIGMA_PX**2)
+        line = (variance[..., 0] <= _SIDE_SIGMA_PX**2) & (variance[..., 1] > _POINT_SIGMA_PX**2)
         return np.asarray(finite & (self.valid | line))
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
@@ -145,12 +146,8 @@ def frames_of(drive: Drive) -> Frames:
     taken = np.array([(image.visit, image.taken_s) for image in drive.images])
     distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
-    return Frames(
-        frame_of_image=inverse.ravel().astype(np.int64),
-        visit=distinct[:, 0].astype(np.int64),
-        stamp_s=distinct[:, 1],
-        map_from_vehicle=poses.astype(np.float64),
-    )
+    frame, visit = inverse.ravel().astype(np.int64), distinct[:, 0].astype(np.int64)
+    return Frames(frame, visit, distinct[:, 1], poses.astype(np.float64))
 
 
 def collect_sightings(
@@ -161,8 +158,8 @@ def collect_sightings(
     Raises:
         MappingError: the drive has no such camera, or its images hold no usable marking.
     """
-    camera_index = _camera_index(drive, cameras)
-    frames = frames_of(drive)
+    infos = [camera_of(drive, name).info for name in cameras]
+    camera_index, frames = {name: c for c, name in enumerate(cameras)}, frames_of(drive)
     rows = [
         (found.image, marking)
         for found in sorted(detections, key=lambda one: one.image)
@@ -180,10 +177,11 @@ def collect_sightings(
     image = np.array([i for i, _ in rows], dtype=np.int64)
     camera = np.array([camera_index[drive.images[i].camera] for i in image], dtype=np.int64)
     corners = np.stack([marking.corners_px for _, marking in rows]).astype(np.float64)
-    covariance = np.stack([_corner_blocks(marking.covariance_px) for _, marking in rows])
-    for name, c in camera_index.items():
+    covariance = np.stack([marking.covariance_px for _, marking in rows]).astype(np.float64)
+    covariance = np.stack([covariance[:, c : c + 2, c : c + 2] for c in (0, 2, 4, 6)], axis=1)
+    for c, info in enumerate(infos):
         own = camera == c
-        corners[own], covariance[own] = _undistort(drive.cameras[name].info, corners[own], covariance[own])
+        corners[own], covariance[own] = _undistort(info, corners[own], covariance[own])
     valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
     valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
     sightings = Sightings(
@@ -217,18 +215,6 @@ def camera_of(drive: Drive, name: str) -> Camera:
         known = ", ".join(drive.cameras)
         raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")
     return drive.cameras[name]
-
-
-def _camera_index(drive: Drive, cameras: Sequence[str]) -> dict[str, int]:
-    for name in cameras:
-        camera_of(drive, name)
-    return {name: c for c, name in enumerate(cameras)}
-
-
-def _corner_blocks(covariance_px: FloatArray) -> FloatArray:
-    """The four 2 x 2 diagonal blocks of an 8 x 8 corner covariance."""
-    blocks = np.asarray(covariance_px, dtype=np.float64).reshape(4, 2, 4, 2)
-    return blocks[range(4), :, range(4), :]
 
 
 def _undistort(

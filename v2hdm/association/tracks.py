@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -23,9 +22,7 @@ from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_REFUSED = 1e9
-"""Cost of a pair that the assignment must not make."""
-
+_REFUSED = 1e9  # cost of a pair that the assignment must not make
 _POSITION_FLOOR_M = 0.02
 """Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
 
@@ -83,20 +80,12 @@ def build_tracks(
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
     # Tracks are numbered camera by camera, and of each visit by visit.
-    counts = np.array([one.counts for one in linked], dtype=np.int64).reshape(-1, len(sightings.cameras))
+    counts = np.array([count for *_, count in linked], dtype=np.int64).reshape(-1, len(sightings.cameras))
     before = np.cumsum(counts.T.flatten()).reshape(counts.T.shape).T - counts
-    for own, one, first in zip(rows, linked, before, strict=True):
-        group[own] = np.where(one.number >= 0, one.number + first[sightings.camera[own]], -1)
-        shift[own] = one.shift
+    for own, (number, turn, _), first in zip(rows, linked, before, strict=True):
+        group[own] = np.where(number >= 0, number + first[sightings.camera[own]], -1)
+        shift[own] = turn
     return Association(group, shift, int(counts.sum()))
-
-
-class _Linked(NamedTuple):
-    """Tracks of one visit: ``number`` (S,) among those of the camera, -1 in none; ``counts`` by camera."""
-
-    number: IntArray
-    shift: IntArray
-    counts: list[int]
 
 
 def _of_visit(
@@ -123,8 +112,11 @@ def _link(
     map_from_vehicle: FloatArray,
     uncertainty: Uncertainty,
     options: AssociationOptions,
-) -> _Linked:
-    """Link the sightings of one visit, whose frames have the poses ``map_from_vehicle``."""
+) -> tuple[IntArray, IntArray, list[int]]:
+    """Link the sightings of one visit, whose frames have the poses ``map_from_vehicle``.
+
+    Returns the track's number (S,) among those of the camera, -1 in none; shifts; and tracks by camera.
+    """
     number = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
     linker = _Linker(sightings, located, map_from_vehicle, uncertainty, options)
@@ -149,7 +141,7 @@ def _link(
                     count += 1
                 number[row] = track.number
         counts.append(count)
-    return _Linked(number, shift, counts)
+    return number, shift, counts
 
 
 class _Linker:
@@ -163,15 +155,14 @@ class _Linker:
         uncertainty: Uncertainty,
         options: AssociationOptions,
     ) -> None:
-        self._sightings = sightings
-        self._located = located
-        self._uncertainty = uncertainty
-        self._options = options
+        self._sightings, self._located = sightings, located
+        self._uncertainty, self._options = uncertainty, options
         steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
         self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
-        self._noise_m2 = _noise_covariances(located, uncertainty)
-        self._ray_map, self._range_m = _mean_rays(located)
+        self._ray_map = mean_corners(located.ray_map, located.valid)
+        self._range_m = np.linalg.norm(self._ray_map, axis=1)
+        self._noise_m2 = _noise_covariances(located, self._ray_map, uncertainty)
         self._centre_map = mean_corners(located.corners_map, located.valid)
         self._size_m = diameters(located.corners_map, located.valid)
 
@@ -194,16 +185,12 @@ class _Linker:
         cost = self._mahalanobis2(found.offset, last[t], own)
         tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], LEAST_TOLERANCE_M)
         shape = found.deformation_m / tolerance_m
-        accepted = (
-            (cost <= self._options.gate_sigmas**2)
-            & (np.linalg.norm(found.offset, axis=-1) <= self._options.max_gate_m)
-            & (shape <= 1.0)
-        )
-        t, d = t[accepted], d[accepted]
+        accepted = (cost <= self._options.gate_sigmas**2) & (shape <= 1.0)
+        accepted &= np.linalg.norm(found.offset, axis=-1) <= self._options.max_gate_m
         costs = np.full((len(tracks), len(rows)), _REFUSED)
-        costs[t, d] = (cost + shape**2)[accepted]
+        costs[t, d] = np.where(accepted, cost + shape**2, _REFUSED)
         shift = np.zeros(costs.shape, dtype=np.int64)
-        shift[t, d] = found.shift[accepted]
+        shift[t, d] = found.shift
         picked = zip(*linear_sum_assignment(costs), strict=True)
         return {int(rows[d]): (tracks[t], int(shift[t, d])) for t, d in picked if costs[t, d] < _REFUSED}
 
@@ -239,16 +226,9 @@ class _Linker:
         return _ray_covariance(self._ray_map[rows], along_m, across_m)
 
 
-def _mean_rays(located: Located) -> tuple[FloatArray, FloatArray]:
-    """Mean ray (S, 2) and its length (S,) over each sighting's valid corners."""
-    ray = mean_corners(located.ray_map, located.valid)
-    return ray, np.linalg.norm(ray, axis=1)
-
-
-def _noise_covariances(located: Located, uncertainty: Uncertainty) -> FloatArray:
-    """Covariance (S, 2, 2) of a sighting's mean position: pixels, jitter and position noise."""
-    ray, range_m = _mean_rays(located)
-    height_m = located.height_m
+def _noise_covariances(located: Located, ray: FloatArray, uncertainty: Uncertainty) -> FloatArray:
+    """Covariance (S, 2, 2) of a sighting's mean position, at the end of ``ray``: pixels, jitter, position."""
+    range_m, height_m = np.linalg.norm(ray, axis=1), located.height_m
     jitter_m = uncertainty.jitter_rad * (range_m**2 + height_m**2) / height_m
     weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
     pixels = np.sum(

@@ -23,63 +23,47 @@ from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
 _worker: tuple[Detector, Drive] | None = None
-_WORKERS_A_GPU = 8
-"""Processes that share one: each takes memory of its own there."""
+_WORKERS_A_GPU = 8  # processes that share one: each takes memory of its own there
 
 Detect = Callable[[Drive, DetectorOptions, Sequence[int], int, Callable[[ImageDetections], None]], None]
 """A function that does what :func:`detect_images` does."""
 
-_FEW_IMAGES = 8
-"""Fewer are looked at before a process has started."""
-
-_IMAGES = 24
-"""Images that are looked at: a second and a half of work."""
-
+_FEW_IMAGES = 8  # fewer are looked at before a process has started
+_IMAGES = 24  # images that are looked at: a second and a half of work
 _LEAST_IMAGES = 10
-_APART_M = 2.0
-"""They are at least this far apart, m, so that markings have moved on."""
-
+_APART_M = 2.0  # they are at least this far apart, m, so that markings have moved on
 _SHARE = 0.7
 """Paint at one place in this share of images is the vehicle: fields of diamonds cover it in a third."""
 
-_MARGIN_PX = 6
-"""The network sees an edge this far from where it is."""
+_MARGIN_PX = 6  # the network sees an edge this far from where it is
 
 
-def learn_own_vehicle(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:
+def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:
     """Where (height, width) a camera's images, in driving order, show its vehicle; None for nowhere."""
-    chosen = _spread_out(images)
-    if len(chosen) < _LEAST_IMAGES:
-        return None
-    total: np.ndarray | None = None
-    for image in chosen:
-        pixels = read_bgr(image.path)
-        if pixels.shape[:2] != (camera.info.height, camera.info.width):
-            return None
-        paint = detector.markings_paint(pixels, camera)
-        total = paint.astype(np.int32) if total is None else total + paint
-    assert total is not None
-    always = total >= _SHARE * len(chosen)
-    if not always.any():
-        return None
-    top, stride = detector.road_camera(camera).far_row, detector.network.info.paint_stride
-    mask = np.zeros((camera.info.height, camera.info.width), dtype=np.uint8)
-    grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
-    rows, columns = min(len(grown), len(mask) - top), min(grown.shape[1], mask.shape[1])
-    mask[top : top + rows, :columns] = grown[:rows, :columns]
-    size = 2 * _MARGIN_PX + 1
-    return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
-
-
-def _spread_out(images: Sequence[Image]) -> list[Image]:
-    """Up to :data:`_IMAGES` images, evenly spread over those taken far enough apart."""
     apart: list[Image] = []
     for image in images:
         place = image.map_from_vehicle[:2, 3]
         if not apart or np.linalg.norm(place - apart[-1].map_from_vehicle[:2, 3]) >= _APART_M:
             apart.append(image)
-    at = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
-    return [apart[k] for k in at.tolist()]
+    chosen = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
+    if len(chosen) < _LEAST_IMAGES:
+        return None
+    shape, painted = (camera.info.height, camera.info.width), []
+    for k in chosen.tolist():
+        pixels = read_bgr(apart[k].path)
+        if pixels.shape[:2] != shape:
+            return None
+        painted.append(detector.markings_paint(pixels, camera))
+    always = np.sum(painted, axis=0) >= _SHARE * len(chosen)
+    if not always.any():
+        return None
+    top, stride = detector.road_camera(camera).far_row, detector.network.info.paint_stride
+    mask = np.zeros(shape, dtype=np.uint8)
+    grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
+    rows, columns = min(len(grown), len(mask) - top), min(grown.shape[1], mask.shape[1])
+    mask[top : top + rows, :columns] = grown[:rows, :columns]
+    size = 2 * _MARGIN_PX + 1
+    return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
@@ -155,10 +139,8 @@ def own_vehicles(drive: Drive, detector: Detector) -> dict[str, BoolArray]:
     """Masks (height, width) of the vehicle itself, learnt for those cameras that have none and show it."""
     masks = {}
     for name, camera in drive.cameras.items():
-        if camera.own_vehicle is not None:
-            continue
-        mask = learn_own_vehicle(detector, [image for image in drive.images if image.camera == name], camera)
-        if mask is not None:
+        images = [image for image in drive.images if image.camera == name]
+        if camera.own_vehicle is None and (mask := _learn(detector, images, camera)) is not None:
             masks[name] = mask
             _log.info("camera %s: %.1f %% of the image is the vehicle itself", name, 100 * mask.mean())
     return masks

@@ -27,19 +27,17 @@ _HORIZON_MARGIN_PX = 16
 FARTHEST_M = 60.0
 """Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
 
-_SURROUNDINGS_PX = 24
-"""So far above the farthest ground what is there helps to classify what lies on it."""
+_SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
-FINE_ENOUGH_M = 0.007
+_FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
 
 ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 
-_LEAST_BELOW_PX = 4.0
-"""Nearer to the horizon than this nothing is known of the ground."""
+_LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
 
-CURVE_UNIT_PX = 100.0
+_CURVE_UNIT_PX = 100.0
 """Unit of the distance below the horizon in the basis of lanes' curves: their parameters are alike."""
 
 _PROBE_PX = 50.0
@@ -56,7 +54,7 @@ class RoadCamera:
     the image rows below the horizon of the camera's initial IPM (with a margin, since that IPM is coarse; the
     rows from there on are a multiple of ``multiple`` where the image is tall enough). ``far_row``, by a
     multiple of ``multiple`` below ``top``, is the one from which on ground within :data:`FARTHEST_M` shows.
-    From ``fine_row`` on (None if there is no such row) a pixel is less than :data:`FINE_ENOUGH_M` of ground
+    From ``fine_row`` on (None if there is no such row) a pixel is less than ``_FINE_ENOUGH_M`` of ground
     wide. ``aside`` cameras look across the way that the vehicle drives. ``foot_vehicle`` (2,) lies below the
     camera. Points far from any lens singularity are assumed.
     """
@@ -67,7 +65,11 @@ class RoadCamera:
         self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
         self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
         self.distorted = has_distortion(camera.info)
-        self._pinhole_lut = _build_pinhole_lut(camera.info) if self.distorted else None
+        # The pinhole pixel of every few recorded ones, one cell beyond the image's far border.
+        columns = np.arange(0.0, self.info.width + _LUT_STEP_PX, _LUT_STEP_PX)
+        rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
+        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
+        self._pinhole_lut: FloatArray = undistort_points(self.info, grid_px.reshape(-1, 2))
         self._ground_from_pinhole_px = facing_ipm(
             self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
         )
@@ -75,7 +77,9 @@ class RoadCamera:
         ahead, left, _ = cam_from_vehicle[2, :3]
         self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
         self.foot_vehicle = camera_centre(cam_from_vehicle)[:2]
-        self.top = self._top_row(multiple)
+        on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
+        height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
+        self.top = self.info.height - min(-(-height // multiple) * multiple, self.info.height)
         spare = max(self.first_row_within(FARTHEST_M) - _SURROUNDINGS_PX - self.top, 0)
         self.far_row = self.top + spare // multiple * multiple
         self.fine_row = self._fine_row()
@@ -83,14 +87,15 @@ class RoadCamera:
     def undistort(self, points_px: FloatArray) -> FloatArray:
         """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-2 px of the lens model."""
         points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
-        if self._pinhole_lut is None or not len(points):
+        if not self.distorted or not len(points):
             return points.copy()
-        rows, columns = self._pinhole_lut.shape[:2]
+        columns = (self.info.width - 1) // _LUT_STEP_PX + 2
+        rows = (self.info.height - 1) // _LUT_STEP_PX + 2
         cell = points / _LUT_STEP_PX
         first = np.minimum(np.maximum(np.floor(cell).astype(np.intp), 0), (columns - 2, rows - 2))
         right, down = np.hsplit(cell - first, 2)
+        lut = self._pinhole_lut
         at = first[:, 0] + columns * first[:, 1]
-        lut = self._pinhole_lut.reshape(-1, 2)
         upper = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
         at += columns
         lower = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
@@ -183,28 +188,13 @@ class RoadCamera:
         rows = np.arange(self.info.height, dtype=np.float64)
         return self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
 
-    def _top_row(self, multiple: int) -> int:
-        on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
-        height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
-        return self.info.height - min(-(-height // multiple) * multiple, self.info.height)
-
     def _fine_row(self) -> int | None:
-        middle = (self.info.width - 1) / 2
         rows = np.arange(self.top, self.info.height, dtype=np.float64)
-        left, right = (
-            self.unproject(np.column_stack([np.full_like(rows, middle + side), rows])) for side in (-0.5, 0.5)
-        )
-        coarse = ~(np.linalg.norm(right - left, axis=1) <= FINE_ENOUGH_M)
+        columns = (self.info.width - 1) / 2 + np.array([-0.5, 0.5])
+        ends = self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
+        coarse = ~(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) <= _FINE_ENOUGH_M)
         first = int(np.flatnonzero(coarse)[-1]) + 1 if coarse.any() else 0
         return self.top + first if first < len(rows) else None
-
-
-def _build_pinhole_lut(info: CameraInfo) -> FloatArray:
-    """Pinhole pixel of every ``_LUT_STEP_PX``-th recorded pixel, one cell beyond the image's far border."""
-    columns = np.arange(0, info.width + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
-    rows = np.arange(0, info.height + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
-    grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
-    return undistort_points(info, grid_px.reshape(-1, 2)).reshape(*grid_px.shape)
 
 
 @dataclass(frozen=True)
@@ -222,9 +212,8 @@ class GroundPoints:
 
     def __getitem__(self, part: slice) -> GroundPoints:
         """Some of the points."""
-        return GroundPoints(
-            self.points_vehicle[part], self.by_px[part], self.by_mounting[part], self.mounting_covariance
-        )
+        points = self.points_vehicle[part], self.by_px[part], self.by_mounting[part]
+        return GroundPoints(*points, self.mounting_covariance)
 
     def joint_covariance(self, covariance_px: FloatArray) -> FloatArray:
         """Covariance (2N, 2N), m^2, of the stacked points (x0, y0, x1, ...).
@@ -237,16 +226,14 @@ class GroundPoints:
         blocks[range(count), :, range(count)] = self.by_px
         jacobian = blocks.reshape(2 * count, 2 * count)
         stacked = self.by_mounting.reshape(2 * count, 6)
-        return np.asarray(
-            jacobian @ covariance_px @ jacobian.T + stacked @ self.mounting_covariance @ stacked.T
-        )
+        mounting = stacked @ self.mounting_covariance @ stacked.T
+        return np.asarray(jacobian @ covariance_px @ jacobian.T + mounting)
 
     def single_covariances(self, sigma_px: float | FloatArray) -> FloatArray:
         """Covariance (N, 2, 2), m^2, of points whose pixels are off by ``sigma_px``, one or (N,)."""
         covariance = np.square(sigma_px)[..., None, None] * self.by_px @ np.swapaxes(self.by_px, 1, 2)
-        return np.asarray(
-            covariance + self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
-        )
+        mounting = self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
+        return np.asarray(covariance + mounting)
 
 
 def _inverse(matrices: FloatArray) -> FloatArray:
@@ -279,8 +266,8 @@ class Horizon:
         probe_px_per_m = 1.0 / max(float(np.linalg.norm(ground[1] - ground[0])), 1e-9)
         self.px_per_m = probe_px_per_m / _PROBE_PX
         range_m = float(camera.range_m(ground.mean(axis=0)))
-        by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / CURVE_UNIT_PX
-        self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * CURVE_UNIT_PX, by_curvature])
+        by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / _CURVE_UNIT_PX
+        self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * _CURVE_UNIT_PX, by_curvature])
 
     def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
         """The a, b and c (3,) of a line's direction, place beside the camera and curvature, 1/m.
@@ -291,7 +278,7 @@ class Horizon:
 
     def basis(self, below: FloatArray) -> FloatArray:
         """The factors (N, 3) of a curve's a, b and c at distances (N,) below the horizon, px."""
-        v = np.maximum(below, _LEAST_BELOW_PX) / CURVE_UNIT_PX
+        v = np.maximum(below, _LEAST_BELOW_PX) / _CURVE_UNIT_PX
         phi = np.ones((len(v), 3))
         phi[:, 1], phi[:, 2] = v, 1.0 / v
         return phi
@@ -319,18 +306,16 @@ def camera_from_calibration(calibration: Calibration, linear_response: bool = Fa
     Raises:
         MapFileError: the calibration cannot be that of a camera that looks at the ground.
     """
-    info = calibration.info
+    info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
     problem = _problem(calibration)
+    if not problem:
+        below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
+        lowest = apply_in_front(ground_from_pinhole_px(info.intrinsic, cam_from_vehicle), below_px)[0]
+        if not np.isfinite(lowest).all():
+            problem = "the image's lowest row is above the horizon; mend cam_from_vehicle"
     if problem:
         raise MapFileError(f"calibration of camera '{info.name}': {problem}")
-    ipm = ipm_from_extrinsic(info, calibration.cam_from_vehicle)
-    below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
-    lowest = apply_in_front(ground_from_pinhole_px(info.intrinsic, calibration.cam_from_vehicle), below_px)[0]
-    if not np.isfinite(lowest).all():
-        raise MapFileError(
-            f"calibration of camera '{info.name}': the image's lowest row is above the horizon; "
-            "mend cam_from_vehicle"
-        )
+    ipm = ipm_from_extrinsic(info, cam_from_vehicle)
     roi_vehicle = lowest + _BELOW_M * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     return Camera(info, {"calibrated": ipm}, "calibrated", roi_vehicle, linear_response=linear_response)
 
@@ -366,11 +351,8 @@ def _problem(calibration: Calibration) -> str | None:
         return "image size and focal lengths must be positive; mend them"
     if np.abs(cam_from_vehicle).max() > _FARTHEST_MOUNT_M:
         return f"cam_from_vehicle puts the camera beyond {_FARTHEST_MOUNT_M:g} m from the vehicle; mend it"
-    if (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or np.linalg.det(rotation) < 0
-        or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1])
-    ):
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ROTATION_TOLERANCE
+    if not rigid or np.linalg.det(rotation) < 0 or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1]):
         return "cam_from_vehicle is no rotation and translation; write it again with `python -m v2hdm.map`"
     if camera_centre(cam_from_vehicle)[2] <= 0:
         return "cam_from_vehicle puts the camera on or under the ground; mend it"

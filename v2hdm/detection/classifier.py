@@ -55,15 +55,9 @@ _LOG_SIZE_SIGMA = 0.2
 _DIRECTION_SIGMA = 0.15
 """Markings of one stencil, as a single image shows them, differ by so much in log size and by so many rad."""
 
-_BEND_RADIUS_M = 20.0
-"""And by the angle that a bend of this radius turns by between them."""
-
-_MOST = 3.0
-"""More company than this adds nothing."""
-
-_APART_M = 0.3
-"""Nearer quadrilaterals are readings of the same paint."""
-
+_BEND_RADIUS_M = 20.0  # and by the angle that a bend of this radius turns by between them
+_MOST = 3.0  # more company than this adds nothing
+_APART_M = 0.3  # nearer quadrilaterals are readings of the same paint
 _LEAST_GAP = 0.5
 _LONGEST_GAP_M = 15.0
 """Dashes of a line are at least so many times their own length apart, and at most so far."""
@@ -117,13 +111,13 @@ def read_markings(
     rows = [(m, kind) for m, (_, kinds) in enumerate(tried) for kind in kinds]
     evidence = gather(fit, output, quads, ground, chosen, rows, catalogue)
     views, first_side = rectified_views(patches, quads, ground, rows, catalogue)
-    at = np.array([m for m, _ in rows], dtype=np.intp)
+    at, kinds = np.array([m for m, _ in rows], dtype=np.intp), [kind for _, kind in rows]
     place = {p.index: m for m, p in enumerate(chosen)}
     parts = {
-        m: [place[k] for k in range(p.index + 1, p.index + 1 + p.blob.parts) if k in place]
+        m: among
         for m, p in enumerate(chosen)
+        if (among := [place[p.index + k] for k in range(1, 1 + p.blob.parts) if p.index + k in place])
     }
-    kinds, parts = [kind for _, kind in rows], {m: among for m, among in parts.items() if among}
     return Readings(fit, at, kinds, evidence, views, ground.corners[at], first_side, parts)
 
 
@@ -135,7 +129,10 @@ def find_markings(
         return []
     odds, side_sigma_px = classify_alone(readings.evidence, readings.views, readings.kinds)
     score = classify_among(odds, readings.ground, readings.kinds)
-    best = _best_of_each(readings.quadrilateral, score)
+    # The reading of each quadrilateral with the highest score; of equals the likelier.
+    order = np.lexsort((-np.arange(len(score)), score))
+    best = np.zeros(int(readings.quadrilateral.max()) + 1, dtype=np.intp)
+    best[readings.quadrilateral[order]] = order
     turned = (np.arange(4) - readings.first_side[best, None]) % 4
     corners_px = readings.fit.corners_px
     covariance = readings.fit.covariance_px(np.take_along_axis(side_sigma_px[best], turned, axis=1))
@@ -152,14 +149,6 @@ def find_markings(
         for m, row in enumerate(best.tolist())
         if score[row] >= options.min_confidence and m not in left_out
     ]
-
-
-def _best_of_each(quadrilateral: np.ndarray, score: FloatArray) -> np.ndarray:
-    """The reading (M,) of each quadrilateral with the highest score; of equals the likelier."""
-    order = np.lexsort((-np.arange(len(score)), score))
-    best = np.zeros(int(quadrilateral.max()) + 1, dtype=np.intp)
-    best[quadrilateral[order]] = order
-    return best
 
 
 def largest_sigma(covariance: FloatArray) -> FloatArray:
@@ -229,12 +218,13 @@ def company(ground: FloatArray, kinds: Sequence[str], probability: FloatArray) -
     kind = np.array(kinds)
     size, axis, centre = _shapes(ground, kind)
     apart = centre[None] - centre[:, None]
-    same = (kind[:, None] == kind) & (np.hypot(apart[..., 0], apart[..., 1]) > _APART_M)
-    weight = np.where(same, probability, 0.0)
+    distance = np.hypot(apart[..., 0], apart[..., 1])
+    weight = np.where((kind[:, None] == kind) & (distance > _APART_M), probability, 0.0)
     log_size = np.log(size)
     misfit = ((log_size[:, None] - log_size) ** 2).sum(axis=2) / _LOG_SIZE_SIGMA**2
-    turned = _turned(axis)
-    may_turn = np.hypot(_DIRECTION_SIGMA, np.hypot(apart[..., 0], apart[..., 1]) / _BEND_RADIUS_M)
+    # Of axes that have no sense of direction.
+    turned = np.arccos(np.clip(np.abs(axis @ axis.T), 0.0, 1.0))
+    may_turn = np.hypot(_DIRECTION_SIGMA, distance / _BEND_RADIUS_M)
     alike = weight * np.exp(-0.5 * (misfit + (turned / may_turn) ** 2))
     in_line = (kind == LANE_DASH)[:, None] & _follows(apart, axis, size[:, 1], turned)
     columns = (
@@ -262,11 +252,6 @@ def _shapes(ground: FloatArray, kind: np.ndarray) -> tuple[FloatArray, FloatArra
     longer = extents[np.arange(len(extents)), size.argmax(axis=1)]
     axis = longer / np.maximum(size.max(axis=1), 1e-9)[:, None]
     return np.clip(np.sort(size, axis=1), 0.01, 100.0), axis, ground.mean(axis=1)
-
-
-def _turned(axis: FloatArray) -> FloatArray:
-    """Angle (M, M), rad, between axes (M, 2) of no sense of direction."""
-    return np.asarray(np.arccos(np.clip(np.abs(axis @ axis.T), 0.0, 1.0)))
 
 
 def _follows(apart: FloatArray, axis: FloatArray, length: FloatArray, turned: FloatArray) -> np.ndarray:

@@ -106,20 +106,13 @@ def blurred_coverage(
     # A wider blur is a smaller picture: each side comes nearer to the pixel in proportion to its distance.
     np.multiply(sides, across, out=share).sum(axis=1, out=derivative[:, 8])
     sides -= ends
-    return _coverage(placed), derivative
-
-
-def _coverage(placed: np.ndarray) -> np.ndarray:
-    """Coverage (M, N) from the pixels' distance, and the sides' starts and ends (3, M, 4, N), overwritten."""
-    pixels = placed.shape[-1]
-    across = placed[0]
     inside = (across < 0).all(axis=1)
     sign = np.copysign(np.float32(1), across)
     np.abs(across, out=across)
     placed[1:] += np.float32(_REACH)
     placed *= np.float32(_CELLS_PER_BLUR)
     np.clip(placed, 0, _LAST_CELL, out=placed)
-    row, start, end = placed.reshape(3, -1, pixels)
+    row, start, end = placed.reshape(3, -1, placed.shape[-1])
     # Borders are slow in OpenCV; the indices were kept inside.
     sign *= np.subtract(
         cv2.remap(owen_table(), end, row, cv2.INTER_LINEAR),
@@ -127,7 +120,7 @@ def _coverage(placed: np.ndarray) -> np.ndarray:
     ).reshape(sign.shape)
     coverage = sign.sum(axis=1)
     coverage += inside
-    return np.asarray(coverage)
+    return coverage, derivative
 
 
 @cache
@@ -160,20 +153,11 @@ def variance_inflation(first: np.ndarray, second: np.ndarray, weight: np.ndarray
     return np.asarray((1 + r) / (1 - r), dtype=np.float64)
 
 
-_PAINT_SIGMA = 0.25
-"""How far the network's probability of paint is from the coverage."""
-
-_MIN_SCATTER = 0.01
-"""Least scatter of log grey: quantisation and noise of the best sensor."""
-
-_SHARED_PIXELS = 20.0
-"""A side's variance is drawn to that of all sides as if by so many pixels."""
-
-_CAUCHY = 2.385
-"""Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)."""
-
-_MAX_CORRELATION = 0.7
-"""Of the residuals of neighbouring pixels; beyond it few pixels would settle all."""
+_PAINT_SIGMA = 0.25  # how far the network's probability of paint is from the coverage
+_MIN_SCATTER = 0.01  # least scatter of log grey: quantisation and noise of the best sensor
+_SHARED_PIXELS = 20.0  # a side's variance is drawn to that of all sides as if by so many pixels
+_CAUCHY = 2.385  # Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)
+_MAX_CORRELATION = 0.7  # of the residuals of neighbouring pixels; beyond it few pixels would settle all
 
 
 def pixel_weights(

@@ -23,8 +23,7 @@ from v2hdm.errors import DetectorError
 from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 
-_NO_PAINT = -20.0
-"""Log odds of paint where the vehicle itself is."""
+_NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
 
 
 class Detector:
@@ -89,10 +88,10 @@ class Detector:
         mask = camera.own_vehicle
         if mask is None:
             return output
-        first, stride = np.array([output.top, 0]), output.stride
+        stride = output.stride
         rows, columns = (
-            np.minimum(stride * np.arange(count) + stride // 2 + start, last - 1)
-            for count, start, last in zip(output.paint.shape, first.tolist(), mask.shape, strict=True)
+            np.minimum(stride * np.arange(count) + stride // 2 + first, last - 1)
+            for count, first, last in zip(output.paint.shape, (output.top, 0), mask.shape, strict=True)
         )
         paint = np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), output.paint)
         return replace(output, paint=paint)
@@ -160,14 +159,11 @@ class Detector:
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
-    expected = (camera.info.height, camera.info.width, 3)
+    expected, problem = (camera.info.height, camera.info.width, 3), None
     if not isinstance(image_bgr, np.ndarray):
-        raise DetectorError(
-            f"camera '{camera.info.name}': got no image but {shown(image_bgr)}; cv2.imread gives None where "
-            "there is no file"
-        )
-    if image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
-        raise DetectorError(
-            f"camera '{camera.info.name}': got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
-            f"says {expected} uint8; mend the camera_info or pick the images that belong to it"
-        )
+        problem = f"no image but {shown(image_bgr)}; cv2.imread gives None where there is no file"
+    elif image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
+        problem = f"an image {image_bgr.shape} {image_bgr.dtype}, its camera_info says {expected} uint8; "
+        problem += "mend the camera_info or pick the images that belong to it"
+    if problem:
+        raise DetectorError(f"camera '{camera.info.name}': got {problem}")

@@ -61,20 +61,12 @@ _BEFORE, _BESIDE = 0.3, 1.0
 """How far a picture reaches beyond the corners, in parts of the sides: of a diamond; of all else along its
 longer sides and across them."""
 
-_FINER = 2
-"""So many samples of the image per element, in each direction."""
-
-_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN = 2.0, 2.0, 1 / 3
-"""Bring the channels to about one."""
-
+_FINER = 2  # so many samples of the image per element, in each direction
+_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN = 2.0, 2.0, 1 / 3  # bring the channels to about one
 _GRID = (np.arange(6) + 0.5) / 6
 _INNER = tuple(part.reshape(-1) for part in np.meshgrid(_GRID, _GRID))
-_SUREST = -4
-"""Place of the ninth decile among 36, in order."""
-
-_BESIDE_PX = 2.5
-"""Paint beside a side is looked for so far outside."""
-
+_SUREST = -4  # place of the ninth decile among 36, in order
+_BESIDE_PX = 2.5  # paint beside a side is looked for so far outside
 _SIZE_LIMITS_M = (0.01, 100.0)
 
 
@@ -146,20 +138,23 @@ def rectified_views(
     length = np.nan_to_num(ground.length, nan=1.0)
     lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
     ordered = quads.long_first(lengthwise).corners[marking]
-    quads = quads.take(marking)
+    quads, output = quads.take(marking), patches.output
     points = quads.px(_points(ordered, diamond, SIZE))
-    grey, blueness = _light(patches, marking, quads.px(_points(ordered, diamond, _FINER * SIZE)))
-    output = patches.output
+    bgr = patches.light_at(marking, quads.px(_points(ordered, diamond, _FINER * SIZE)))
+    bgr = bgr.reshape(len(bgr), SIZE, _FINER, SIZE, _FINER, 3).mean(axis=(2, 4))
+    logs = log_light(bgr)
+    grey, blueness = (
+        plane - np.median(plane, axis=(1, 2), keepdims=True)
+        for plane in (log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2])
+    )
     odds, shares = output.odds_at(points), output.shares_at(points)
     lines = shares[:, output.classes.index(LANE_LINE)]
     names = catalogue.of_family(SYMBOL, OTHER)
     symbols = shares[:, [k for k, name in enumerate(output.classes) if name in names]].sum(axis=1)
     own = shares[of_reading, [output.classes.index(kind) for _, kind in readings]]
-    before, after = (
-        (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds),
-        (lines, symbols, patches.outside(points)),
-    )
-    planes = [*(p[of_reading] for p in before), own, *(p[of_reading] for p in after)]
+    shared = (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds, lines, symbols)
+    planes = [plane[of_reading] for plane in (*shared, patches.outside(points))]
+    planes.insert(CHANNELS.index("own_share"), own)
     first_side = np.where(lengthwise, 0, 1)[marking][of_reading]
     return np.stack(planes, axis=1).astype(np.float32), first_side
 
@@ -185,12 +180,3 @@ def _points(corners: FloatArray, diamond: np.ndarray, size: int) -> FloatArray:
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., :1] * b[..., 1:] - a[..., 1:] * b[..., :1])
-
-
-def _light(patches: Patches, marking: np.ndarray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Log grey and log of blue over red (S, SIZE, SIZE), over their medians, of finer ``points`` (S, ...)."""
-    bgr = patches.light_at(marking, points)
-    parts = bgr.reshape(len(points), SIZE, _FINER, SIZE, _FINER, 3).mean(axis=(2, 4))
-    logs = log_light(parts)
-    grey, blueness = log_light(grey_of(parts)), logs[..., 0] - logs[..., 2]
-    return tuple(plane - np.median(plane, axis=(1, 2), keepdims=True) for plane in (grey, blueness))

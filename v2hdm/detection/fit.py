@@ -30,9 +30,7 @@ from v2hdm.records import BoolArray, FloatArray
 TYPICAL_BLUR_PX = 0.75
 """Point spread of a focused camera, px, pixel aperture included."""
 
-_BLUR_SIGMA_PX = 0.2
-"""How far one marking's blur is from the typical one, px: motion, focus, frayed paint."""
-
+_BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
 _BLUR_LIMITS_PX = (0.35, 3.0)
 _SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
 """Blur of the first steps, in distances of the grid's points and px: a wide one sees sides from far away."""
@@ -56,18 +54,14 @@ _MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
 _OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
 
-_OPEN_SIGMA = 3.0
-"""A side cut by the image's border is unknown within this many lengths of the marking."""
-
+_OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
 _BEYOND_PX = 6.0
 """How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
 
 _CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
 """Log contrast of paint over ground, as measured on asphalt, widened for worn and for fresh paint."""
 
-_MOST_CONTRAST = 4.0
-"""Log contrast of white paint on the blackest ground."""
-
+_MOST_CONTRAST = 4.0  # log contrast of white paint on the blackest ground
 _LIGHT_STEP = 0.4
 """By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
 
@@ -80,12 +74,8 @@ _MODEL_SIGMA_PX = 0.04
 aperture."""
 
 _SEARCH_STEPS, _STEPS = 4, 8
-_MAX_STEP = 2.0
-"""Longest step of a side, in blurs."""
-
-_SETTLED_PX, _FOUND_PX = 0.05, 0.3
-"""Steps of fit and of search that are shorter than this are the last, px."""
-
+_MAX_STEP = 2.0  # longest step of a side, in blurs
+_SETTLED_PX, _FOUND_PX = 0.05, 0.3  # steps of fit and of search that are shorter than this are the last, px
 _BLUR, _K = 8, 9
 _LIGHT = 10
 _SLOPE = _LIGHT + KNOTS
@@ -117,9 +107,7 @@ _ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
 _DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
 _ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
 
-_TILT_SHARE = 0.5
-"""A side that is off as a whole is askew by this share of that."""
-
+_TILT_SHARE = 0.5  # a side that is off as a whole is askew by this share of that
 _WHOLE_SIDES = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron(
     [[1.0, -1.0], [-1.0, 1.0]], np.eye(4)
 )
@@ -165,13 +153,8 @@ class Fit:
 
     def side_variance(self) -> FloatArray:
         """Variance (M, 4), px^2, of the place of each side's middle along its normal."""
-        start, end, both = self._ends(self.side_covariance)
+        start, end, both = _ends(self.side_covariance)
         return np.asarray((start + end + 2 * both) / 4)
-
-    def _ends(self, by_side: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Variances (M, 4) of each side's start and end, and their covariance."""
-        start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
-        return start, end, by_side[:, _CORNER, _CORNER + 4]
 
     def _second_order(self, by_side: FloatArray) -> FloatArray:
         """Covariance (M, 8, 8), px^2, that the error of a side's direction adds where its end is vague.
@@ -179,7 +162,7 @@ class Fit:
         A corner that may lie far along a side is off across it by its way times the error of the side's
         direction.
         """
-        start, end, both = self._ends(by_side)
+        start, end, both = _ends(by_side)
         normal = self.quad.normal
         tilt = np.maximum(start + end - 2 * both, 0) / np.maximum(self.quad.length, 1.0) ** 2
         out = np.zeros((len(normal), 4, 2, 4, 2))
@@ -189,6 +172,12 @@ class Fit:
             outer = normal[:, of, :, None] * normal[:, of, None, :]
             out[:, _CORNER, :, _CORNER] += (variance[..., None, None] * outer).swapaxes(0, 1)
         return out.reshape(-1, 8, 8)
+
+
+def _ends(by_side: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Variances (M, 4) of each side's start and end, and their covariance."""
+    start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
+    return start, end, by_side[:, _CORNER, _CORNER + 4]
 
 
 def fit_quadrilaterals(
@@ -221,9 +210,8 @@ def fit_quadrilaterals(
     searched[lost] = start.corners[lost]
     searched_px = frames.to_px(searched)
     # Beyond the image a lens model may fold.
-    folded = ~camera.inside(searched_px, -_OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1) & ~open_sides.any(
-        axis=1
-    )
+    within = camera.inside(searched_px, -_OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1)
+    folded = ~within & ~open_sides.any(axis=1)
     folded |= ~(np.ptp(searched_px, axis=1).max(axis=1) < 2 * np.ptp(corners_px, axis=1).max(axis=1))
     searched[folded], searched_px[folded] = start.corners[folded], corners_px[folded]
 
@@ -269,10 +257,12 @@ class _System:
     inliers: FloatArray
     by_side: FloatArray
 
-    def put(self, rows: np.ndarray, other: _System) -> None:
-        """Overwrite the markings ``rows`` with those of ``other``."""
-        for name, value in vars(self).items():
-            value[rows] = getattr(other, name)
+
+def _put(whole: _System | _State, rows: np.ndarray, part: _System | _State) -> None:
+    """Overwrite the markings ``rows`` with those of ``part``."""
+    for name, value in vars(whole).items():
+        if isinstance(value, np.ndarray):
+            value[rows] = getattr(part, name)
 
 
 @dataclass
@@ -318,35 +308,28 @@ class _State:
 
         With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
         """
+        scatter, settled_px = (_FINAL_SCATTER, _SETTLED_PX) if paint is None else (_WIDE_SCATTER, _FOUND_PX)
+        system = self.step(lattice, paint, scatter)
         running = np.arange(len(self.blur_px))
-        system: _System | None = None
-        wide_scatter = _FINAL_SCATTER if paint is None else _WIDE_SCATTER
-        for number in range(steps):
-            now = self._take(running)
-            part = now.step(lattice, paint, wide_scatter * 0.5**number)
-            self._put(running, now)
-            if system is None:
-                system = part
-            else:
-                system.put(running, part)
-            moving = np.abs(part.by_side).max(axis=1) > (_SETTLED_PX if paint is None else _FOUND_PX)
+        moving = np.abs(system.by_side).max(axis=1) > settled_px
+        for number in range(1, steps):
             lattice, running = lattice.take(moving), running[moving]
             paint = None if paint is None else paint[moving]
             if not len(running):
                 break
-        assert system is not None
+            now = self._take(running)
+            part = now.step(lattice, paint, scatter * 0.5**number)
+            _put(self, running, now)
+            _put(system, running, part)
+            corners = self.quad.corners.copy()
+            corners[running] = now.quad.corners
+            self.quad = Quad(corners)
+            moving = np.abs(part.by_side).max(axis=1) > settled_px
         return system
 
     def _take(self, rows: np.ndarray) -> _State:
         parts = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
         return _State(Quad(self.quad.corners[rows]), expected_blur_px=self.expected_blur_px, **parts)
-
-    def _put(self, rows: np.ndarray, other: _State) -> None:
-        for name in ("blur_px", "contrast", "expected_contrast", "light", "slope"):
-            getattr(self, name)[rows] = getattr(other, name)
-        corners = self.quad.corners.copy()
-        corners[rows] = other.quad.corners
-        self.quad = Quad(corners)
 
     def step(self, lattice: Lattice, paint: np.ndarray | None, least_scatter: float) -> _System:
         """One Gauss-Newton step, in place; the robust scale is ``least_scatter`` or more."""

@@ -18,8 +18,7 @@ from v2hdm.io.safe.pixels import read_pixels
 
 _log = logging.getLogger(__name__)
 
-_MOST_CAMERAS = 1 << 16
-"""OpenCV takes a larger index for something else."""
+_MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Suffixes of images in a folder."""
@@ -88,21 +87,17 @@ def video_frames(path: Path) -> Iterator[Frame]:
     Raises:
         DriveError: OpenCV cannot read it, or it has no frame.
     """
-    with _capture(str(path)) as capture:
-        if not capture.isOpened():
-            raise DriveError(
-                f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
-            )
+    refused = f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
+    with _capture(str(path), refused) as capture:
         promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        index = 0
-        while (pixels := _read(capture)) is not None:
-            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-            yield Frame(str(path), f"{path.stem}_{index:06d}", index, stamp_s, pixels)
-            index += 1
-        if not index:
+        count = 0
+        for count, pixels in enumerate(_pixels(capture), start=1):
+            stamp_s, name = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, f"{path.stem}_{count - 1:06d}"
+            yield Frame(str(path), name, count - 1, stamp_s, pixels)
+        if not count:
             raise DriveError(f"{path}: the video has no frame that can be read; copy or convert it again")
-        if index < promised:
-            _log.warning("%s: the video ends after %d of %d frames; is it cut off?", path, index, promised)
+        if count < promised:
+            _log.warning("%s: the video ends after %d of %d frames; is it cut off?", path, count, promised)
 
 
 def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
@@ -113,21 +108,20 @@ def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[
     Raises:
         DriveError: it does not open, or gives no more frames.
     """
-    with _capture(min(number, _MOST_CAMERAS)) as capture:
-        if not capture.isOpened():
-            raise DriveError(f"camera {number}: does not open; is it plugged in and used by no one else?")
+    refused = f"camera {number}: does not open; is it plugged in and used by no one else?"
+    with _capture(min(number, _MOST_CAMERAS), refused) as capture:
         if size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-        index = 0
-        while (pixels := _read(capture)) is not None:
-            yield Frame(f"camera {number}", f"camera{number}_{index:06d}", index, time.time(), pixels)
-            index += 1
-        raise DriveError(f"camera {number}: gives no image after {index} frames; check its cable")
+        count = 0
+        for count, pixels in enumerate(_pixels(capture), start=1):
+            name = f"camera{number}_{count - 1:06d}"
+            yield Frame(f"camera {number}", name, count - 1, time.time(), pixels)
+        raise DriveError(f"camera {number}: gives no image after {count} frames; check its cable")
 
 
 @contextmanager
-def _capture(source: str | int) -> Iterator[cv2.VideoCapture]:
+def _capture(source: str | int, refused: str) -> Iterator[cv2.VideoCapture]:
     """A capture that keeps OpenCV's and FFmpeg's own complaints off the terminal; the error is ours."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -136,11 +130,13 @@ def _capture(source: str | int) -> Iterator[cv2.VideoCapture]:
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:
+        if not capture.isOpened():
+            raise DriveError(refused)
         yield capture
     finally:
         capture.release()
 
 
-def _read(capture: cv2.VideoCapture) -> np.ndarray | None:
-    there, pixels = capture.read()
-    return np.asarray(pixels) if there else None
+def _pixels(capture: cv2.VideoCapture) -> Iterator[np.ndarray]:
+    while (read := capture.read())[0]:
+        yield np.asarray(read[1])

@@ -18,17 +18,13 @@ _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
-_MOST_PIXELS = 600
-"""A band of more pixels is thinned: all markings of an image are padded to the most."""
-
+_MOST_PIXELS = 600  # a band of more pixels is thinned: all markings of an image are padded to the most
 _MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
 """Ends of at most this share of the length make a quadrilateral slim; they reach that far past corners."""
 
-_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12
-"""Rows and columns of the coarse grid on which a fit begins."""
-
+_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12  # rows and columns of the coarse grid on which a fit begins
 _MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
 """How far it reaches beyond a quadrilateral, in its lengths and widths."""
 
@@ -107,11 +103,9 @@ def lay_grid(
         px.
     """
     quad = Quad(frames.from_image(corners_px))
-    a, b = (
-        np.linspace(-margin, 1 + margin, count)
-        for margin, count in ((_MARGIN_ALONG, _SEARCH_ALONG), (_MARGIN_ACROSS, _SEARCH_ACROSS))
-    )
-    a, b = (part.ravel() for part in np.meshgrid(a, b))
+    along = np.linspace(-_MARGIN_ALONG, 1 + _MARGIN_ALONG, _SEARCH_ALONG)
+    across = np.linspace(-_MARGIN_ACROSS, 1 + _MARGIN_ACROSS, _SEARCH_ACROSS)
+    a, b = (part.ravel() for part in np.meshgrid(along, across))
     pixels = np.clip(np.round(frames.to_px(quad.long_first().at(a, b))), -(10**6), 10**6)
     shape = pixels.shape[:2]
     u, v = pixels.reshape(-1, 2).astype(np.intp).T
@@ -149,10 +143,10 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     pixels[marking, place] = np.column_stack([u, v])
     place_of_cell = np.zeros(band.size, dtype=np.intp)
     place_of_cell[cell] = np.where(thin[marking] == 1, place, 0)
-    near = _near_the_next(columns, size[:, 0])[marking, j], _near_the_next(rows, size[:, 1])[marking, i]
     neighbours = np.zeros((2, *shape), dtype=np.intp)
-    for axis, step in ((0, 1), (1, across)):
-        neighbours[axis, marking, place] = np.where(near[axis], place_of_cell[cell + step], 0)
+    for axis, places, at, step in ((0, columns, j, 1), (1, rows, i, across)):
+        near = _near_the_next(places, size[:, axis])[marking, at]
+        neighbours[axis, marking, place] = np.where(near, place_of_cell[cell + step], 0)
     # Where a band is thinned, the next in its row is the neighbour.
     thinned = np.flatnonzero((thin[marking[:-1]] > 1) & (marking[1:] == marking[:-1]) & (i[1:] == i[:-1]))
     neighbours[0, marking[thinned], place[thinned]] = place[thinned] + 1
@@ -170,13 +164,13 @@ def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.nda
 
     Yellow paint on light ground is as bright in grey, but darker in blue.
     """
-    means, variances = [], []
-    for part in (inside * used, (1 - inside) * used):
+    apart, variance = np.float32(0), np.float32(0)
+    for part, sign in ((inside * used, 1), ((1 - inside) * used, -1)):
         count = np.maximum(part.sum(axis=1), 1)
         mean = (light * part).sum(axis=2) / count
-        means.append(mean)
-        variances.append(((light - mean[..., None]) ** 2 * part).sum(axis=2) / count)
-    clear = np.abs(means[0] - means[1]) / np.sqrt(variances[0] + variances[1] + 1e-4)
+        apart = apart + sign * mean
+        variance = variance + ((light - mean[..., None]) ** 2 * part).sum(axis=2) / count
+    clear = np.abs(apart) / np.sqrt(variance + 1e-4)
     clear[0] *= _GREY_FIRST
     return np.asarray(light[clear.argmax(axis=0), np.arange(light.shape[1])])
 
@@ -212,7 +206,13 @@ def _columns_and_rows(quad: Quad, size: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     each = np.arange(len(size))
     along = np.where(size[:, 0] >= size[:, 1], 0, 1)
-    step, band = _lattice_steps(quad, along)
+    longest, area = quad.length.max(axis=1), quad.area
+    band = area + _OUTSIDE_PX * (quad.length.sum(axis=1) + 4 * _OUTSIDE_PX)
+    band -= np.maximum(longest - 2 * _INSIDE_PX, 0) * np.maximum(area / longest - 2 * _INSIDE_PX, 0)
+    ratio = np.maximum(band / _MAX_PIXELS, 1.0)
+    longer = np.ceil(ratio / np.maximum(ratio / 4, 1))
+    step = np.empty_like(size)
+    step[each, along], step[each, 1 - along] = longer, np.ceil(ratio / longer)
     place, extent = np.sort(quad.corners[each, :, along], axis=1), size[each, along]
     head = np.ceil(np.minimum(place[:, 1], place[:, 0] + quad.width) + _END_PX).astype(np.intp)
     tail = np.floor(np.maximum(place[:, 2], place[:, 3] - quad.width) - _END_PX).astype(np.intp)
@@ -244,19 +244,6 @@ def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.nda
     first, between = first[:, None], between[:, None]
     middle, last = head + (k - first) * step, tail + (k - first - between) * outer
     return np.asarray(np.where(k < first, k * outer, np.where(k < first + between, middle, last)))
-
-
-def _lattice_steps(quad: Quad, along: np.ndarray) -> tuple[np.ndarray, FloatArray]:
-    """Steps (M, 2) along u and v that leave about ``_MAX_PIXELS`` of the band (M,) px about the sides."""
-    longest, area = quad.length.max(axis=1), quad.area
-    band = area + _OUTSIDE_PX * (quad.length.sum(axis=1) + 4 * _OUTSIDE_PX)
-    band -= np.maximum(longest - 2 * _INSIDE_PX, 0) * np.maximum(area / longest - 2 * _INSIDE_PX, 0)
-    ratio = np.maximum(band / _MAX_PIXELS, 1.0)
-    longer = np.ceil(ratio / np.maximum(ratio / 4, 1))
-    other = np.ceil(ratio / longer)
-    wide = along[:, None] == 0
-    step = np.where(wide, np.stack([longer, other], 1), np.stack([other, longer], 1)).astype(np.intp)
-    return step, band
 
 
 def _in_band(quad: Quad, bow_px: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:

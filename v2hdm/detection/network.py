@@ -34,24 +34,16 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
     # float32 as on the CPU, and one algorithm each time: detections do not depend on the process.
     "cuda": ("CUDAExecutionProvider", {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}),
 }
-_FALLBACK = {"cpu": [], "cuda": ["CPUExecutionProvider"]}
-"""For the few operations that a device does not have."""
 
-_OVERLAP_PX = 64
-"""Overlap of the two resolutions, so that either has its surroundings where they are joined."""
-
-_GRID_PX = 16
-"""The seam is on the grid of all outputs; the network's own multiple may be larger."""
-
+_OVERLAP_PX = 64  # overlap of the two resolutions, so that either has its surroundings where they are joined
+_GRID_PX = 16  # the seam is on the grid of all outputs; the network's own multiple may be larger
 _MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
 """Factors of a lane output (2, h, w), log odds and offset, in the mirror."""
 
 _LEAST_LOG_ODDS = -3.0
 """Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
 
-_MOST_ODDS = 6.0
-"""Log odds beyond this differ by chance only."""
-
+_MOST_ODDS = 6.0  # log odds beyond this differ by chance only
 _MOST_EXPONENT = 30.0
 
 
@@ -246,7 +238,7 @@ def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     kinds = (one.kinds + other.kinds[..., ::-1]) / 2
     (odds, offset), (odds_too, offset_too) = one.lanes, other.lanes[..., ::-1] * _MIRRORED
     # Where a line crosses a cell only that output knows that sees it cross.
-    weight = 1 / (1 + np.exp(np.clip(odds_too - odds, -30, 30)))
+    weight = as_probability(odds - odds_too)
     lanes = np.stack([(odds + odds_too) / 2, weight * offset + (1 - weight) * offset_too])
     columns = [-(-width // stride) for stride in info.strides]
     return RawOutput(*(a[..., :n] for a, n in zip((paint, kinds, lanes), columns, strict=True)))
@@ -327,15 +319,14 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
-        provider, settings = _PROVIDERS[device]
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=[(provider, settings), *_FALLBACK[device]]
-        )
+        # The CPU does the few operations that a device does not have.
+        providers = [_PROVIDERS[name] for name in dict.fromkeys((device, "cpu"))]
+        session = onnxruntime.InferenceSession(str(path), options, providers)
     except Exception as error:
-        raise DetectorError(
-            f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
-        ) from error
+        problem = f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
+        raise DetectorError(problem) from error
     # Where the driver or cuDNN fails, onnxruntime goes on without a word on the CPU.
+    provider = _PROVIDERS[device][0]
     if provider not in session.get_providers():
         raise DetectorError(
             f"detector.device is {device}, but onnxruntime could not start {provider}: check the driver, "
@@ -366,26 +357,21 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
             f"{path}: no usable '{METADATA_KEY}' metadata ({_one_line(error)}); "
             "this is not a model written by `python -m export`"
         ) from error
+    problem = None
     unknown = [name for name in info.classes if name not in info.catalogue.classes]
-    if unknown or not info.classes:
-        raise DetectorError(
-            f"{path}: unknown classes {unknown}, known are {', '.join(info.catalogue.names)}; "
-            "use another model"
-        )
-    if min(info.strides) < 1 or any(info.multiple % stride for stride in info.strides):
-        raise DetectorError(
-            f"{path}: strides {info.strides} do not divide multiple {info.multiple}; export it again"
-        )
-    if info.kind_stride % info.paint_stride:
-        raise DetectorError(
-            f"{path}: the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "
-            f"{info.paint_stride}; export it again"
-        )
     names = ([node.name for node in session.get_inputs()], [node.name for node in session.get_outputs()])
-    if names != (["image"], _OUTPUTS):
-        raise DetectorError(
-            f"{path}: inputs and outputs are {names}, not ['image'] and {_OUTPUTS}; export it again"
-        )
+    if unknown or not info.classes:
+        known = ", ".join(info.catalogue.names)
+        problem = f"unknown classes {unknown}, known are {known}; use another model"
+    elif min(info.strides) < 1 or any(info.multiple % stride for stride in info.strides):
+        problem = f"strides {info.strides} do not divide multiple {info.multiple}; export it again"
+    elif info.kind_stride % info.paint_stride:
+        problem = f"the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "
+        problem += f"{info.paint_stride}; export it again"
+    elif names != (["image"], _OUTPUTS):
+        problem = f"inputs and outputs are {names}, not ['image'] and {_OUTPUTS}; export it again"
+    if problem:
+        raise DetectorError(f"{path}: {problem}")
     return info
 
 

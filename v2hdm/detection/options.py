@@ -6,17 +6,16 @@ from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
 from v2hdm.io.safe.texts import shown
-from v2hdm.settings import NOT_NEGATIVE, POSITIVE, check_settings
-
-_MOST_THREADS = 256
-"""More take the machine's memory before they do any work."""
-
+from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
 
 DEVICES = ("cpu", "cuda")
 
-_RANGES = dict.fromkeys(("max_range_m", "max_corner_sigma_px", "lane_step_m"), POSITIVE) | {
-    "border_px": NOT_NEGATIVE
-}
+_RANGES = (
+    dict.fromkeys(("max_range_m", "max_corner_sigma_px", "lane_step_m"), POSITIVE)
+    | dict.fromkeys(("min_score", "min_confidence"), Within(0, 1 - 1e-9))
+    # More threads take the machine's memory before they do any work.
+    | {"border_px": NOT_NEGATIVE, "blur_px": Within(0.2, 3), "threads": Within(1, 256)}
+)
 
 
 @dataclass(kw_only=True)
@@ -66,10 +65,3 @@ class DetectorOptions:
         check_settings(self, _RANGES, "detector.")
         if self.device not in DEVICES:
             raise ConfigError(f"detector.device is {shown(self.device)}: choose {' or '.join(DEVICES)}")
-        if not 1 <= self.threads <= _MOST_THREADS:
-            raise ConfigError(f"detector.threads is {self.threads}: set 1 to {_MOST_THREADS}")
-        if self.blur_px is not None and not 0.2 <= self.blur_px <= 3.0:
-            raise ConfigError(f"detector.blur_px is {self.blur_px}: set 0.2 to 3.0 px, or none to measure it")
-        for name in ("min_score", "min_confidence"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a probability in [0, 1)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,12 +14,8 @@ from v2hdm.detection.network import NetworkOutput
 from v2hdm.geometry.quadrilateral import Quad, block_diagonal, following
 from v2hdm.records import BoolArray, FloatArray
 
-_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
-"""Weights of ITU-R BT.601."""
-
-_CLIPPED = 250
-"""Codes from here on are those of a sensor at its limit, noise and white balance allowed for."""
-
+_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)  # weights of ITU-R BT.601
+_CLIPPED = 250  # codes from here on are those of a sensor at its limit, noise and white balance allowed for
 _DARK = 0.01
 """Added to radiance before taking logarithms: in shade a step is as large as in the sun, noise is not."""
 
@@ -32,8 +29,7 @@ Edges fitted to coded values lie outwards of those of a bright marking by about 
 _AROUND, _SPARE_PX = np.array([[-1.0, 2.0, 2.0, -1.0], [-2.0, -2.0, 3.0, 3.0]]), 16
 """Corners of a patch, in longer and shorter sides of its marking's outline, and the px beyond."""
 
-_BOW_PX = 0.25
-"""A lens that bows the sides of a quadrilateral by less is as good as none."""
+_BOW_PX = 0.25  # a lens that bows the sides of a quadrilateral by less is as good as none
 
 
 def linear_bgr(coded: np.ndarray, linear_response: bool) -> np.ndarray:
@@ -75,9 +71,8 @@ class Patches:
         self._image, self._owner, self._own = image_bgr, owner, own
         self._linear_response = camera.camera.linear_response
         around = Quad(corners_px).long_first().at(*_AROUND)
-        low = np.clip(around.min(axis=1) - _SPARE_PX, 0, self._last_px).astype(int).tolist()
-        high = np.clip(around.max(axis=1) + _SPARE_PX, 0, self._last_px).astype(int).tolist()
-        self._boxes = [(*first, *last) for first, last in zip(low, high, strict=True)]
+        ends = np.stack([around.min(axis=1) - _SPARE_PX, around.max(axis=1) + _SPARE_PX], axis=1)
+        self._boxes = np.clip(ends, 0, self._last_px).astype(int).reshape(-1, 4).tolist()
         self._pixels = [_cut(image_bgr, box) for box in self._boxes]
 
     def look(
@@ -97,7 +92,11 @@ class Patches:
                 box = own_u.min(), own_v.min(), own_u.max(), own_v.max()
                 patch, left, top = self._patch(m, *map(int, box))
                 coded[begin:end] = patch[own_v - top, own_u - left]
-        use &= ~self._foreign(u, v, marking)
+        (rows, columns), stride = self._owner.shape, self.output.stride
+        row = np.clip((v - self.output.top) // stride, 0, rows - 1)
+        owner = self._owner[row, np.minimum(u // stride, columns - 1)]
+        first, last = self._own[marking].T
+        use &= (owner == 0) | ((owner >= first + 1) & (owner <= last + 1))
         bgr = linear_bgr(coded, self._linear_response)
         light = log_light(np.stack([grey_of(bgr), bgr[:, 2], bgr[:, 0]]))
         return light, use, use & (coded >= _CLIPPED).any(axis=1)
@@ -119,27 +118,19 @@ class Patches:
         """Which points (..., 2) are outside the image."""
         return np.asarray(((points_px < 0) | (points_px > self._last_px)).any(axis=-1))
 
-    def _foreign(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray) -> BoolArray:
-        """Which pixels (n,) of markings (n,) are paint of other pieces than the marking's own."""
-        (rows, columns), stride = self._owner.shape, self.output.stride
-        row = np.clip((v - self.output.top) // stride, 0, rows - 1)
-        owner = self._owner[row, np.minimum(u // stride, columns - 1)]
-        first, last = self._own[marking].T
-        return np.asarray((owner > 0) & ((owner < first + 1) | (owner > last + 1)))
-
     def _patch(
         self, marking: int, left: int, top: int, right: int, bottom: int
     ) -> tuple[np.ndarray, int, int]:
         """The pixels (h, w, 3) of a patch that reaches as far as asked, with their first column and row."""
         patch, (low_u, low_v, high_u, high_v) = self._pixels[marking], self._boxes[marking]
         if left < low_u or top < low_v or right > high_u or bottom > high_v:
-            box = min(left, low_u), min(top, low_v), max(right, high_u), max(bottom, high_v)
+            box = [min(left, low_u), min(top, low_v), max(right, high_u), max(bottom, high_v)]
             patch = self._pixels[marking] = _cut(self._image, box)
             self._boxes[marking] = box
         return patch, *self._boxes[marking][:2]
 
 
-def _cut(image_bgr: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
+def _cut(image_bgr: np.ndarray, box: Sequence[int]) -> np.ndarray:
     """The pixels (h, w, 3), a view, from the column and row of a box's first corner to those of its last."""
     left, top, right, bottom = box
     return image_bgr[top : bottom + 1, left : right + 1]

@@ -16,23 +16,17 @@ import numpy as np
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.records import FloatArray, LaneDetection
 
-_GUESS_SIGMA_RAD = np.deg2rad(6.0)
-"""Standard deviation of a guess of the pitch."""
-
+_GUESS_SIGMA_RAD = np.deg2rad(6.0)  # standard deviation of a guess of the pitch
 _PARALLEL_SIGMA_RAD = 0.015
 """Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is
 known."""
 
-_POINT_SIGMA_PX = 1.0
-"""Least standard deviation of a line beside its own points, px."""
-
+_POINT_SIGMA_PX = 1.0  # least standard deviation of a line beside its own points, px
 _MOST_SIGMA_RAD = np.deg2rad(0.6)
 """A pitch of a larger standard deviation is not returned: of 80 up to 1 degree, ten were off by more than
 that."""
 
-_OUTLIER_SIGMAS = 2.0
-"""Scale of Cauchy's loss: kerbs, arrows and letters point elsewhere."""
-
+_OUTLIER_SIGMAS = 2.0  # scale of Cauchy's loss: kerbs, arrows and letters point elsewhere
 _STEPS = 20
 _VOTES = 3
 _AGREE_RAD = np.deg2rad(1.0)
@@ -59,7 +53,6 @@ def estimate_pitch(lanes: Sequence[LaneDetection], camera: RoadCamera) -> Pitch 
         return None
     place, slope, covariance = (np.array(column) for column in zip(*lines, strict=True))
     x, y = float(np.median(place + slope * guess_px)), guess_px
-    weight = np.ones(len(lines))
     for _ in range(_STEPS):
         design = np.column_stack([np.ones(len(lines)), -slope])
         gradient = np.array([1.0, y])

@@ -21,9 +21,7 @@ from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.quadrilateral import following, is_convex_px, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_MIN_CELLS = 5
-"""Blobs of fewer cells are noise: their outline is not worth four corners."""
-
+_MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners
 _LEAST_SHARE, _LEAST_SYMBOL_SHARE = 0.15, 0.25
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
@@ -36,26 +34,16 @@ Markings that nearly touch come apart in sure paint; doubtful paint joins parts 
 _LEAST_SURE, _MOST_SURE = 0.2, 0.6
 """A piece of doubtful paint is of use if this much of it is likely, and news if no more than that."""
 
-_MOST_PARTS = 12
-"""Parts that are looked at of one piece: more are the grains of bad light."""
-
+_MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
 _OUTLINE_SCALE = 4
 
-_LEAST_CERTAINTY = 0.3
-"""Least mean probability of paint of a piece; below it one in fifty is a marking."""
-
-_LEAST_CLASS_SHARE = 0.02
-"""Least share of a class, by network and size, with which it is proposed."""
-
-_CLASS_DOUBT = 0.05
-"""Share of its certainty about classes that the network may give to wrong ones."""
-
+_LEAST_CERTAINTY = 0.3  # least mean probability of paint of a piece; below it one in fifty is a marking
+_LEAST_CLASS_SHARE = 0.02  # least share of a class, by network and size, with which it is proposed
+_CLASS_DOUBT = 0.05  # share of its certainty about classes that the network may give to wrong ones
 _GROUP_DOUBT = 0.1
 """Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
 
-_LEAST_FILL = 0.5
-"""Least share of a quadrilateral that its piece of paint fills: a triangle fills half."""
-
+_LEAST_FILL = 0.5  # least share of a quadrilateral that its piece of paint fills: a triangle fills half
 _BORDER_PX = 3.0
 """A side this near to the image's border is cut by it: the network's outline is coarser than this."""
 
@@ -156,10 +144,8 @@ def propose(
         ground = on_ground[begin:end]
         whole = bool(camera.inside(blob.outline_px, _BORDER_PX).all())
         share = _shares(blob, *rectangle_size(ground), catalogue, whole=whole)
-        start = _tightest(outlines[begin:end])
-        if start is not None and not _within(start[0], camera, max_range_m):
-            start = None
-        found.append(Proposal(blob, index, share, ground, *(start or (None, 0.0))))
+        start = _tightest(outlines[begin:end], camera, max_range_m)
+        found.append(Proposal(blob, index, share, ground, *start))
     return found
 
 
@@ -178,58 +164,47 @@ def _shares(
     for name, score in known.items():
         group = catalogue.classes[name].group
         groups[group] = groups.get(group, 0.0) + score
-    likely = {
-        name: (
-            score / certainty
-            + _CLASS_DOUBT / len(known)
-            + _GROUP_DOUBT * groups[catalogue.classes[name].group] / certainty
-        )
-        * float(np.exp(catalogue.classes[name].size_log_likelihood(length_m, width_m, whole=whole)))
-        for name, score in known.items()
-    }
+    likely = {}
+    for name, score in known.items():
+        described = catalogue.classes[name]
+        odds = score / certainty + _CLASS_DOUBT / len(known)
+        odds += _GROUP_DOUBT * groups[described.group] / certainty
+        likely[name] = odds * float(np.exp(described.size_log_likelihood(length_m, width_m, whole=whole)))
     total = max(sum(likely.values()), 1e-12)
     return {name: value / total for name, value in likely.items()}
 
 
-def _within(corners: FloatArray, camera: RoadCamera, max_range_m: float) -> bool:
-    """Whether a quadrilateral (4, 2), pinhole px, is convex, on the ground and in range."""
-    if not is_convex_px(corners):
-        return False
-    ground = camera.ground(corners)
-    return bool(np.isfinite(ground).all() and camera.range_m(ground.mean(axis=0)) <= max_range_m)
+def _tightest(
+    outline_pinhole_px: FloatArray, camera: RoadCamera, max_range_m: float
+) -> tuple[FloatArray | None, float]:
+    """The tightest quadrilateral around the hull of an outline (N, 2), and how much of it the hull fills.
 
-
-def _tightest(outline_pinhole_px: FloatArray) -> tuple[FloatArray, float] | None:
-    """The tightest quadrilateral around the hull of an outline (N, 2), and how much of it the hull fills."""
+    None where it is not convex, not on the ground or out of range.
+    """
     first = outline_pinhole_px[0]
     hull = cv2.convexHull((outline_pinhole_px - first).astype(np.float32))
     quad = quad_from_hull(hull)
-    if quad is None:
-        return None
+    if quad is None or not is_convex_px(quad + first):
+        return None, 0.0
+    ground = camera.ground(quad + first)
+    if not np.isfinite(ground).all() or camera.range_m(ground.mean(axis=0)) > max_range_m:
+        return None, 0.0
     area_px2 = float(cv2.contourArea(quad.astype(np.float32)))
     return quad + first, cv2.contourArea(hull) / max(area_px2, 1e-6)
 
 
-@dataclass(frozen=True)
 class _Groups:
     """Groups of classes: ``of_class`` (K,) of each class, the ``least_share`` (G,) of a blob to be present.
 
     ``symbols`` are the names of symbols and other paint.
     """
 
-    of_class: IntArray
-    least_share: FloatArray
-    symbols: tuple[str, ...]
-
-    @classmethod
-    def of(cls, classes: Sequence[str], catalogue: Catalogue) -> _Groups:
-        """The groups of the ``classes``."""
-        names = list(dict.fromkeys(catalogue.classes[name].group for name in classes))
-        of_class = np.array([names.index(catalogue.classes[name].group) for name in classes], dtype=np.int64)
-        symbols = catalogue.of_family(SYMBOL, OTHER)
-        least = np.full(len(names), _LEAST_SHARE)
-        least[[of_class[k] for k, name in enumerate(classes) if name in symbols]] = _LEAST_SYMBOL_SHARE
-        return cls(of_class, least, symbols)
+    def __init__(self, classes: Sequence[str], catalogue: Catalogue) -> None:
+        names = [catalogue.classes[name].group for name in classes]
+        self.of_class = np.array([names.index(name) for name in names], dtype=np.int64)
+        self.symbols = catalogue.of_family(SYMBOL, OTHER)
+        self.least_share = np.full(len(names), _LEAST_SHARE)
+        self.least_share[self.of_class[np.isin(classes, self.symbols)]] = _LEAST_SYMBOL_SHARE
 
 
 def find_blobs(
@@ -249,7 +224,7 @@ def find_blobs(
     cells, score = _class_scores(output, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
-    groups = _Groups.of(output.classes, catalogue)
+    groups = _Groups(output.classes, catalogue)
     blobs: list[Blob] = []
     wholes, stats, whole_of = _doubtful(level, contours, cells)
     first_of_whole: dict[int, int] = {}
@@ -268,10 +243,8 @@ def find_blobs(
         scores = dict(zip(output.classes, score[:, index].tolist(), strict=True))
         outline_px = _origin_px(output, 0, 0) + output.stride * outlines[index]
         signed, origin_px = _signed(inside, level[box]), _origin_px(output, box[0].start, box[1].start)
-        by_class = any(part.traced for part in parts)
-        blobs.append(
-            Blob(scores, signed, origin_px, output.stride, outline_px, parts=len(parts), traced=not by_class)
-        )
+        whole = Blob(scores, signed, origin_px, output.stride, outline_px, parts=len(parts))
+        blobs.append(replace(whole, traced=not any(part.traced for part in parts)))
         owner[box][inside] = len(blobs)
         for part in parts:
             blobs.append(part)
@@ -372,9 +345,8 @@ def _split(
     parts = []
     for own_level in levels:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(((own_level > 0) & inside).view(np.uint8))
-        for label in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist():
-            if label:
-                parts.append(_blob(labels == label, own_level, output, box))
+        large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist()
+        parts += [_blob(labels == label, own_level, output, box) for label in large if label]
     if len(parts) < 2:
         return []
     touches = any(part.kind in groups.symbols for part in parts)
@@ -419,22 +391,19 @@ def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:
 def zero_crossings(level: np.ndarray) -> FloatArray:
     """Where a field (h, w) changes sign between neighbours: points (N, 2) as (column, row), interpolated."""
     points = []
-    for axis in (0, 1):
-        first = level[:-1] if axis == 0 else level[:, :-1]
-        second = level[1:] if axis == 0 else level[:, 1:]
-        i, j = np.nonzero((first > 0) != (second > 0))
-        fraction = first[i, j] / (first[i, j] - second[i, j])
-        points.append(np.column_stack([j, i + fraction] if axis == 0 else [j + fraction, i]))
+    for field, order in ((level, [1, 0]), (level.T, [0, 1])):
+        i, j = np.nonzero((field[:-1] > 0) != (field[1:] > 0))
+        fraction = field[i, j] / (field[i, j] - field[i + 1, j])
+        points.append(np.column_stack([i + fraction, j])[:, order])
     return np.concatenate(points).astype(np.float64)
 
 
 def outline_polygon(blob: Blob) -> FloatArray:
     """The soft outline as a closed polygon (N, 2) in recorded px, to a fifth of an element."""
-    fine = cv2.resize(blob.level, None, fx=_OUTLINE_SCALE, fy=_OUTLINE_SCALE, interpolation=cv2.INTER_LINEAR)
+    size = blob.level.shape[1] * _OUTLINE_SCALE, blob.level.shape[0] * _OUTLINE_SCALE
+    fine = cv2.resize(blob.level, size, interpolation=cv2.INTER_LINEAR)
     if np.count_nonzero(fine > 0) < _OUTLINE_SCALE**2:  # hardly paint, and none between the cells' centres
-        fine = cv2.resize(
-            blob.level, None, fx=_OUTLINE_SCALE, fy=_OUTLINE_SCALE, interpolation=cv2.INTER_NEAREST
-        )
+        fine = cv2.resize(blob.level, size, interpolation=cv2.INTER_NEAREST)
     contours, _ = cv2.findContours((fine > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(contours, key=len)
     polygon = cv2.approxPolyDP(longest, 0.2 * _OUTLINE_SCALE, closed=True).reshape(-1, 2)

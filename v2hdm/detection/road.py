@@ -42,7 +42,7 @@ from v2hdm.records import (
     MarkingDetection,
 )
 
-LANE_SIGMA_PX = 1.0
+_LANE_SIGMA_PX = 1.0
 """Standard deviation of a point of a lane's paint; points of whole lines have a sigma of their own."""
 
 _PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
@@ -178,7 +178,7 @@ def _marking(image: MarkingDetection, ground: GroundPoints) -> RoadMarking:
 
 
 def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
-    sigma_px = LANE_SIGMA_PX if image.sigma_px is None else image.sigma_px
+    sigma_px = _LANE_SIGMA_PX if image.sigma_px is None else image.sigma_px
     return RoadLane(image, ground.points_vehicle, ground.single_covariances(sigma_px))
 
 
@@ -233,10 +233,7 @@ def _significant(values: FloatArray) -> list[Any]:
 
 
 def _plain(values: FloatArray) -> list[Any]:
-    finite = np.isfinite(values)
-    plain: list[Any] = values.tolist()
-    if not finite.all():
-        plain = np.where(finite, values.astype(object), np.array(None)).tolist()
+    plain: list[Any] = np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()
     return plain
 
 
@@ -246,35 +243,23 @@ def draw_detections(
     """A copy of an image with its detections; red corners are not valid."""
     canvas = image_bgr.copy()
     for lane in lanes:
-        _draw_lane(canvas, lane)
+        colour, points = _COLOUR_BGR.get(lane.kind, _OTHER_BGR), _fixed(lane.points_px)
+        cv2.polylines(canvas, [points], False, colour, 1, cv2.LINE_AA, _SHIFT)
+        for point in points:
+            cv2.circle(canvas, point.tolist(), 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+        if lane.identity is not None and len(points):
+            _write(canvas, f"{lane.identity:+d}", lane.points_px[0], colour)
     for marking in markings:
-        _draw_marking(canvas, marking)
+        colour, outlined = _COLOUR_BGR.get(marking.kind, _OTHER_BGR), len(marking.outline_px) > 0
+        shape_px = marking.outline_px if outlined else marking.corners_px
+        cv2.polylines(canvas, [_fixed(shape_px)], True, colour, 1, cv2.LINE_AA, _SHIFT)
+        for corner, valid in zip(_fixed(marking.corners_px), marking.corner_valid, strict=True):
+            if not outlined:
+                dot = colour if valid else _INVALID_BGR
+                cv2.circle(canvas, corner.tolist(), 3 << _SHIFT, dot, 1, cv2.LINE_AA, _SHIFT)
+        right_px = shape_px[np.argmax(shape_px[:, 0])]
+        _write(canvas, f"{marking.kind} {marking.score:.2f}", right_px, colour)
     return canvas
-
-
-def _draw_lane(canvas: np.ndarray, lane: LaneDetection) -> None:
-    colour = _COLOUR_BGR.get(lane.kind, _OTHER_BGR)
-    points = _fixed(lane.points_px)
-    if not len(points):
-        return
-    cv2.polylines(canvas, [points], False, colour, 1, cv2.LINE_AA, _SHIFT)
-    for point in points:
-        cv2.circle(canvas, point.tolist(), 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
-    if lane.identity is not None:
-        _write(canvas, f"{lane.identity:+d}", lane.points_px[0], colour)
-
-
-def _draw_marking(canvas: np.ndarray, marking: MarkingDetection) -> None:
-    colour = _COLOUR_BGR.get(marking.kind, _OTHER_BGR)
-    shape_px = marking.outline_px if len(marking.outline_px) else marking.corners_px
-    shape = _fixed(shape_px)
-    cv2.polylines(canvas, [shape], True, colour, 1, cv2.LINE_AA, _SHIFT)
-    if not len(marking.outline_px):
-        for corner, valid in zip(shape, marking.corner_valid, strict=True):
-            dot = colour if valid else _INVALID_BGR
-            cv2.circle(canvas, corner.tolist(), 3 << _SHIFT, dot, 1, cv2.LINE_AA, _SHIFT)
-    right_px = shape_px[np.argmax(shape_px[:, 0])]
-    _write(canvas, f"{marking.kind} {marking.score:.2f}", right_px, colour)
 
 
 def _write(canvas: np.ndarray, text: str, at_px: FloatArray, colour: tuple[int, int, int]) -> None:

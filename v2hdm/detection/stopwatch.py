@@ -12,18 +12,19 @@ import numpy as np
 
 _running: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
-
 KEPT = 10_000
 """Images whose times are kept, the last ones: a vehicle's process runs for days."""
 
+TOTAL = "all"
+"""The name of the time from beginning to end of an image, stages or not."""
+
 
 class Stopwatch:
-    """Collects the time of each stage, image by image; of the last :data:`KEPT` images."""
+    """Collects the time of each stage, image by image; of the last :data:`KEPT` of all ``images``."""
 
     def __init__(self) -> None:
-        self._images: deque[dict[str, float]] = deque(maxlen=KEPT)
-        self._total_s: deque[float] = deque(maxlen=KEPT)
-        self._count = 0
+        self.images = 0
+        self._kept: deque[dict[str, float]] = deque(maxlen=KEPT)
         self._now: dict[str, float] | None = None
 
     @contextmanager
@@ -35,9 +36,8 @@ class Stopwatch:
         try:
             yield
             if self._now is not None:
-                self._images.append(self._now)
-                self._total_s.append(time.perf_counter() - start)
-                self._count += 1
+                self._kept.append(self._now | {TOTAL: time.perf_counter() - start})
+                self.images += 1
         finally:
             _running.reset(token)
 
@@ -46,38 +46,21 @@ class Stopwatch:
         self._now = None
 
     @property
-    def images(self) -> int:
-        """How many images were timed."""
-        return self._count
-
-    @property
     def stages(self) -> tuple[str, ...]:
         """Stages in the order in which they were first seen."""
-        return tuple(dict.fromkeys(stage for laps in self._images for stage in laps))
+        return tuple(dict.fromkeys(stage for laps in self._kept for stage in laps if stage != TOTAL))
 
     def times_s(self, stage: str) -> np.ndarray:
-        """Seconds (N,) spent in a stage, one value an image; 0 where it was not entered."""
-        return np.array([laps.get(stage, 0.0) for laps in self._images])
-
-    def total_s(self) -> np.ndarray:
-        """Seconds (N,) from beginning to end of each image, stages or not."""
-        return np.array(self._total_s)
-
-    def add(self, stage: str, seconds: float) -> None:
-        """Add to a stage of the image at hand."""
-        if self._now is not None:
-            self._now[stage] = self._now.get(stage, 0.0) + seconds
+        """Seconds (N,) spent in a stage or in :data:`TOTAL`, one value per image; 0 where not entered."""
+        return np.array([laps.get(stage, 0.0) for laps in self._kept])
 
 
 @contextmanager
 def lap(stage: str) -> Iterator[None]:
     """Time a stage; entered again for the same image, the times add up. Stages must not be nested."""
-    stopwatch = _running.get()
-    if stopwatch is None:
-        yield
-        return
-    start = time.perf_counter()
+    stopwatch, start = _running.get(), time.perf_counter()
     try:
         yield
     finally:
-        stopwatch.add(stage, time.perf_counter() - start)
+        if stopwatch is not None and (laps := stopwatch._now) is not None:
+            laps[stage] = laps.get(stage, 0.0) + time.perf_counter() - start

@@ -41,10 +41,9 @@ def vehicle_twists(
 
     Central differences, one-sided at the ends of each ``visit`` (F,); a single pose has no motion.
     """
-    count = len(stamp_s)
-    before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
+    own = np.arange(len(stamp_s))
+    before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(own) - 1)
     if visit is not None:
-        own = np.arange(count)
         before = np.where(visit[before] == visit, before, own)
         after = np.where(visit[after] == visit, after, own)
     moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
@@ -52,7 +51,7 @@ def vehicle_twists(
     return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
 
 
-UNSURVEYED_CENTRE_SIGMA_M = 0.3
+_UNSURVEYED_CENTRE_SIGMA_M = 0.3
 """How well, m, a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
 
 HEAVE_SIGMA_M = 0.01
@@ -63,7 +62,7 @@ Solve = Callable[[Problem, SolveOptions], Solution]
 LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
 
-OPEN_END_PX = 1000.0
+_OPEN_END_PX = 1000.0
 """Sigma, px, of where along its side a corner lies that is no point: anywhere in the image."""
 
 VARIANCE_FACTORS = (0.05, 20.0)
@@ -129,12 +128,12 @@ class Bundle:
 
 
 def full_model(
-    pose_noise: Sequence[PoseNoise], options: MappingOptions, poses: str, variance_factor: float = 1.0
+    pose_sigma: Sequence[PoseSigma], options: MappingOptions, poses: str, variance_factor: float = 1.0
 ) -> Model:
     """Every frame deviates from its recorded pose by the states of the pose model ``poses``."""
     solver = with_model(replace(_solver(options), coarse=False), MODELS[poses])
-    sigma, floor_px = tuple(pose_sigma_of(one) for one in pose_noise), options.model_floor_px
-    return Model(sigma, floor_px, solver, variance_factor, options.known_sizes, options.survey)
+    sizes, survey = options.known_sizes, options.survey
+    return Model(tuple(pose_sigma), options.model_floor_px, solver, variance_factor, sizes, survey)
 
 
 def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
@@ -173,14 +172,8 @@ def solve_bundle(
 ) -> Bundle:
     """Estimate extrinsics, poses and the corners of all groups together.
 
-    Args:
-        sightings: the table of sightings.
-        association: groups to estimate.
-        usable: corners (S, 4), in the sightings' own order, that may be used.
-        rig: extrinsics to start from; the poses are always the recorded ones.
-        cameras: by name, for the priors on their centres.
-        model: noise and what is estimated.
-        solve: takes the place of :func:`v2hdm.adjust.solve`.
+    ``usable`` (S, 4) are the corners, in the sightings' own order, that may be used. The extrinsics start
+    from those of ``rig``, the poses always from the recorded ones.
 
     Raises:
         MappingError: no corner was seen twice.
@@ -198,7 +191,7 @@ def solve_bundle(
     own_corner = association.corner_order()[row, corner]
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
-    covariance_px[on_line] = line_only(covariance_px[on_line], OPEN_END_PX)
+    covariance_px[on_line] = line_only(covariance_px[on_line], _OPEN_END_PX)
     observations = Observations(
         camera=used.camera.astype(np.int64),
         frame=used.frame.astype(np.int64),
@@ -211,7 +204,13 @@ def solve_bundle(
     problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
     problem = replace(problem, lengths=lengths, control=control)
     solution = solve(problem, model.solver)
-    adjusted, index = _adjusted_rig(rig, sightings, used, solution), {name: c for c, name in enumerate(names)}
+    cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
+    cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
+    map_from_vehicle[used.frames] = solution.map_from_vehicle
+    adjusted, index = (
+        Rig(rig.intrinsic, cam_from_vehicle, map_from_vehicle),
+        {n: c for c, n in enumerate(names)},
+    )
     return Bundle(adjusted, model, problem, solution, association, row, group, corner, corner_index, index)
 
 
@@ -234,7 +233,12 @@ def _problem(
     model: Model,
 ) -> Problem:
     """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
-    centre, sigma = centre_priors(cameras, rig.cam_from_vehicle[used.cameras])
+    # Camera centres are surveyed, or else implied by the starting extrinsic.
+    centre = camera_centre(rig.cam_from_vehicle[used.cameras])
+    sigma = np.full_like(centre, _UNSURVEYED_CENTRE_SIGMA_M)
+    for c, camera in enumerate(cameras):
+        if camera.centre_prior is not None:
+            centre[c], sigma[c] = camera.centre_prior.centre_vehicle, camera.centre_prior.sigma_m
     intrinsic = rig.intrinsic[used.cameras]
     twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     return Problem(
@@ -292,28 +296,8 @@ def _observed_corners(
     row, corner = np.nonzero(in_order)
     group = association.group[row]
     flat = group * 4 + corner
-    seen = np.bincount(flat, minlength=4 * association.count)
     number = np.full(4 * association.count, -1, dtype=np.int64)
-    kept = seen >= 2
+    kept = np.bincount(flat, minlength=4 * association.count) >= 2
     number[kept] = np.arange(np.count_nonzero(kept))
     known = kept[flat]
     return row[known], group[known], corner[known], number.reshape(-1, 4)
-
-
-def centre_priors(cameras: Sequence[Camera], cam_from_vehicle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Prior camera centres and sigmas (C, 3): surveyed, or else implied by the starting extrinsic."""
-    centre = camera_centre(cam_from_vehicle)
-    sigma = np.full_like(centre, UNSURVEYED_CENTRE_SIGMA_M)
-    for c, camera in enumerate(cameras):
-        prior = camera.centre_prior
-        if prior is not None:
-            centre[c], sigma[c] = prior.centre_vehicle, prior.sigma_m
-    return centre, sigma
-
-
-def _adjusted_rig(rig: Rig, sightings: Sightings, used: _Used, solution: Solution) -> Rig:
-    cam_from_vehicle = rig.cam_from_vehicle.copy()
-    cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
-    map_from_vehicle = sightings.map_from_vehicle.copy()
-    map_from_vehicle[used.frames] = solution.map_from_vehicle
-    return Rig(rig.intrinsic, cam_from_vehicle, map_from_vehicle)

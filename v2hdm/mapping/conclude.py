@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,8 +76,10 @@ def conclude(
     located = locate(evidence.sightings, final.rig)
     located.informs[:] &= evidence.usable
     fused = fuse_groups(final.association, located, jitter_rad=0.0)
-    classified = classify(with_shared_errors(solved_candidates(final), fused), seen, options)
+    classified = classify(with_shared_errors(_solved_candidates(final), fused), seen, options)
     scale = max(1.0, final.solution.chi2_per_dof)
+    covariance = final.solution.extrinsic_covariance * scale
+    index, names = final.camera_index, evidence.sightings.cameras
     markings = with_relative_sigma(
         classified.markings(),
         final.corner_index[classified.accepted],
@@ -91,13 +93,21 @@ def conclude(
         groups=classified.accepted,
         markings=markings,
         excluded=classified.exclusions(),
-        calibrations=_calibrations(final, evidence.sightings.cameras, evidence.cameras),
+        # A camera that saw no marking keeps its start and has no covariance.
+        calibrations={
+            name: Calibration(
+                info=evidence.cameras[name].info,
+                cam_from_vehicle=final.rig.cam_from_vehicle[c],
+                covariance=covariance[index[name]] if name in index else None,
+            )
+            for c, name in enumerate(names)
+        },
         reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
         initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
     )
 
 
-def solved_candidates(bundle: Bundle) -> Candidates:
+def _solved_candidates(bundle: Bundle) -> Candidates:
     """The corners of every group of ``bundle``.
 
     Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than stated
@@ -116,21 +126,6 @@ def solved_candidates(bundle: Bundle) -> Candidates:
         blocks = scale * bundle.solution.corner_covariance(indices)
         covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
     return Candidates.seen(bundle.corners_map, covariance)
-
-
-def _calibrations(
-    bundle: Bundle, names: Sequence[str], cameras: Mapping[str, Camera]
-) -> dict[str, Calibration]:
-    """Calibrations by camera; one that saw no marking keeps its start and has no covariance."""
-    covariance = bundle.solution.extrinsic_covariance * max(1.0, bundle.solution.chi2_per_dof)
-    return {
-        name: Calibration(
-            info=cameras[name].info,
-            cam_from_vehicle=bundle.rig.cam_from_vehicle[c],
-            covariance=covariance[bundle.camera_index[name]] if name in bundle.camera_index else None,
-        )
-        for c, name in enumerate(names)
-    }
 
 
 def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:

@@ -34,9 +34,7 @@ Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 Solve = Callable[[Association, BoolArray, Rig], Rig]
 """The rig that groups of sightings lead to, of usable corners (S, 4), from another."""
 
-_FIRST_LINK_MARKINGS = 12
-"""From so many the extrinsics are better than the IPM that they began with."""
-
+_FIRST_LINK_MARKINGS = 12  # from so many the extrinsics are better than the IPM that they began with
 _LINK_GROWTH = 4
 """How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
 more than the last time alone."""
@@ -44,8 +42,7 @@ more than the last time alone."""
 _RECORD_GROWTH = 1.6
 """How many times as large the map is whenever its markings are kept for the figure of its growth."""
 
-_LEAST_CORNERS = 3
-"""Corners that fix a marking: all are parallelograms."""
+_LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
 
 @dataclass(frozen=True)
@@ -98,17 +95,10 @@ class IncrementalMapper:
         solve: Solve,
         model: Model,
     ) -> None:
-        """Begin with an empty map.
+        """Begin with an empty map, from the extrinsics and recorded poses of ``rig``.
 
-        Args:
-            sightings: the table of sightings.
-            rig: extrinsics to start from, and the recorded poses.
-            cameras: the rig's cameras by name.
-            position_sigma_m: how far the recorded positions are off.
-            options: settings of the mapping.
-            link: finds the tracks.
-            solve: solves for all markings together.
-            model: of the solve for each marking, which estimates no pose.
+        ``position_sigma_m`` is how far the recorded positions are off, ``model`` that of the solve for each
+        marking, which estimates no pose.
         """
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
@@ -121,14 +111,12 @@ class IncrementalMapper:
         """Keep the whole markings of the map whenever it has grown by so much: how its error settles."""
         if len(self._places) < max(self._record_at, self._known):
             return
-        corners = [self._corners(marking) for marking in range(len(self._places))]
-        self.growth.append(
-            tuple(
-                Marking(self._sightings.kinds[place.kind], own, len(place.images))
-                for own, place in zip(corners, self._places, strict=True)
-                if np.isfinite(own).all()
-            )
+        whole = (
+            Marking(self._sightings.kinds[place.kind], corners, len(place.images))
+            for number, place in enumerate(self._places)
+            if np.isfinite(corners := self._corners(number)).all()
         )
+        self.growth.append(tuple(whole))
         self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
     def run(self, progress: Callable[[str], None]) -> Grown:
@@ -177,11 +165,9 @@ class IncrementalMapper:
         rows = rows[np.argsort(tracks.group[rows], kind="stable")]
         members = np.split(rows, np.flatnonzero(np.diff(tracks.group[rows])) + 1) if len(rows) else []
         kinds = group_kinds(tracks, self._sightings)
-        ended = True
         for own in sorted(members, key=lambda own: int(own[-1])):
             if len(self._places) >= most:
-                ended = False
-                break
+                return Association(number, shift, len(self._places)), False
             track = self._track(own, int(kinds[tracks.group[own[0]]]), tracks, usable)
             if track is None:
                 continue
@@ -190,26 +176,26 @@ class IncrementalMapper:
                 number[own] = len(self._places) - 1 if marking is None else marking
                 self._record()
                 shift[own] = (shift[own] + turn) % 4
-        return Association(number, shift, len(self._places)), ended
+        return Association(number, shift, len(self._places)), True
 
     def _take(self, track: _Track, marking: int | None, turn: int) -> bool:
         """Take a track into the map as a ``marking``, None for a further one; whether that went well."""
-        corner = (track.seen.corner - turn) % 4
-        place = self._further_place(track) if marking is None else self._places[marking]
+        corner, known = (track.seen.corner - turn) % 4, np.isfinite(track.corners_map).all(axis=1)
+        place = (
+            _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), np.asarray(known), track.corners_map)
+            if marking is None
+            else self._places[marking]
+        )
         numbers = place.corner.copy()
         further = np.setdiff1d(corner, np.flatnonzero(numbers >= 0))
         numbers[further] = np.count_nonzero(numbers >= 0) + np.arange(len(further))
         turned_map = track.corners_map[(np.arange(4) + turn) % 4]
         sighted = Sighted(replace(track.seen, corner=numbers[corner]))
         if not self._coarse:
-            kind = self._sightings.kinds[place.kind]
-            sighted = replace(
-                sighted,
-                lengths=known_lengths(self._options.known_sizes, [kind], turned_map[None], numbers[None]),
-                control=control_points(
-                    self._options.survey, turned_map[None], numbers[None], PoseSigma(self._floor_m)
-                ),
-            )
+            kind, corners = self._sightings.kinds[place.kind], (turned_map[None], numbers[None])
+            lengths = known_lengths(self._options.known_sizes, [kind], *corners)
+            control = control_points(self._options.survey, *corners, PoseSigma(self._floor_m))
+            sighted = replace(sighted, lengths=lengths, control=control)
         count = len(self._places)
         number = count if marking is None else marking
         if count < self._known:
@@ -228,11 +214,6 @@ class IncrementalMapper:
             if len(self._places) == self._known:
                 self.grown.adjust()
         return True
-
-    def _further_place(self, track: _Track) -> _Place:
-        """A place for a marking that the map does not have."""
-        known = np.asarray(np.isfinite(track.corners_map).all(axis=1))
-        return _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), known, track.corners_map)
 
     def _corners(self, marking: int) -> FloatArray:
         """Corners (4, 2) of a marking under the present extrinsics, nan where none was seen as a point."""

@@ -10,27 +10,29 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust import Fault, Status, observability
-from v2hdm.association.ground import views_of
+from v2hdm.association.ground import ground_points, views_of
+from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
+from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.errors import ConfigError
 from v2hdm.executor import IN_PROCESS, Executor
-from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
+from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.quadrilateral import is_convex
 from v2hdm.io.maps.evidence import Residuals
-from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
-from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
 from v2hdm.mapping.stated import without_corner
 from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
+from v2hdm.site.candidates import Exclusion
 from v2hdm.site.changes import Base, update_map
 from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.site.lanes import map_lanes
@@ -67,20 +69,14 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
     out = []
     for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
-        clocks = {}
+        here, clocks = [one for one in score_tests if one.about in ("", f"in {place.name}")], {}
         for name in outcome.inputs.sightings.cameras:
-            if (visit, name) not in applied_s:
-                continue
-            beyond_s, sigma_s = estimated.get(name, (0.0, 0.0))
-            if name not in estimated:
-                # Of each camera, and of all of them together: a clock of its own may differ by both.
-                tested = [
-                    one.sigma**2
-                    for one in score_tests
-                    if name in one.cameras and one.about in ("", f"in {place.name}")
-                ]
-                sigma_s = float(np.sqrt(sum(tested))) if tested else float("inf")
-            clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
+            # Of each camera, and of all of them together: a clock of its own may differ by both.
+            tested = [one.sigma**2 for one in here if name in one.cameras]
+            unobserved = 0.0, float(np.sqrt(sum(tested))) if tested else float("inf")
+            beyond_s, sigma_s = estimated.get(name, unobserved)
+            if (visit, name) in applied_s:
+                clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
         out.append(clocks)
     return tuple(out)
 
@@ -140,7 +136,10 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
     images = [drive.images[i] for i in seen.tolist()]
     return Residuals(
-        image=tuple(_below(image.path, drive.root) for image in images),
+        image=tuple(
+            path.relative_to(drive.root).as_posix() if path.is_relative_to(drive.root) else str(path)
+            for path in (image.path for image in images)
+        ),
         camera=tuple(image.camera for image in images),
         taken_s=np.array([image.taken_s for image in images]),
         row_image=row_image.astype(np.int64),
@@ -153,13 +152,6 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     )
 
 
-def _below(path: Path, root: Path) -> str:
-    """A path from ``root`` on, whole where it lies elsewhere."""
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-
-
-LogStep = Callable[[str], None]
-
 NAIVE_IPMS: Mapping[str, str] = {"CNI": "calibrated", "ENI": "estimated"}
 """Naive methods by the name of the IPM that they use."""
 
@@ -171,7 +163,7 @@ def run_methods(
     detections: Sequence[ImageDetections],
     cameras: Sequence[str],
     options: MappingOptions | None = None,
-    progress: LogStep = silent,
+    progress: Callable[[str], None] = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
     executor: Executor = IN_PROCESS,
@@ -221,22 +213,20 @@ def run_methods(
 
 def _given_ipms(drive: Drive, cameras: Sequence[str]) -> dict[str, dict[str, FloatArray]]:
     """By naive method the IPMs of the cameras, for methods whose IPM every camera has."""
-    given: dict[str, dict[str, FloatArray]] = {}
-    for name, ipm_name in NAIVE_IPMS.items():
-        ipms = {c: camera_of(drive, c).ipm for c in cameras}
-        known = {c: ipm[ipm_name] for c, ipm in ipms.items() if ipm_name in ipm}
-        if len(known) == len(cameras):
-            given[name] = known
-    return given
+    ipms = {c: camera_of(drive, c).ipm for c in cameras}
+    return {
+        name: {c: ipm[known_as] for c, ipm in ipms.items()}
+        for name, known_as in NAIVE_IPMS.items()
+        if all(known_as in ipm for ipm in ipms.values())
+    }
 
 
 def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:
     """The naive strategy under one IPM per camera, for instance that of a known extrinsic."""
     begin_s = time.perf_counter()
-    drive, sightings, options = inputs.drive, inputs.sightings, inputs.options
-    cameras = {c: camera_of(drive, c) for c in sightings.cameras}
-    markings, excluded = naive_markings(sightings, inputs.tracks, cameras, ipm, options)
-    extrinsic = {c: extrinsic_from_ipm(cameras[c].info, matrix) for c, matrix in ipm.items()}
+    drive, sightings = inputs.drive, inputs.sightings
+    markings, excluded = _naive_markings(inputs, ipm)
+    extrinsic = {c: extrinsic_from_ipm(drive.cameras[c].info, matrix) for c, matrix in ipm.items()}
     lanes = _lanes(inputs, ground_by_ipm(drive, ipm, extrinsic))
     return MethodResult(
         name=name,
@@ -244,6 +234,64 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
         hd_map=HdMap(tuple(markings), lanes, drive.origin),
         excluded=tuple(excluded),
         diagnostics={"time_s": time.perf_counter() - begin_s},
+    )
+
+
+def _naive_markings(inputs: Inputs, ipm: Mapping[str, FloatArray]) -> tuple[list[Marking], list[Exclusion]]:
+    """The naive strategy: back-project by an IPM within its region of interest, and average.
+
+    It is the paper's baseline. Recorded poses are taken at their word; only sightings with four valid corners
+    inside the region count.
+    Tracks merge where their averages lie within ``naive_merge_m``: two cameras whose IPMs disagree by more
+    yield two markings where there is one, which is the method's own failure.
+    """
+    sightings, options = inputs.sightings, inputs.options.association
+    cameras = [inputs.drive.cameras[name] for name in sightings.cameras]
+    rois = [camera.roi_vehicle for camera in cameras]
+    forward = [facing_ipm(ipm[c.info.name], c.roi_vehicle.mean(axis=0)) for c in cameras]
+    homographies = np.stack(forward)[sightings.camera]
+    corners_vehicle = ground_points(homographies, sightings.corners_pinhole_px)
+    to_map = flat_motion(sightings.map_from_vehicle[sightings.frame]) @ homographies
+    corners_map = ground_points(to_map, sightings.corners_pinhole_px)
+    usable = (inputs.tracks.group >= 0) & sightings.valid.all(axis=1)
+    for c, roi in enumerate(rois):
+        own = sightings.camera == c
+        usable[own] &= inside_convex(roi, corners_vehicle[own]).all(axis=1)
+    tracks = keep_rows(inputs.tracks, usable)
+    association = merge_groups(
+        tracks,
+        sightings,
+        _average(tracks, corners_map),
+        floor_m=options.naive_merge_m,
+        gate_sigmas=np.inf,
+        max_distance_m=options.naive_merge_m,
+        shape_tolerance=2 * options.shape_tolerance,
+    )
+    average = _average(association, corners_map)
+    markings: list[Marking] = []
+    excluded: list[Exclusion] = []
+    each = zip(average.corners_map, is_convex(average.corners_map), average.seen[:, 0].tolist(), strict=True)
+    for kind, (corners, convex, count) in zip(group_kinds(association, sightings), each, strict=True):
+        name = sightings.kinds[kind]
+        if count >= LEAST_SIGHTINGS and convex:
+            markings.append(Marking(name, corners, count))
+        else:
+            reason = "not a convex quadrilateral" if count >= LEAST_SIGHTINGS else "too few sightings"
+            excluded.append(Exclusion(name, corners.mean(axis=0), count, reason))
+    return markings, excluded
+
+
+def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
+    """Plain mean of each group's corners; the strategy knows of no covariance."""
+    rows = np.flatnonzero(association.group >= 0)
+    corners = association.in_group_order(corners_map)[rows]
+    seen = np.bincount(association.group[rows], minlength=association.count)
+    total = np.zeros((association.count, 4, 2))
+    np.add.at(total, association.group[rows], corners)
+    return FusedGroups(
+        corners_map=total / np.maximum(seen, 1)[:, None, None],
+        covariance_m2=np.zeros((association.count, 4, 2, 2)),
+        seen=np.repeat(seen[:, None], 4, axis=1),
     )
 
 
@@ -261,6 +309,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
             len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
+    known = observability(bundle.problem, solution)
     lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig))
     symbols = map_symbols(inputs.sightings.symbols, bundle.rig, noise.roll_pitch_rad, optimised.markings)
     return MethodResult(
@@ -280,7 +329,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
             "chi2_per_dof": solution.chi2_per_dof,
             "time_s": time.perf_counter() - begin_s,
         },
-        certainty=_certainty(bundle),
+        certainty={name: known[index].sentence(name) for name, index in bundle.camera_index.items()},
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
@@ -314,18 +363,8 @@ def _brought_up_to_date(
     return replace(made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals)
 
 
-def _certainty(bundle: Bundle) -> dict[str, str]:
-    known = observability(bundle.problem, bundle.solution)
-    return {name: known[index].sentence(name) for name, index in bundle.camera_index.items()}
-
-
 def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:
-    options = inputs.options.lanes
-    cloud = collect_lane_points(
-        inputs.drive,
-        inputs.detections,
-        ground,
-        max_range_m=options.max_range_m,
-        jitter_rad=inputs.drive.pose_noise.roll_pitch_rad,
-    )
+    drive, options = inputs.drive, inputs.options.lanes
+    jitter_rad = drive.pose_noise.roll_pitch_rad
+    cloud = collect_lane_points(drive, inputs.detections, ground, options.max_range_m, jitter_rad)
     return map_lanes(cloud, options)

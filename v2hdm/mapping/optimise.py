@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from v2hdm.adjust import Status, estimate_noise, select_model
+from v2hdm.adjust import Status, estimate_noise, select_model, solve
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -27,7 +27,6 @@ from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
     Bundle,
-    Model,
     coarse_model,
     full_model,
     pose_sigma_of,
@@ -40,13 +39,13 @@ from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, lar
 
 _log = logging.getLogger(__name__)
 
-SETTLED_MODEL = "heave"
+_SETTLED_MODEL = "heave"
 """Pose model of the solves between which associations still change: it leaves no error of a pose out."""
 
-STEEP_SINE = 0.15
+_STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
 
-LOOSE_CLOCK_SIGMA_S = 0.3
+_LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 
@@ -62,33 +61,24 @@ class Optimiser:
         sightings: Sightings,
         views: Views,
         cameras: Mapping[str, Camera],
-        pose_noise: PoseNoise | Sequence[PoseNoise],
+        pose_noise: Sequence[PoseNoise],
         options: MappingOptions,
         executor: Executor = IN_PROCESS,
     ) -> None:
-        """``pose_noise`` is that of all visits, or of each; gates take the largest of each kind."""
-        self._executor = executor
-        self._sightings = sightings
-        self._views = views
+        """``pose_noise`` is that of each visit; gates take the largest of each kind."""
+        self._executor, self._sightings, self._views = executor, sightings, views
         self._cameras = {name: cameras[name] for name in sightings.cameras}
-        visits = int(sightings.visit.max(initial=0)) + 1
-        self._noise_of_visits = (
-            visits * (pose_noise,) if isinstance(pose_noise, PoseNoise) else tuple(pose_noise)
-        )
+        self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)
-        self._pose_sigma = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
+        self._pose_sigma = self._own_noise = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._options = options
-        self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
         self.growth: tuple[tuple[Marking, ...], ...] = ()
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
-
-    @property
-    def pose_model(self) -> str:
-        """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
-        return self._pose_model
 
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
@@ -118,9 +108,10 @@ class Optimiser:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
-            self._pose_model = self._choose_pose_model(bundle)
+            self.pose_model = self._choose_pose_model(bundle)
         progress("final solve")
-        usable, inlier = self._gate(bundle)
+        inlier, usable = bundle.inliers, np.zeros_like(self._sightings.valid)
+        usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         final = self._solve(bundle.association, usable, bundle.rig)
         return conclude(
             Evidence(self._sightings, self._views, self._cameras, final, bundle, inlier, usable),
@@ -131,11 +122,8 @@ class Optimiser:
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
-        model = replace(
-            self._full_model("clock"),
-            variance_factor=bundle.model.variance_factor,
-            clock_sigma_s=LOOSE_CLOCK_SIGMA_S,
-        )
+        model = full_model(self._pose_sigma, self._options, "clock", bundle.model.variance_factor)
+        model = replace(model, clock_sigma_s=_LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
@@ -220,38 +208,52 @@ class Optimiser:
     def _solve_steep(self, tracks: Association) -> Bundle:
         located = self._locate(self.initial_rig)
         sine = np.where(located.valid, located.sine_depression, np.nan)
-        threshold = min(STEEP_SINE, float(np.nanmedian(sine)))
+        threshold = min(_STEEP_SINE, float(np.nanmedian(sine)))
         with np.errstate(invalid="ignore"):
             steep = located.valid & (sine >= threshold)
         return self._solve(tracks, steep, self.initial_rig, coarse=True)
 
     def _solve(self, association: Association, usable: BoolArray, rig: Rig, coarse: bool = False) -> Bundle:
-        bundle = solve_bundle(
-            self._sightings,
-            association,
-            usable,
-            rig,
-            self._cameras,
-            coarse_model(rig, self._noise_of_visits, self._options)
+        noises, options = self._noise_of_visits, self._options
+        model = (
+            coarse_model(rig, noises, options)
             if coarse
-            else self._full_model(self._pose_model),
+            else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
+        bundle = solve_bundle(self._sightings, association, usable, rig, self._cameras, model)
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
-        """The solve under the sigmas of the poses that ``bundle`` shows, in place of those that were stated."""
+        """The solve under the attitude's and the height's noise that ``bundle`` shows, whatever was stated.
+
+        The positions' stays as stated: images do not see what moves the vehicle and its map alike.
+        """
         stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
-        self._pose_sigma = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
+        self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
+        self._pose_sigma = tuple(
+            replace(own, position_m=one.position_m, position_drift=one.position_drift)
+            for own, one in zip(self._own_noise, stated, strict=True)
+        )
         bundle = self._solve(bundle.association, self._usable(bundle.association, bundle.rig), bundle.rig)
         self._reweigh(bundle)
         return bundle
 
-    def _full_model(self, poses: str) -> Model:
-        model = full_model(self._noise_of_visits, self._options, poses, self._variance_factor)
-        return replace(model, pose_sigma=self._pose_sigma)
+    @property
+    def pose_noise(self) -> dict[str, float]:
+        """How many times as large as stated the drive shows the noise of the poses to be, by kind."""
+        own = [self._own_noise, [pose_sigma_of(one) for one in self._noise_of_visits]]
+        kinds = ("position_m", "heading_rad", "roll_pitch_rad")
+        totals = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in own] for kind in kinds}
+        return {kind: found / stated for kind, (found, stated) in totals.items() if stated > 0}
+
+    def under_own_noise(self, bundle: Bundle) -> Bundle:
+        """``bundle`` solved under all noise of the poses that the drive shows, for tests of its inputs."""
+        start = bundle.solution.cam_from_vehicle
+        problem = replace(bundle.problem, pose_sigma=self._own_noise, cam_from_vehicle=start)
+        return replace(bundle, problem=problem, solution=solve(problem, bundle.model.solver))
 
     def _reweigh(self, bundle: Bundle) -> None:
         """Scale the observations' variances as their residuals under ``bundle`` say."""
@@ -265,18 +267,11 @@ class Optimiser:
         try:
             selection = select_model(start, bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the pose model stays %r, since none could be chosen: %s", SETTLED_MODEL, failure)
-            return SETTLED_MODEL
+            _log.warning("the pose model stays %r, since none could be chosen: %s", _SETTLED_MODEL, failure)
+            return _SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
-
-    def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:
-        """Corners (S, 4) of accepted observations, and the verdict on each observation (K,)."""
-        inlier = bundle.inliers
-        usable = np.zeros_like(self._sightings.valid)
-        usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
-        return usable, inlier
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.adjust import Fault, ScoreTest, pose_innovations, score_faults
+from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faults
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Sightings, collect_sightings
@@ -24,23 +24,17 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
-from v2hdm.mapping.fit import (
-    along_route,
-    camera_fits,
-    contradictions,
-    overall_factor,
-    point_of,
-)
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, SurveyOptions
-from v2hdm.mapping.results import Contradiction, SolveEvidence
-from v2hdm.records import Drive, FloatArray, ImageDetections
+from v2hdm.mapping.results import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction, SolveEvidence
+from v2hdm.mapping.stated import name_of
+from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray
 
 _log = logging.getLogger(__name__)
 
-CONTRADICTED_SIGMAS = 5.0
-"""From so many sigmas an input is contradicted: clean drives stay below 3 (docs/verdict.md), and one in two
-million would exceed it by chance."""
+CONTRADICTED_SIGMAS = 4.0
+"""From so many sigmas an input is contradicted: in one of 400 right drives one of its forty tests exceeds
+it by chance."""
 
 
 @dataclass(frozen=True)
@@ -82,21 +76,27 @@ _SIZES: Mapping[Fault, _Size] = {
 OBSERVABLE_SIGMA = {fault: size.sigma for fault, size in _SIZES.items()}
 """Sigma, in the fault's unit, up to which a drive observes it."""
 
-LOOSE_CENTRE_SIGMA_M = 10.0
+_LOOSE_CENTRE_SIGMA_M = 10.0
 """Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
 
-AMBIGUOUS_SHARE = 0.8
+_AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
 CLOCK_OBSERVABLE_S = 0.004
 """Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
 
-CENTRE_OBSERVABLE_M = 0.1
+_CENTRE_OBSERVABLE_M = 0.1
 """Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
 
-MOST_CORRECTIONS = 4
+_MOST_CORRECTIONS = 4
 """Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
+
+
+_MEDIAN_SQUARED = 2 * float(np.log(2))
+"""Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
+
+_CELL_OBSERVATIONS = 40  # observations of a cell from which its median residual counts
 
 
 @dataclass(frozen=True)
@@ -156,27 +156,29 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             settled = optimiser.settle(inputs.tracks, progress)
         # 2. Test the inputs against what everything else says.
         progress("tests of the inputs")
-        found = _score_tests(settled, drive)
+        found = score_faults(settled.problem, settled.solution)
+        found = tuple(one for one in found if _is_stated(one, settled, drive))
         worst = next((one for one in found if is_contradicted(one)), None)
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
         left = None
-        if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
+        if worst is not None and len(corrected) < _MOST_CORRECTIONS and not _is_ambiguous(worst, found):
             left = _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
-        corrected.append(_in_words(settled, (worst,), inputs)[0])
-        _warn(inputs, corrected[-1])
+        corrected += _contradictions(settled, (worst,), inputs.sightings, visit_names(drive))
+        one, about = corrected[-1], f" {corrected[-1].about}" if corrected[-1].about else ""
+        _log.warning(
+            "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
+            ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas,
+            one.value, one.fault.unit,
+        )  # fmt: skip
         inputs = left
     # 4. Choose the pose model, solve without outliers and conclude.
     optimised = optimiser.finish(settled, progress)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
-    suspected = _in_words(settled, found, inputs)
+    suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, evidence), optimised
-
-
-def _in_words(settled: Bundle, found: Sequence[ScoreTest], inputs: Inputs) -> tuple[Contradiction, ...]:
-    return contradictions(settled, found, _frame_s(settled, inputs.sightings), visit_names(inputs.drive))
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
@@ -184,33 +186,16 @@ def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
     return sightings.stamp_s[np.unique(sightings.frame[settled.row])]
 
 
-def _warn(inputs: Inputs, one: Contradiction) -> None:
-    about = f" {one.about}" if one.about else ""
-    _log.warning(
-        "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
-        ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas, one.value,
-        one.fault.unit,
-    )  # fmt: skip
-
-
 def visit_names(drive: Drive) -> tuple[str, ...]:
     """The names of a joined drive's visits, none of a single one."""
     return tuple(visit.name for visit in drive.joined)
-
-
-def _score_tests(bundle: Bundle, drive: Drive) -> tuple[ScoreTest, ...]:
-    """The inputs that can be tested and were stated at all, the likeliest cause first."""
-    found = [one for one in score_faults(bundle.problem, bundle.solution) if _is_stated(one, bundle, drive)]
-    return tuple(sorted(found, key=lambda one: -log_odds(one)))
 
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
     if one.fault not in (Fault.SURVEY, Fault.LEVER):
         return True
-    names = list(bundle.camera_index)
-    own = names if one.camera < 0 else [names[one.camera]]
-    return all(drive.cameras[name].centre_prior is not None for name in own)
+    return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
 
 
 def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
@@ -242,7 +227,7 @@ def _evidence(
     final: Bundle,
     sightings: Sightings,
 ) -> SolveEvidence:
-    factors, window_s = along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
+    factors, window_s = _along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
     innovations = pose_innovations(settled.solution)
     largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
     return SolveEvidence(
@@ -250,11 +235,11 @@ def _evidence(
         corrected=tuple(corrected),
         pose_model=optimiser.pose_model,
         held_out=optimiser.held_out,
-        fits=camera_fits(settled),
-        variance_factor=overall_factor(settled),
+        fits=_camera_fits(settled),
+        variance_factor=_factor(settled, settled.solution.mahalanobis2),
         along_route=factors,
         window_s=window_s,
-        pose_innovations=innovations.rms(),
+        pose_noise=optimiser.pose_noise,
         worst_innovation=float(largest.max()),
         worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
         clock_s=_clocks(final),
@@ -272,7 +257,7 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
         and min(one.camera, worst.camera) >= 0
         and one.camera != worst.camera
     ]
-    return max(rivals, default=0.0) > AMBIGUOUS_SHARE * worst.sigmas
+    return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
 
 
 def is_contradicted(one: ScoreTest | Contradiction) -> bool:
@@ -287,20 +272,17 @@ def is_physical(one: ScoreTest | Contradiction) -> bool:
 
 
 def log_odds(one: ScoreTest | Contradiction) -> float:
-    """How likely a fault is the cause: the gain of its likelihood on stretches that the others predict, and
-    its size, of which a Cauchy distribution about the usual one is expected."""
+    """How likely a fault is the cause, by its gain and by its size, which is Cauchy about the usual one."""
     return one.gain - math.log1p((one.value / _SIZES[one.fault].usual) ** 2)
 
 
 def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
-    offset_s = bundle.solution.clock_offset_s
+    offset_s = bundle.solution.clock_offset_s.T.tolist()
     if not bundle.model.solver.clock_offset:
-        return tuple({} for _ in offset_s.T)
-    sigma = np.sqrt(bundle.solution.covariance.clock_s2())
-    return tuple(
-        {name: (float(offset_s[c, v]), float(sigma[c, v])) for name, c in bundle.camera_index.items()}
-        for v in range(offset_s.shape[1])
-    )
+        return tuple({} for _ in offset_s)
+    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()
+    index, visits = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
+    return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in visits)
 
 
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
@@ -310,21 +292,21 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
             return None
         return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
-        if worst.sigma > CENTRE_OBSERVABLE_M:
+        if worst.sigma > _CENTRE_OBSERVABLE_M:
             return None
-        names = tuple(settled.camera_index)
-        return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
+        return _without_axis(inputs, _cameras_of(settled, worst), worst.axis)
     options = inputs.options
     if worst.fault is Fault.SIZE:
         # One wrong size says that the paint is of another standard; the others' corners may only look like
         # outliers, which a robust loss hides from the tests.
-        sizes = replace(options.known_sizes, by_class_m={})
-        return replace(inputs, options=replace(options, known_sizes=sizes))
-    if worst.fault in (Fault.CONTROL, Fault.DATUM):
-        point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
-        survey = options.survey.only([]) if point is None else options.survey.without(point)
-        return replace(inputs, options=replace(options, survey=survey))
-    return None
+        options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
+    elif worst.fault is Fault.CONTROL:
+        options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
+    elif worst.fault is Fault.DATUM:
+        options = replace(options, survey=options.survey.only([]))
+    else:
+        return None
+    return replace(inputs, options=options)
 
 
 def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
@@ -351,9 +333,104 @@ def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | N
     cameras = dict(inputs.drive.cameras)
     for name in names:
         prior = cameras[name].centre_prior
-        if prior is None or prior.sigma_m[axis] >= LOOSE_CENTRE_SIGMA_M:
+        if prior is None or prior.sigma_m[axis] >= _LOOSE_CENTRE_SIGMA_M:
             return None
         sigma_m = prior.sigma_m.copy()
-        sigma_m[axis] = LOOSE_CENTRE_SIGMA_M
+        sigma_m[axis] = _LOOSE_CENTRE_SIGMA_M
         cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
     return replace(inputs, drive=replace(inputs.drive, cameras=cameras))
+
+
+def _contradictions(
+    bundle: Bundle, found: Sequence[ScoreTest], sightings: Sightings, visits: Sequence[str] = ()
+) -> tuple[Contradiction, ...]:
+    """``found`` in the bundle's problem, in the words of the user's inputs; several ``visits`` are named."""
+    frame_s = _frame_s(bundle, sightings)
+    return tuple(
+        Contradiction(
+            fault=one.fault,
+            cameras=_cameras_of(bundle, one),
+            axis=one.axis,
+            about=_about(bundle, one, frame_s, visits),
+            value=one.value,
+            sigma=one.sigma,
+            p_value=one.p_value,
+            gain=one.gain,
+            image_share=one.image_share,
+        )
+        for one in found
+    )
+
+
+def _cameras_of(bundle: Bundle, test: ScoreTest) -> tuple[str, ...]:
+    names = tuple(bundle.camera_index)
+    return names if test.camera < 0 else (names[test.camera],)
+
+
+def _point_of(bundle: Bundle, item: int) -> str:
+    """The name of the surveyed point that a test's ``item`` is."""
+    control = bundle.problem.control
+    assert control is not None
+    return name_of(bundle.model.survey, control.points_map[item])
+
+
+def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
+    """How well each camera's observations fit ``bundle``, a solve before anything was left out."""
+    seen, solution = bundle.problem.observations, bundle.solution
+    points, fits = bundle.inliers & ~seen.on_line, {}
+    for name, c in bundle.camera_index.items():
+        own = seen.camera == c
+        fits[name] = CameraFit(
+            observations=int(own.sum()),
+            variance_factor=_factor(bundle, solution.mahalanobis2[own]),
+            rejected_share=float(1 - bundle.inliers[own].mean()),
+            bias_px=_cell_bias(seen.pinhole_px[own & points], solution.residual_px[own & points]),
+        )
+    return fits
+
+
+def _along_route(bundle: Bundle, frame: IntArray, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance factors (W,) of windows along the route, and when they begin (W,), s.
+
+    ``frame`` (K,) is that of each observation, ``stamp_s`` (F,) the frames' times.
+    """
+    order = np.argsort(frame, kind="stable")
+    count = max(len(order) // WINDOW_OBSERVATIONS, 1)
+    windows = np.array_split(order, count)
+    factors = [_factor(bundle, bundle.solution.mahalanobis2[window]) for window in windows]
+    return np.array(factors), np.array([stamp_s[frame[window[0]]] for window in windows])
+
+
+def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:
+    return bundle.model.variance_factor * float(np.median(mahalanobis2)) / _MEDIAN_SQUARED
+
+
+def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
+    """Longest median residual of the cells that the places (K, 2) span."""
+    if not len(places_px):
+        return 0.0
+    rows, columns = CELLS
+    low, span = places_px.min(axis=0), np.maximum(np.ptp(places_px, axis=0), 1.0)
+    share = (places_px - low) / span * (1 - 1e-9)
+    cell = (share[:, 1] * rows).astype(np.int64) * columns + (share[:, 0] * columns).astype(np.int64)
+    biases = [
+        float(np.linalg.norm(np.median(residual_px[cell == number], axis=0)))
+        for number in np.flatnonzero(np.bincount(cell) >= _CELL_OBSERVATIONS)
+    ]
+    return max(biases, default=0.0)
+
+
+def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, visits: Sequence[str]) -> str:
+    if test.fault in CHANGES:
+        return f"from {frame_s[test.item]:.1f} s on"
+    if test.fault is Fault.CLOCK and test.item >= 0 and visits:
+        return f"in {visits[test.item]}"
+    lengths = bundle.problem.lengths
+    if test.fault is Fault.SIZE and lengths is not None:
+        length_m = float(np.unique(lengths.length_m)[test.item])
+        stated = bundle.model.sizes.by_class_m.items()
+        names = [name for name, size in stated if any(abs(one - length_m) < 1e-9 for one in size)]
+        return f"{', '.join(names)} {length_m:.2f} m"
+    if test.fault is Fault.CONTROL:
+        return _point_of(bundle, test.item)
+    return ""

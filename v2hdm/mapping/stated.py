@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma
 from v2hdm.io.maps.surveyed import match
-from v2hdm.mapping.options import ControlOptions, SizeOptions, SurveyOptions
+from v2hdm.mapping.options import SizeOptions, SurveyOptions
 from v2hdm.records import DIAMOND, FloatArray, IntArray
 
 _DIAGONALS = (((0, 2),), ((1, 3),))
@@ -23,15 +23,11 @@ def known_lengths(
     """The distances between corners that stated sizes imply, None if there are none.
 
     Of a diamond the size is that of its diagonals, of all others that of its sides. A marking that is not of
-    its class's size is another thing, or cut off; nothing is known of it.
-
-    Args:
-        sizes: as stated.
-        kind: (G,) class of every group.
-        corners_map: (G, 4, 2) rough positions, nan where unknown.
-        corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
+    its class's size is another thing, or cut off; nothing is known of it. ``kind`` (G,) is the class of every
+    group, ``corners_map`` (G, 4, 2) rough positions, nan where unknown, and ``corner_index`` (G, 4) the
+    corners' numbers in the adjustment, -1 for none.
     """
-    first, second, length_m = [], [], []
+    found: list[tuple[int, int, float]] = []
     for name, size in sizes.by_class_m.items():
         spans = _DIAGONALS if name == DIAMOND else _SIDES
         for group in np.flatnonzero(np.array(kind) == name):
@@ -44,14 +40,11 @@ def known_lengths(
                 continue
             for span, metres in zip(spans, wanted, strict=True):
                 ends = corner_index[group][np.array(span)]
-                for a, b in ends[(ends >= 0).all(axis=1)]:
-                    first.append(a)
-                    second.append(b)
-                    length_m.append(metres)
-    if not first:
+                found += [(a, b, metres) for a, b in ends[(ends >= 0).all(axis=1)].tolist()]
+    if not found:
         return None
-    sigma_m = np.full(len(first), sizes.sigma_m)
-    return KnownLengths(np.array(first), np.array(second), np.array(length_m), sigma_m)
+    first, second, length_m = (np.array(column) for column in zip(*found, strict=True))
+    return KnownLengths(first, second, length_m, np.full(len(found), sizes.sigma_m))
 
 
 def control_points(
@@ -59,13 +52,11 @@ def control_points(
 ) -> ControlPoints | None:
     """The corners that surveyed points belong to, None if there are none; points out of reach are left out.
 
-    Args:
-        survey: as stated.
-        corners_map: (G, 4, 2) rough positions, nan where unknown.
-        corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
-        poses: how far the recorded poses are off; neighbouring corners share their drift.
+    ``corners_map`` and ``corner_index`` are as of :func:`known_lengths`. ``poses`` is how far the recorded
+    poses are off; neighbouring corners share their drift.
     """
-    points, sigma_m = _arrays(survey.control)
+    points = np.array([one.position_map for one in survey.control], dtype=np.float64).reshape(-1, 2)
+    sigma_m = np.array([one.sigma_m for one in survey.control], dtype=np.float64).reshape(-1, 2)
     known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
     if not len(points) or not known.any():
         return None
@@ -96,9 +87,3 @@ def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list
     """The names of the control points that ``control`` makes no use of."""
     used = set() if control is None else {name_of(survey, point) for point in control.points_map}
     return [one.id for one in survey.control if one.id not in used]
-
-
-def _arrays(points: Sequence[ControlOptions]) -> tuple[FloatArray, FloatArray]:
-    """Positions and sigmas (N, 2) of control points, m."""
-    positions = np.array([one.position_map for one in points], dtype=np.float64).reshape(-1, 2)
-    return positions, np.array([one.sigma_m for one in points], dtype=np.float64).reshape(-1, 2)

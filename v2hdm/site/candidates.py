@@ -10,22 +10,21 @@ from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.quadrilateral import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-UNSEEN_M2 = 1e4
+_UNSEEN_M2 = 1e4
 """Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
 
 _CORRELATION = 0.2
 """Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
 small."""
 
-_KNOWN_SIGMA_M = 0.5
-"""Sigma, m, below which a corner counts as known: a fraction of any marking's length."""
+_KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
 
 
 @dataclass(frozen=True)
 class Candidates:
     """Corners ``corners_map`` (G, 4, 2), m, of G candidates and their joint covariances (G, 8, 8), m^2.
 
-    A corner that was not seen has the variance :data:`UNSEEN_M2` and lies anywhere near the others.
+    A corner that was not seen has the variance :data:`_UNSEEN_M2` and lies anywhere near the others.
     """
 
     corners_map: FloatArray
@@ -38,7 +37,7 @@ class Candidates:
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
         rows = np.repeat(unseen, 2, axis=1)
-        covariance = np.where(rows[:, :, None] | rows[:, None, :], UNSEEN_M2 * np.eye(8), covariance_m2)
+        covariance = np.where(rows[:, :, None] | rows[:, None, :], _UNSEEN_M2 * np.eye(8), covariance_m2)
         return cls(np.where(unseen[..., None], centre[:, None], corners_map), covariance)
 
     def __len__(self) -> int:
@@ -103,5 +102,5 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates
     shared = np.where(unseen, 0.0, _CORRELATION * single)
     # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
     no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
-    shared[no_point] = line_only(shared[no_point], UNSEEN_M2**0.5)
+    shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))

@@ -8,6 +8,7 @@ map has is shifted along with its surroundings.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -43,7 +44,8 @@ def fused(old: Marking, new: Marking, turn: int, pair: int, shift: Shift) -> Mar
         corners_map=(parts[0] + parts[1]).reshape(4, 2),
         sightings=old.sightings + new.sightings,
         covariance_m2=(covariance + covariance.T) / 2,
-        relative_sigma_m=_relative(own),
+        # The standard deviation of a coordinate of the centre by the marking's own errors.
+        relative_sigma_m=float(np.sqrt(np.einsum("iaja->", own.reshape(4, 2, 4, 2)) / 32)),
     )
 
 
@@ -53,12 +55,7 @@ def shifted_with(markings: Sequence[Marking], errors: Errors, of_old: bool, shif
     mean, spread = at(errors.centres_map, errors.shared_m2)
     covariance = errors.own_m2 + SHIFT @ spread @ SHIFT.T
     return [
-        replace(
-            one,
-            corners_map=one.corners_map - mean[k],
-            covariance_m2=covariance[k],
-            relative_sigma_m=one.relative_sigma_m,
-        )
+        replace(one, corners_map=one.corners_map - mean[k], covariance_m2=covariance[k])
         for k, one in enumerate(markings)
     ]
 
@@ -95,22 +92,16 @@ def _repainted(old: Marking, new: Marking, turn: int) -> Marking:
     )
 
 
-def _relative(own_m2: FloatArray) -> float:
-    """Standard deviation of a coordinate of the centre by the marking's own errors."""
-    return float(np.sqrt(np.einsum("iaja->", own_m2.reshape(4, 2, 4, 2)) / 32))
-
-
-DRIFT_OVER_M = 30.0
+_DRIFT_OVER_M = 30.0
 """Distance over which the error that a map's markings share fades, m, where the map does not say."""
 
-LIKELY = 0.5
+_LIKELY = 0.5
 """Probability from which a marking is reported as moved, gone or new paint: the likelier of the two."""
 
 _LEAST_PAIRED = 0.3
 """Share of the markings that a drive looked at which it finds again at least, if the site is the same."""
 
-_LOOKED = 3
-"""Easy views from which a drive has looked at a place for that share."""
+_LOOKED = 3  # easy views from which a drive has looked at a place for that share
 
 
 @dataclass(frozen=True)
@@ -153,7 +144,7 @@ def update_map(
         MappingError: the drive finds too little of the map again to be of its site.
     """
     old, new = base.hd_map.markings, made.markings
-    of_old = Errors.of(old, base.hd_map.drift_over_m or DRIFT_OVER_M)
+    of_old = Errors.of(old, base.hd_map.drift_over_m or _DRIFT_OVER_M)
     of_new = Errors.of(new, drift_over_m)
     rates = find_rates(observer, new)
     now, before = observer.looks(old, ~mapped), _looks_of(base, new, observer)
@@ -170,54 +161,29 @@ def update_map(
     )
     _check_site(decision, now, len(old))
     by_old, by_new = fused_markings(old, new, decision)
-    numbers = _Numbers(base.hd_map)
-    fresh = {k: replace(one, id=numbers.next()) for k, one in by_new.items()}
-    gone = {k for k, probability in decision.gone.items() if probability > LIKELY}
-    changes = [
-        *_moves(decision, old, by_old, now),
-        *_missing(decision, old, by_old, now),
-        *_additions(decision, fresh, before),
-    ]
-    lanes = updated_lanes(base.hd_map.lanes, made.lanes, decision.shift, numbers.next)
-    symbols = updated_symbols(base.hd_map.symbols, made.symbols, decision.shift, numbers.next)
+    # Ids that no feature of the map has or ever had.
+    known = [one.id or 0 for some in (old, base.hd_map.lanes, base.hd_map.symbols) for one in some]
+    number = itertools.count(1 + max([base.hd_map.largest_id, *known])).__next__
+    fresh = {k: replace(one, id=number()) for k, one in by_new.items()}
+    gone = {k for k, probability in decision.gone.items() if probability > _LIKELY}
     updated = replace(
         base.hd_map,
         markings=(*(one for k, one in by_old.items() if k not in gone), *fresh.values()),
-        lanes=lanes,
-        symbols=symbols,
+        lanes=updated_lanes(base.hd_map.lanes, made.lanes, decision.shift, number),
+        symbols=updated_symbols(base.hd_map.symbols, made.symbols, decision.shift, number),
         drift_over_m=max(of_old.over_m, of_new.over_m),
-        largest_id=numbers.largest,
+        largest_id=number() - 1,
     )
-    same = sum(pair.moved <= LIKELY for pair in decision.pairs)
-    shift_m = decision.shift.off_map.mean(axis=0) if len(decision.shift.old) else np.zeros(2)
-    names = _names(len(new), decision, by_old, fresh)
-    return updated, Changes(tuple(changes), same, shift_m), names
-
-
-def _names(
-    count: int, decision: Decision, by_old: Mapping[int, Marking], fresh: Mapping[int, Marking]
-) -> Names:
-    names = Names(np.zeros(count, dtype=np.int64), np.tile(np.arange(4), (count, 1)))
+    names = Names(np.zeros(len(new), dtype=np.int64), np.tile(np.arange(4), (len(new), 1)))
     for k, one in fresh.items():
         names.id[k] = one.id or 0
     for pair in decision.pairs:
         names.id[pair.new] = by_old[pair.old].id or 0
         names.corner[pair.new] = np.argsort(SHIFTS[pair.turn])
-    return names
-
-
-class _Numbers:
-    """Ids that no feature of a map has or ever had."""
-
-    def __init__(self, hd_map: HdMap) -> None:
-        ids = [one.id for one in hd_map.markings]
-        ids += [one.id for one in hd_map.lanes]
-        ids += [one.id for one in hd_map.symbols]
-        self.largest = max([hd_map.largest_id, *(number or 0 for number in ids)])
-
-    def next(self) -> int:
-        self.largest += 1
-        return self.largest
+    same = sum(pair.moved <= _LIKELY for pair in decision.pairs)
+    shift_m = decision.shift.off_map.mean(axis=0) if len(decision.shift.old) else np.zeros(2)
+    changes = _changes(decision, old, by_old, fresh, now, before)
+    return updated, Changes(tuple(changes), same, shift_m), names
 
 
 def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Looks:
@@ -232,23 +198,19 @@ def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Look
     corners = np.array([one.corners_map for one in places]).reshape(-1, 4, 2)
     seen = replace(observer, views=views, rig=rig).easy_views(corners)[0]
     found = np.zeros(len(places), dtype=np.int64)
-    for kind, place, sightings in base.left_out:
-        for k, one in enumerate(places):
-            inside = np.linalg.norm(one.corners_map.mean(axis=0) - place) < _size_m(one) / 2
-            if one.kind == kind and inside:
+    for k, one in enumerate(places):
+        diagonals_m = np.linalg.norm(one.corners_map[2:] - one.corners_map[:2], axis=1)
+        for kind, place, sightings in base.left_out:
+            off_m = np.linalg.norm(one.corners_map.mean(axis=0) - place)
+            if one.kind == kind and off_m < diagonals_m.max() / 2:
                 found[k] = max(found[k], sightings)
     return Looks(np.maximum(np.bincount(seen, minlength=len(places)), found), found)
-
-
-def _size_m(marking: Marking) -> float:
-    """Its longer diagonal, m."""
-    return float(np.linalg.norm(marking.corners_map[2:] - marking.corners_map[:2], axis=1).max())
 
 
 def _check_site(decision: Decision, now: Looks, count: int) -> None:
     """Refuse a map of which the drive finds nearly nothing where it looked."""
     paired = np.zeros(count, dtype=bool)
-    paired[[pair.old for pair in decision.pairs if pair.moved <= LIKELY]] = True
+    paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
     looked = (now.views >= _LOOKED) | paired
     if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
         raise MappingError(
@@ -257,12 +219,18 @@ def _check_site(decision: Decision, now: Looks, count: int) -> None:
         )
 
 
-def _moves(
-    decision: Decision, old: Sequence[Marking], by_old: Mapping[int, Marking], now: Looks
+def _changes(
+    decision: Decision,
+    old: Sequence[Marking],
+    by_old: Mapping[int, Marking],
+    fresh: Mapping[int, Marking],
+    now: Looks,
+    before: Looks,
 ) -> list[Change]:
+    """What has moved, what is missing and what is new, by the looks at the old places and at the new."""
     shift, out = decision.shift, []
     for pair in decision.pairs:
-        if pair.moved <= LIKELY:
+        if pair.moved <= _LIKELY:
             continue
         k, after = pair.old, by_old[pair.old]
         mean, spread = shift.of_old_at(shift.of_old.centres_map[[k]], shift.of_old.shared_m2[[k]])
@@ -271,38 +239,16 @@ def _moves(
         placed = old[k].corners_map - mean[0]
         moved = after.corners_map.mean(axis=0) - placed.mean(axis=0)
         numbers = pair.moved, int(now.views[k]), int(now.found[k]), after.sightings
-        change = _change(old[k], Fate.MOVED, placed, after.corners_map, numbers)
-        out.append(replace(change, shift_m=moved, shift_sigma_m=sigma))
-    return out
-
-
-def _missing(
-    decision: Decision, old: Sequence[Marking], by_old: Mapping[int, Marking], now: Looks
-) -> list[Change]:
-    out = []
+        course = placed, after.corners_map, moved, sigma, *numbers
+        out.append(Change(old[k].id or 0, old[k].kind, Fate.MOVED, *course))
     for k, gone in decision.gone.items():
-        fate, corners = Fate.VANISHED if gone > LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
+        fate, corners = Fate.VANISHED if gone > _LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
         numbers = max(gone, 1 - gone), int(now.views[k]), int(now.found[k]), old[k].sightings
-        out.append(_change(old[k], fate, corners, None if gone > LIKELY else corners, numbers))
-    return out
-
-
-def _additions(decision: Decision, fresh: Mapping[int, Marking], before: Looks) -> list[Change]:
-    out = []
+        left = None if gone > _LIKELY else corners
+        out.append(Change(old[k].id or 0, old[k].kind, fate, corners, left, None, None, *numbers))
     for k, one in fresh.items():
         new = decision.fresh[k]
-        fate = Fate.NEW if new > LIKELY else Fate.FIRST_SEEN
+        fate = Fate.NEW if new > _LIKELY else Fate.FIRST_SEEN
         numbers = max(new, 1 - new), int(before.views[k]), int(before.found[k]), one.sightings
-        out.append(_change(one, fate, None, one.corners_map, numbers))
+        out.append(Change(one.id or 0, one.kind, fate, None, one.corners_map, None, None, *numbers))
     return out
-
-
-def _change(
-    marking: Marking,
-    fate: Fate,
-    before: FloatArray | None,
-    after: FloatArray | None,
-    numbers: tuple[float, int, int, int],
-) -> Change:
-    """A change without a shift; ``numbers`` are probability, views, found and sightings."""
-    return Change(marking.id or 0, marking.kind, fate, before, after, None, None, *numbers)

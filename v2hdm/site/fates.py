@@ -23,32 +23,23 @@ from v2hdm.geometry.quadrilateral import SHIFTS, align
 from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
 
-MOVED_SIGMA_M = 0.5
+_MOVED_SIGMA_M = 0.5
 """Sigma of how far a marking is painted from where it was, m a coordinate: a new line of the same bay."""
 
-TURNED_SIGMA_RAD = 0.2
-"""Sigma of how far it is turned then, rad."""
-
-_REACH_M = 4 * MOVED_SIGMA_M
-"""Markings farther apart are never one, m."""
-
+_TURNED_SIGMA_RAD = 0.2  # sigma of how far it is turned then, rad
+_REACH_M = 4 * _MOVED_SIGMA_M  # markings farther apart are never one, m
 _OTHER_SHAPE_M = 0.1
 """Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
 
 _MISREAD_M = 0.3
 """Sigma of an end or corner that one of two drives has taken from another edge, m, as in the site model."""
 
-_MISREAD_SHARE = 0.05
-"""Share of markings of which one of two drives has misread an end or a corner."""
-
+_MISREAD_SHARE = 0.05  # share of markings of which one of two drives has misread an end or a corner
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
 """Dirichlet prior: of fifty markings about so many stay, are painted elsewhere, are gone."""
 
-_PRIOR_NEW = (1.0, 50.0)
-"""Gamma prior: one new marking where there were fifty."""
-
-_PASSES = 4
-"""Rounds of shift, odds and assignment; the assignment settles within three."""
+_PRIOR_NEW = (1.0, 50.0)  # Gamma prior: one new marking where there were fifty
+_PASSES = 4  # rounds of shift, odds and assignment; the assignment settles within three
 
 STAYED, MOVED = range(2)
 
@@ -163,17 +154,13 @@ def decide(
         alone_new = np.setdiff1d(np.arange(len(new)), candidates.new[chosen])
         counts = [(1 - moved[chosen]).sum(), moved[chosen].sum(), gone[alone_old].sum()]
         rates = _rates(
-            _PRIOR_COUNT + counts,
-            (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen)),
+            _PRIOR_COUNT + counts, (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen))
         )
-    numbers = zip(candidates.old[chosen], candidates.new[chosen], candidates.turn[chosen], strict=True)
+    columns = candidates.old, candidates.new, candidates.turn, moved
     return Decision(
-        pairs=tuple(
-            Pair(int(a), int(b), int(turn), float(probability))
-            for (a, b, turn), probability in zip(numbers, moved[chosen], strict=True)
-        ),
-        gone={int(k): float(gone[k]) for k in alone_old},
-        fresh={int(k): float(fresh[k]) for k in alone_new},
+        pairs=tuple(Pair(*row) for row in zip(*(one[chosen].tolist() for one in columns), strict=True)),
+        gone={k: float(gone[k]) for k in alone_old.tolist()},
+        fresh={k: float(fresh[k]) for k in alone_new.tolist()},
         shift=shift,
     )
 
@@ -242,7 +229,7 @@ def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates:
         noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
         # In the basis a shift counts twice its length, a turn by its arm.
         free = np.zeros(8)
-        free[:2], free[2] = (2 * MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * TURNED_SIGMA_RAD) ** 2
+        free[:2], free[2] = (2 * _MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * _TURNED_SIGMA_RAD) ** 2
         out[p, STAYED] = rates.stayed + _read(off, noise)
         out[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
     return out
@@ -258,18 +245,15 @@ def _read(off: FloatArray, noise: FloatArray) -> float:
 def _normal(off: FloatArray, covariance: FloatArray) -> float:
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, off)
-    count = len(off)
-    return float(-0.5 * (whitened @ whitened + count * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
+    return float(-0.5 * (whitened @ whitened + len(off) * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
 
 
 def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
     """Log density (P,) of each pair's new marking, in its basis, if it is another one anywhere."""
     off = (candidates.basis @ candidates.off[..., None])[..., 0]
     noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
-    shape = [
-        _normal(one[3:], own[3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5))
-        for one, own in zip(off, noise, strict=True)
-    ]
+    noise = noise[:, 3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5)
+    shape = [_normal(*one) for one in zip(off[:, 3:], noise, strict=True)]
     return np.asarray(density - np.log(4) - np.log(np.pi * candidates.arm_m) + np.array(shape))
 
 
@@ -283,13 +267,13 @@ def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
     size = count + int(news.max()) + 1
     graph = coo_array((np.ones(len(better)), (olds, count + news)), shape=(size, size))
     _, group = connected_components(graph, directed=False)
-    chosen: list[int] = []
+    chosen = []
     for one in np.unique(group[olds]):
         own = better[group[olds] == one]
         a, rows = np.unique(candidates.old[own], return_inverse=True)
         b, columns = np.unique(candidates.new[own], return_inverse=True)
-        gain = np.zeros((len(a), len(b)))
+        gain, taken = np.zeros((len(a), len(b))), np.zeros((len(a), len(b)), dtype=bool)
         gain[rows, columns] = score[own]
-        taken = {(int(r), int(c)) for r, c in zip(*linear_sum_assignment(-gain), strict=True)}
-        chosen += [int(p) for p, r, c in zip(own, rows, columns, strict=True) if (int(r), int(c)) in taken]
-    return np.array(sorted(chosen), dtype=np.int64)
+        taken[linear_sum_assignment(-gain)] = True
+        chosen.append(own[taken[rows, columns]])
+    return np.sort(np.concatenate(chosen))

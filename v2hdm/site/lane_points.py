@@ -15,12 +15,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of
-from v2hdm.geometry.ipm import (
-    direction_covariance,
-    facing_ipm,
-    flat_motion,
-    ground_from_pinhole_px,
-)
+from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
@@ -41,9 +36,7 @@ _CENTRE_SIGMA_PX = 1.0
 _OWN_SIGMA_M = 0.01
 """Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
 
-_TANGENT_REACH = 2
-"""Points to either side whose difference gives a point's direction."""
-
+_TANGENT_REACH = 2  # points to either side whose difference gives a point's direction
 _GUIDE_RANGE = 1.8
 """Whole lines are followed so many times farther than paint is mapped: they only say what is one line."""
 
@@ -87,35 +80,42 @@ class ImageGround:
     map_from_pinhole_px: FloatArray
     centre_map: FloatArray
 
+    @classmethod
+    def of_images(
+        cls, count: int, rows: IntArray, homographies: FloatArray, extrinsic: FloatArray, poses: FloatArray
+    ) -> ImageGround:
+        """Of ``count`` images those at ``rows``."""
+        out = cls(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
+        centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
+        out.map_from_pinhole_px[rows], out.centre_map[rows] = homographies, centre
+        return out
+
 
 def ground_by_ipm(
     drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray]
 ) -> ImageGround:
     """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are."""
-    rows, names, poses = _rows(drive, list(ipm))
-    forward = {
-        name: facing_ipm(matrix, drive.cameras[name].roi_vehicle.mean(axis=0)) for name, matrix in ipm.items()
-    }
-    homographies = flat_motion(poses) @ np.stack([forward[name] for name in names])
-    extrinsic = np.stack([cam_from_vehicle[name] for name in names])
-    return _image_ground(len(drive.images), rows, homographies, extrinsic, poses)
+    rows, camera = _rows(drive, list(ipm))
+    poses = np.stack([drive.images[i].map_from_vehicle for i in rows])
+    forward = [facing_ipm(ipm[name], drive.cameras[name].roi_vehicle.mean(axis=0)) for name in ipm]
+    extrinsic = np.stack([cam_from_vehicle[name] for name in ipm])[camera]
+    homographies = flat_motion(poses) @ np.stack(forward)[camera]
+    return ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
 
 
 def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround:
     """By optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
-    rows, names, _ = _rows(drive, cameras)
-    camera = np.array([list(cameras).index(name) for name in names])
+    rows, camera = _rows(drive, cameras)
     poses = rig.map_from_vehicle[frames_of(drive).frame_of_image[rows]]
     extrinsic = rig.cam_from_vehicle[camera]
     homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
-    return _image_ground(len(drive.images), rows, homographies, extrinsic, poses)
+    return ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
 
 
 def collect_lane_points(
     drive: Drive,
     detections: Sequence[ImageDetections],
     ground: ImageGround,
-    *,
     max_range_m: float,
     jitter_rad: float,
 ) -> LaneCloud:
@@ -189,21 +189,11 @@ def _guides(
     return Guides(points_map[near], line[near], np.array([i for i, _ in lanes], dtype=np.int64))
 
 
-def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, list[str], FloatArray]:
-    """Images of ``cameras``: their indices, camera names and recorded poses."""
-    rows = [i for i, image in enumerate(drive.images) if image.camera in cameras]
-    names = [drive.images[i].camera for i in rows]
-    return np.array(rows), names, np.stack([drive.images[i].map_from_vehicle for i in rows])
-
-
-def _image_ground(
-    count: int, rows: IntArray, homographies: FloatArray, extrinsic: FloatArray, poses: FloatArray
-) -> ImageGround:
-    centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
-    all_homographies = np.full((count, 3, 3), np.nan)
-    all_centres = np.full((count, 3), np.nan)
-    all_homographies[rows], all_centres[rows] = homographies, centre
-    return ImageGround(all_homographies, all_centres)
+def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, IntArray]:
+    """The images of ``cameras``, and the index of the camera of each."""
+    index = {name: c for c, name in enumerate(cameras)}
+    rows = [(i, index[image.camera]) for i, image in enumerate(drive.images) if image.camera in index]
+    return np.array(rows)[:, 0], np.array(rows)[:, 1]
 
 
 def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
@@ -219,20 +209,11 @@ def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
         return np.asarray(difference / np.linalg.norm(difference, axis=1, keepdims=True))
 
 
-_SEED_CELL_M = 0.25
-"""Side of the cells that each give a seed, m."""
-
-_DIRECTION_BINS = 8
-"""Number of directions distinguished within a cell, over half a circle."""
-
-_SAME_DIRECTION = np.cos(np.deg2rad(20.0))
-"""Cosine from which points are of one line: a crossing one is not."""
-
-_ITERATIONS = 4
-"""Mean shifts of each seed."""
-
-_THIN_SPACINGS = 0.7
-"""Spacings of nodes within which the best supported one suppresses others of its line."""
+_SEED_CELL_M = 0.25  # side of the cells that each give a seed, m
+_DIRECTION_BINS = 8  # number of directions distinguished within a cell, over half a circle
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
+_ITERATIONS = 4  # mean shifts of each seed
+_THIN_SPACINGS = 0.7  # spacings of nodes within which the best supported one suppresses others of its line
 
 
 @dataclass(frozen=True)
@@ -251,32 +232,22 @@ class Nodes:
 
 def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
     """Nodes on the ridges of ``cloud``, about ``options.node_spacing_m`` apart."""
-    seeds = _seeds(cloud)
-    points, tangent = cloud.points_map[seeds].copy(), cloud.tangent[seeds].copy()
-    pairs = _neighbours(points, cloud, options)
+    # A seed for each cell of position and direction.
+    angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
+    place = np.floor(cloud.points_map / _SEED_CELL_M)
+    cell = np.column_stack([place, np.floor(angle / np.pi * _DIRECTION_BINS)]).astype(np.int64)
+    seeds = np.unique(cell, axis=0, return_index=True)[1]
+    points, tangent = cloud.points_map[seeds], cloud.tangent[seeds]
+    # Pairs of seed and point of the cloud that may ever lie in its neighbourhood.
+    reach_m = float(np.hypot(options.half_length_m, 2 * options.half_width_m))
+    near = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
+    pairs = near["i"].astype(np.int64), near["j"].astype(np.int64)
     for _ in range(_ITERATIONS):
         points, tangent = _shift(points, tangent, cloud, pairs, options)
     images, dash = _support(points, tangent, cloud, pairs, options)
     supported = np.flatnonzero(images >= options.min_images)
     kept = supported[_thin(points[supported], tangent[supported], images[supported], options)]
     return Nodes(points[kept], tangent[kept], images[kept], dash[kept])
-
-
-def _seeds(cloud: LaneCloud) -> IntArray:
-    """One point of the cloud per cell of position and direction."""
-    angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
-    cell = np.column_stack(
-        [np.floor(cloud.points_map / _SEED_CELL_M), np.floor(angle / np.pi * _DIRECTION_BINS)]
-    )
-    _, first = np.unique(cell.astype(np.int64), axis=0, return_index=True)
-    return np.asarray(first)
-
-
-def _neighbours(points: FloatArray, cloud: LaneCloud, options: LaneOptions) -> tuple[IntArray, IntArray]:
-    """Pairs (seed, point of the cloud) that may ever lie in a seed's neighbourhood."""
-    reach_m = float(np.hypot(options.half_length_m, 2 * options.half_width_m))
-    near = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
-    return near["i"].astype(np.int64), near["j"].astype(np.int64)
 
 
 def _coordinates(
@@ -334,8 +305,8 @@ def _support(
     near = (np.abs(along) <= options.node_spacing_m) & (np.abs(across) <= 0.5 * options.half_width_m)
     near &= cosine >= _SAME_DIRECTION
     seed, point = pairs[0][near], pairs[1][near]
-    key = np.unique(seed * (int(cloud.image.max(initial=0)) + 1) + cloud.image[point])
-    images = np.bincount(key // (int(cloud.image.max(initial=0)) + 1), minlength=len(points))
+    shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
+    images = np.bincount(shown, minlength=len(points))
     total = np.maximum(np.bincount(seed, minlength=len(points)), 1)
     dash = np.bincount(seed, weights=cloud.dash[point].astype(float), minlength=len(points)) / total
     return images.astype(np.int64), dash

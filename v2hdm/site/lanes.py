@@ -15,24 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.records import LANE_DASH, LANE_LINE, BoolArray, FloatArray, IntArray, Lane
+from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
 
-_SAME_DIRECTION = np.cos(np.deg2rad(25.0))
-"""Cosine from which two nodes are of one line."""
-
-_MAX_LINK_SPACINGS = 2.5
-"""Longest link of two nodes, in spacings of nodes."""
-
+_SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # cosine from which two nodes are of one line
+_MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings of nodes
 _MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
 """Largest angle of a gap's chord and an end's tangent, and difference of the angles at both ends, rad."""
 
-_END_SIGMA_M = 0.05
-"""Lateral error of an end, m, which short gaps must allow for in angles."""
-
-_END_LENGTH_M = 2.0
-"""Length, m, over which an end's direction is taken."""
+_END_SIGMA_M = 0.05  # lateral error of an end, m, which short gaps must allow for in angles
+_END_LENGTH_M = 2.0  # length, m, over which an end's direction is taken
 
 
 @dataclass(frozen=True)
@@ -57,10 +50,9 @@ def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
     """String nodes into paths that never fork: linked are mutually nearest ones ahead and behind."""
     if not len(nodes.points_map):
         return []
-    links = _mutual_links(nodes, _MAX_LINK_SPACINGS * options.node_spacing_m)
     return [
         Path(nodes.points_map[path], float(nodes.dash[path].mean()), float(np.median(nodes.images[path])))
-        for path in _walk(links)
+        for path in _walk(_mutual_links(nodes, _MAX_LINK_SPACINGS * options.node_spacing_m))
         if len(path) >= 2
     ]
 
@@ -70,18 +62,20 @@ def join_paths(paths: list[Path], options: LaneOptions) -> list[Path]:
 
     Gaps up to ``max_dash_gap_m`` are bridged between dashed pieces, up to ``max_break_m`` otherwise.
     """
-    joints = _joints(paths, options)
-    chain = _Chains(len(paths))
-    for a, end_a, b, end_b in joints:
-        chain.join(a, end_a, b, end_b)
-    return [_concatenate([paths[p].turned(flip) for p, flip in run], options) for run in chain.runs()]
+    joined = []
+    for run in _runs(len(paths), _joints(paths, options)):
+        own = [paths[path].turned(backwards) for path, backwards in run]
+        pieces = [own[0].points_map]
+        for before, after in itertools.pairwise(own):
+            pieces += [_bridge(before.points_map, after.points_map, options.node_spacing_m), after.points_map]
+        joined.append(_merged(np.concatenate(pieces), own))
+    return joined
 
 
 def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
     """For each node (N, 2) the node linked ahead and behind it, -1 where there is none."""
     pairs = cKDTree(nodes.points_map).query_pairs(reach_m, output_type="ndarray")
-    source = np.concatenate([pairs[:, 0], pairs[:, 1]])
-    target = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    source, target = np.concatenate([pairs, pairs[:, ::-1]]).T
     offset = nodes.points_map[target] - nodes.points_map[source]
     distance = np.linalg.norm(offset, axis=1)
     tangent = nodes.tangent[source]
@@ -96,13 +90,8 @@ def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
     # Written from the costliest to the cheapest, so that the cheapest stays.
     order = np.argsort(-cost, kind="stable")
     best[source[order], (along[order] < 0).astype(int)] = target[order]
-    chosen = best.copy()
-    for side in (0, 1):
-        node = np.flatnonzero(best[:, side] >= 0)
-        other = best[node, side]
-        one_sided = node[~(best[other] == node[:, None]).any(axis=1)]
-        chosen[one_sided, side] = -1
-    return chosen
+    own = np.arange(len(best))[:, None, None]
+    return np.where((best[best] == own).any(axis=2) & (best >= 0), best, -1)
 
 
 def _walk(links: IntArray) -> list[IntArray]:
@@ -140,19 +129,13 @@ def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int
     limit_m = np.where(dashed[a] & dashed[b], options.max_dash_gap_m, options.max_break_m)
     leaving = _signed_angle(outward[a], gap)
     arriving = _signed_angle(gap, -outward[b])
-    fits = (gap_m <= limit_m) & (a // 2 != b // 2) & _on_one_arc(leaving, arriving, gap_m)
+    # The chord of an arc meets both tangents at one angle.
+    slack = np.arctan2(_END_SIGMA_M, np.maximum(gap_m, 1e-6))
+    fits = (gap_m <= limit_m) & (a // 2 != b // 2)
+    fits &= np.maximum(np.abs(leaving), np.abs(arriving)) <= _MAX_BEND_RAD + slack
+    fits &= np.abs(leaving - arriving) <= _MAX_ARC_MISMATCH_RAD + 2 * slack
     order = np.flatnonzero(fits)[np.argsort(gap_m[fits], kind="stable")]
     return [(int(a[p]) // 2, int(a[p]) % 2, int(b[p]) // 2, int(b[p]) % 2) for p in order]
-
-
-def _on_one_arc(leaving_rad: FloatArray, arriving_rad: FloatArray, gap_m: FloatArray) -> BoolArray:
-    """Whether a gap's chord meets both tangents at one angle, lateral errors of 5 cm allowed for."""
-    slack = np.arctan2(_END_SIGMA_M, np.maximum(gap_m, 1e-6))
-    return np.asarray(
-        (np.abs(leaving_rad) <= _MAX_BEND_RAD + slack)
-        & (np.abs(arriving_rad) <= _MAX_BEND_RAD + slack)
-        & (np.abs(leaving_rad - arriving_rad) <= _MAX_ARC_MISMATCH_RAD + 2 * slack)
-    )
 
 
 def _outward(points: FloatArray) -> FloatArray:
@@ -160,8 +143,11 @@ def _outward(points: FloatArray) -> FloatArray:
     distance = np.linalg.norm(points - points[-1], axis=1)
     inner = np.flatnonzero(distance <= _END_LENGTH_M)
     start = int(inner[0]) if len(inner) > 1 else max(len(points) - 2, 0)
-    direction = points[-1] - points[start:-1].mean(axis=0)
-    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+    return _unit(points[-1] - points[start:-1].mean(axis=0))
+
+
+def _unit(way: FloatArray) -> FloatArray:
+    return np.asarray(way / max(float(np.linalg.norm(way)), 1e-9))
 
 
 def _signed_angle(source: FloatArray, target: FloatArray) -> FloatArray:
@@ -170,50 +156,27 @@ def _signed_angle(source: FloatArray, target: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(cross, np.sum(source * target, axis=1)))
 
 
-class _Chains:
-    """Paths being joined end to end, each end at most once and never into a ring."""
-
-    def __init__(self, count: int) -> None:
-        self._next: dict[tuple[int, int], tuple[int, int]] = {}
-        self._root = list(range(count))
-
-    def join(self, a: int, end_a: int, b: int, end_b: int) -> None:
-        """Join two ends unless one is taken or the paths are connected already."""
-        if (a, end_a) in self._next or (b, end_b) in self._next or self._find(a) == self._find(b):
-            return
-        self._next[a, end_a], self._next[b, end_b] = (b, end_b), (a, end_a)
-        self._root[self._find(a)] = self._find(b)
-
-    def runs(self) -> list[list[tuple[int, bool]]]:
-        """Runs of (path, whether it is walked backwards), each path in exactly one run."""
-        seen: set[int] = set()
-        runs = []
-        for start in range(len(self._root)):
-            if start in seen or ((start, 0) in self._next and (start, 1) in self._next):
-                continue
-            run, path, enter = [], start, 1 if (start, 0) in self._next else 0
-            while True:
-                seen.add(path)
-                run.append((path, enter == 1))
-                following = self._next.get((path, 1 - enter))
-                if following is None:
-                    break
-                path, enter = following
-            runs.append(run)
-        return runs
-
-    def _find(self, path: int) -> int:
-        while self._root[path] != path:
-            path = self._root[path]
-        return path
+def _runs(count: int, joints: list[tuple[int, int, int, int]]) -> list[list[tuple[int, bool]]]:
+    """Runs of (path, whether it is walked backwards): each end is joined once at most, never into a ring."""
+    run_of = [[(path, False)] for path in range(count)]
+    for a, end_a, b, end_b in joints:
+        before = _ending_with((a, end_a == _FIRST), run_of[a])
+        after = _ending_with((b, end_b == _FIRST), run_of[b])
+        if run_of[a] is not run_of[b] and before and after:
+            joined = before + _backwards(after)
+            for path, _ in joined:
+                run_of[path] = joined
+    runs = {id(run): run if run[0][0] <= run[-1][0] else _backwards(run) for run in run_of}
+    return sorted(runs.values())
 
 
-def _concatenate(paths: list[Path], options: LaneOptions) -> Path:
-    """One path of several in order, the gaps bridged by cubic curves with vertices as elsewhere."""
-    pieces = [paths[0].points_map]
-    for before, after in itertools.pairwise(paths):
-        pieces += [_bridge(before.points_map, after.points_map, options.node_spacing_m), after.points_map]
-    return _merged(np.concatenate(pieces), paths)
+def _ending_with(last: tuple[int, bool], run: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
+    """The run walked so that it ends with ``last``; empty where another path follows that."""
+    return next((way for way in (run, _backwards(run)) if way[-1] == last), [])
+
+
+def _backwards(run: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
+    return [(path, not backwards) for path, backwards in reversed(run)]
 
 
 def _merged(points_map: FloatArray, paths: Sequence[Path]) -> Path:
@@ -237,18 +200,11 @@ def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArr
     )
 
 
-_MAX_BRIDGE_M = 25.0
-"""Longest gap that images' whole lines bridge, m."""
-
-_PASSES_M = 0.4
-"""A line that comes so near the end of a piece passes it."""
-
-_LEAST_COSINE = np.cos(np.deg2rad(30.0))
-"""Cosine of a gap's way and the directions of its ends at least."""
-
+_MAX_BRIDGE_M = 25.0  # longest gap that images' whole lines bridge, m
+_PASSES_M = 0.4  # a line that comes so near the end of a piece passes it
+_LEAST_COSINE = np.cos(np.deg2rad(30.0))  # cosine of a gap's way and the directions of its ends at least
 _FIRST, _LAST = 0, 1
-_DIRECTION_LENGTH_M = 5.0
-"""A bridge leaves a piece in about the direction of so much of its end."""
+_DIRECTION_LENGTH_M = 5.0  # a bridge leaves a piece in about the direction of so much of its end
 
 
 def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> list[Path]:
@@ -256,27 +212,18 @@ def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> lis
     if not len(guides.points_map):
         return paths
     tree = cKDTree(guides.points_map)
-    ended = [(path, _ends(path)) for path in paths]
-    while (joined := _shortest_bridge(ended, guides, tree, options)) is not None:
-        a, b, path = joined
-        ended = [of for k, of in enumerate(ended) if k not in (a, b)] + [(path, _ends(path))]
-    return [path for path, _ in ended]
-
-
-def _shortest_bridge(
-    ended: list[tuple[Path, FloatArray]], guides: Guides, tree: cKDTree, options: LaneOptions
-) -> tuple[int, int, Path] | None:
-    """Two of the paths, each with its ends, and what they are together: the shortest gap to be bridged."""
-    if len(ended) < 2:
-        return None
-    for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])).tolist():
-        before = ended[a][0].turned(end_a == _FIRST)
-        after = ended[b][0].turned(end_b == _LAST)
-        between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, options)
-        if between is not None:
-            joined = np.concatenate([before.points_map, between, after.points_map])
-            return a, b, _merged(joined, [before, after])
-    return None
+    bridged = True
+    while bridged and len(paths) > 1:
+        bridged = False
+        for a, end_a, b, end_b in _gaps(np.stack([_ends(path) for path in paths])).tolist():
+            before, after = paths[a].turned(end_a == _FIRST), paths[b].turned(end_b == _LAST)
+            between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, options)
+            if between is not None:
+                points = np.concatenate([before.points_map, between, after.points_map])
+                rest = [path for k, path in enumerate(paths) if k not in (a, b)]
+                paths, bridged = [*rest, _merged(points, [before, after])], True
+                break
+    return paths
 
 
 def _gaps(ends: FloatArray) -> NDArray[np.int64]:
@@ -303,10 +250,8 @@ def _ends(path: Path) -> FloatArray:
 def _end_direction(points: FloatArray) -> FloatArray:
     """Direction (2,) in which a polyline ends, over its last metres."""
     away = np.linalg.norm(points - points[-1], axis=1)
-    direction = (
-        points[-1] - points[int(np.argmin(np.abs(away - min(_DIRECTION_LENGTH_M, float(away.max())))))]
-    )
-    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+    at = int(np.argmin(np.abs(away - min(_DIRECTION_LENGTH_M, float(away.max())))))
+    return _unit(points[-1] - points[at])
 
 
 def _course_between(
@@ -347,31 +292,23 @@ def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
     if len(cloud.points_map) < 2:
         return ()
     paths = join_paths(string_nodes(find_nodes(cloud, options), options), options)
-    paths = bridge_paths(paths, cloud.guides, options)
-    return tuple(_lane(path, options) for path in paths if _is_seen_enough(path, options))
-
-
-def _is_seen_enough(path: Path, options: LaneOptions) -> bool:
-    """Whether a path is long enough, and a short one seen often enough."""
-    image_metres = path.length_m * path.images
-    return path.length_m >= options.min_length_m and image_metres >= _LEAST_LENGTH_M * options.min_images
-
-
-def _lane(path: Path, options: LaneOptions) -> Lane:
-    kind = LANE_DASH if path.dash > 0.5 else LANE_LINE
-    points = _resample(_smooth(path.points_map), options.node_spacing_m)
-    return Lane(kind, points, round(path.images))
-
-
-def _smooth(points: FloatArray) -> FloatArray:
-    """Binomial smoothing of the inner vertices: takes out the nodes' own lateral noise."""
-    out = points.copy()
-    out[1:-1] = 0.25 * points[:-2] + 0.5 * points[1:-1] + 0.25 * points[2:]
-    return out
+    return tuple(
+        Lane(
+            LANE_DASH if path.dash > 0.5 else LANE_LINE,
+            _resample(path.points_map, options.node_spacing_m),
+            round(path.images),
+        )
+        for path in bridge_paths(paths, cloud.guides, options)
+        if path.length_m >= options.min_length_m
+        and path.length_m * path.images >= _LEAST_LENGTH_M * options.min_images
+    )
 
 
 def _resample(points: FloatArray, spacing_m: float) -> FloatArray:
-    """Vertices at equal steps of about ``spacing_m`` along a polyline, both ends kept."""
+    """Vertices at equal steps of about ``spacing_m`` along a smoothed polyline, both ends kept."""
+    # Binomial smoothing takes out the nodes' own lateral noise.
+    inner = 0.25 * points[:-2] + 0.5 * points[1:-1] + 0.25 * points[2:]
+    points = np.concatenate([points[:1], inner, points[-1:]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], max(round(float(along[-1]) / spacing_m), 1) + 1)
     return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])

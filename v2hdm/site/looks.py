@@ -32,35 +32,20 @@ Grey = Callable[[int], NDArray[np.float32]]
 _INSIDE = np.linspace(0.2, 0.8, 7)
 """Where along either side an outline's inside is sampled: off its edges, which a pose's error blurs."""
 
-_BESIDE_M = (0.12, 0.25)
-"""How far beside its edges the ground is sampled, m."""
-
-_MOST_VIEWS = 6
-"""Near views of a place that are looked at: the errors of more repeat themselves."""
-
-_MOST_LEARNED = 40
-"""Markings of a drive that its paint and its ground are learned from."""
-
-_ASIDE_M = 1.3
-"""How far beside a marking bare ground is looked for, m."""
-
-_CLEAR_M = 1.0
-"""Distance from all known paint that makes ground bare, m."""
-
-_LEAST_LEARNED = 8
-"""Places from which the drive's own paint or ground is known; with fewer nothing is said."""
-
+_BESIDE_M = (0.12, 0.25)  # how far beside its edges the ground is sampled, m
+_MOST_VIEWS = 6  # near views of a place that are looked at: the errors of more repeat themselves
+_MOST_LEARNED = 40  # markings of a drive that its paint and its ground are learned from
+_ASIDE_M = 1.3  # how far beside a marking bare ground is looked for, m
+_CLEAR_M = 1.0  # distance from all known paint that makes ground bare, m
+_LEAST_LEARNED = 8  # places from which the drive's own paint or ground is known; with fewer nothing is said
 _HIDDEN_SIGMA = 0.5
 """Sigma of the contrast, log ratio of grey values, of whatever else stands before the ground."""
 
 _HIDDEN_SHARE = 0.5
 """Share of the markings which are there and not found that are hidden; the others are worn."""
 
-_STRANGE_SHARE = 0.05
-"""Share of bare places that are not: a stain, the edge of a shadow."""
-
-_LEAST_SIGMA = 0.02
-"""Floor of the sigma of bare ground's contrast: the grain of an image."""
+_STRANGE_SHARE = 0.05  # share of bare places that are not: a stain, the edge of a shadow
+_LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
 
 
 @dataclass(frozen=True)
@@ -86,55 +71,6 @@ def _mixed(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
     return np.asarray(logsumexp([np.log(share) + first, np.log1p(-share) + second], axis=0))
 
 
-@dataclass(frozen=True)
-class Pictures:
-    """The images of a drive, and from where they were taken."""
-
-    grey: Grey
-    views: Views
-    cameras: tuple[Camera, ...]
-    rig: Rig
-
-    def contrasts(self, corners_map: FloatArray, place: IntArray, image: IntArray) -> FloatArray:
-        """The median contrast (N,) of places (N, 4, 2) over their nearest views; nan without a view.
-
-        Pairs of ``place`` (P,) and ``image`` (P,) say which images have a place in view.
-        """
-        row_of = {int(one): row for row, one in enumerate(self.views.image)}
-        wanted: dict[int, list[int]] = {}
-        for number in range(len(corners_map)):
-            rows = np.array([row_of[int(one)] for one in image[place == number]], dtype=np.int64)
-            at = self.rig.map_from_vehicle[self.views.frame[rows]][:, :2, 3]
-            away_m = np.linalg.norm(at - corners_map[number].mean(axis=0), axis=1)
-            for row in rows[np.argsort(away_m)[:_MOST_VIEWS]].tolist():
-                wanted.setdefault(row, []).append(number)
-        found: list[list[float]] = [[] for _ in corners_map]
-        for row, numbers in sorted(wanted.items()):
-            grey = self.grey(int(self.views.image[row]))
-            for number in numbers:
-                found[number].append(self._contrast(grey, row, corners_map[number]))
-        return np.array([np.nanmedian(own) if np.isfinite(own).any() else np.nan for own in found])
-
-    def _contrast(self, grey: NDArray[np.float32], row: int, corners: FloatArray) -> float:
-        """The log ratio of the mean grey values within an outline (4, 2) and beside it."""
-        inside, beside = _samples(corners)
-        camera = self.views.camera[row]
-        cam_from_map = self.rig.cam_from_vehicle[camera] @ np.linalg.inv(
-            self.rig.map_from_vehicle[self.views.frame[row]]
-        )
-        means = []
-        for points in (inside, beside):
-            pinhole, depth_m = project_ground(self.rig.intrinsic[camera], cam_from_map, points)
-            if not (depth_m > 0).all():
-                return float("nan")
-            pixel = distort_points(self.cameras[camera].info, pinhole).astype(np.float32)
-            values = cv2.remap(grey, pixel[None, :, 0], pixel[None, :, 1], cv2.INTER_LINEAR, borderValue=-1.0)
-            if not (values >= 0).all():
-                return float("nan")
-            means.append(float(values.mean()) + 1.0)
-        return float(np.log(means[0] / means[1]))
-
-
 def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points within an outline (4, 2), and beside its four edges."""
     s, t = (grid.ravel()[:, None] for grid in np.meshgrid(_INSIDE, _INSIDE))
@@ -150,43 +86,35 @@ def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def learn_paint(
-    pictures: Pictures,
-    markings: Sequence[Marking],
-    paint_map: FloatArray,
-    near_views: Callable[[FloatArray], tuple[IntArray, IntArray]],
+    observer: Observer, markings: Sequence[Marking], paint_map: FloatArray
 ) -> Mapping[str, Paint]:
     """By class the contrast of paint and of bare ground in a drive; classes of too few markings are left out.
 
-    Args:
-        pictures: its images.
-        markings: of its own map.
-        paint_map: (N, 2) places where there is, or was, paint.
-        near_views: gives (place, image) of the views of places (N, 4, 2).
+    ``markings`` are of the drive's own map; ``paint_map`` (N, 2) are places where there is, or was, paint.
     """
     out = {}
     paint = cKDTree(paint_map)
     for kind in sorted({one.kind for one in markings}):
         own = np.stack([one.corners_map for one in markings if one.kind == kind])
         own = own[np.linspace(0, len(own) - 1, min(len(own), _MOST_LEARNED)).astype(int)]
-        painted = pictures.contrasts(own, *near_views(own))
-        aside = np.concatenate([own + _across(own, sign * _ASIDE_M)[:, None] for sign in (-1, 1)])
+        painted = observer.contrasts(own)
+        across = _ASIDE_M * _across(own)[:, None]
+        aside = np.concatenate([own - across, own + across])
         clear = paint.query(aside.reshape(-1, 2))[0].reshape(-1, 4).min(axis=1) > _CLEAR_M
-        bare = pictures.contrasts(aside[clear], *near_views(aside[clear])) if clear.any() else np.zeros(0)
+        bare = observer.contrasts(aside[clear]) if clear.any() else np.zeros(0)
         samples = [values[np.isfinite(values)] for values in (painted, bare)]
         if min(len(values) for values in samples) >= _LEAST_LEARNED:
             out[kind] = Paint(_robust(samples[0]), _robust(samples[1]))
     return out
 
 
-def _across(corners: FloatArray, by_m: float) -> FloatArray:
-    """Shifts (N, 2) across the longest extent of outlines (N, 4, 2)."""
-    spans = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]], axis=1)
-    diagonals = np.stack([corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]], axis=1)
-    every = np.concatenate([spans, diagonals], axis=1)
+def _across(corners: FloatArray) -> FloatArray:
+    """Unit directions (N, 2) across the longest extent, side or diagonal, of outlines (N, 4, 2)."""
+    every = corners[:, [1, 2, 2, 3]] - corners[:, [0, 1, 0, 1]]
     longest = np.argmax(np.linalg.norm(every, axis=2), axis=1)
     along = every[np.arange(len(every)), longest]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    return np.asarray(by_m * np.column_stack([-along[:, 1], along[:, 0]]))
+    return np.column_stack([-along[:, 1], along[:, 0]])
 
 
 def _robust(values: FloatArray) -> tuple[float, float]:
@@ -201,9 +129,7 @@ _MOST_SQUARED = 25.0
 _NEAR_M = 12.0
 """Distance from the camera, m, within which markings are found at about one rate, as those of a map say."""
 
-_SAME_PLACE_M = 0.05
-"""A marking that has one of its class nearer than this is there, m."""
-
+_SAME_PLACE_M = 0.05  # a marking that has one of its class nearer than this is there, m
 _REACH_M = 2.0
 """How far the middle of a sighting may be from a place's centre, m: of a dash one may see an end only."""
 
@@ -217,12 +143,8 @@ class Looks:
 
     def watched(self, rate: FloatArray) -> Watched:
         """The log odds of that, where markings of the class are found at a ``rate`` (N,)."""
-        return Watched(
-            there=np.array(
-                [log_found(k, n, r) for k, n, r in zip(self.found, self.views, rate, strict=True)]
-            ),
-            bare=log_found_where_none_is(self.found, self.views),
-        )
+        there = [log_found(k, n, r) for k, n, r in zip(self.found, self.views, rate, strict=True)]
+        return Watched(np.array(there), log_found_where_none_is(self.found, self.views))
 
 
 @dataclass(frozen=True)
@@ -240,11 +162,6 @@ class Observer:
     jitter_rad: float
     grey: Grey | None = None
 
-    @property
-    def pictures(self) -> Pictures | None:
-        """Its images, None where they are not to be had."""
-        return None if self.grey is None else Pictures(self.grey, self.views, self.cameras, self.rig)
-
     def easy_views(self, corners_map: FloatArray) -> tuple[IntArray, IntArray]:
         """(place, image) in which each of the places (N, 4, 2) is wholly in view, and near."""
         return easy_views(self.views, self.rig, list(self.cameras), corners_map, _NEAR_M)
@@ -253,14 +170,12 @@ class Observer:
         """How often it looked at ``markings``, and found one among the sightings that are ``free`` (S,)."""
         if not markings:
             return Looks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-        corners = np.stack([one.corners_map for one in markings])
-        group, image = self.easy_views(corners)
+        corners, count = np.stack([one.corners_map for one in markings]), len(markings)
+        place, image = self.easy_views(corners)
         shown = self._shown(markings, corners, free)
-        found = [(int(g), int(i)) in shown for g, i in zip(group, image, strict=True)]
-        count = len(markings)
-        return Looks(
-            np.bincount(group, minlength=count), np.bincount(group[found], minlength=count).astype(np.int64)
-        )
+        found = [pair in shown for pair in zip(place.tolist(), image.tolist(), strict=True)]
+        views = np.bincount(place, minlength=count)
+        return Looks(views, np.bincount(place[found], minlength=count).astype(np.int64))
 
     def _shown(
         self, markings: Sequence[Marking], corners: FloatArray, free: BoolArray
@@ -271,17 +186,47 @@ class Observer:
         if not len(rows):
             return set()
         row, place = near_pairs(located, rows, corners.mean(axis=1), _REACH_M)
-        kinds = [one.kind for one in markings]
-        alike = [
-            kinds[p] == self.sightings.kinds[k] for p, k in zip(place, self.sightings.kind[row], strict=True)
-        ]
+        kinds = np.array([one.kind for one in markings])
+        alike = kinds[place] == np.array(self.sightings.kinds)[self.sightings.kind[row]]
         row, place = row[alike], place[alike]
         squared = squared_distances(
             self.sightings, located, self.rig, row, corners[place], self.jitter_rad
         ).min(axis=1, initial=np.inf)
         fits = squared <= _MOST_SQUARED
-        images = self.sightings.image[row[fits]]
-        return {(int(p), int(i)) for p, i in zip(place[fits], images, strict=True)}
+        return set(zip(place[fits].tolist(), self.sightings.image[row[fits]].tolist(), strict=True))
+
+    def contrasts(self, corners_map: FloatArray) -> FloatArray:
+        """The median contrast (N,) of places (N, 4, 2) over their nearest views; nan without a view."""
+        assert self.grey is not None
+        place, image = self.easy_views(corners_map)
+        row_of = {int(one): row for row, one in enumerate(self.views.image)}
+        wanted: dict[int, list[int]] = {}
+        for number in range(len(corners_map)):
+            rows = np.array([row_of[int(one)] for one in image[place == number]], dtype=np.int64)
+            at = self.rig.map_from_vehicle[self.views.frame[rows]][:, :2, 3]
+            away_m = np.linalg.norm(at - corners_map[number].mean(axis=0), axis=1)
+            for row in rows[np.argsort(away_m)[:_MOST_VIEWS]].tolist():
+                wanted.setdefault(row, []).append(number)
+        found: list[list[float]] = [[] for _ in corners_map]
+        for row, numbers in sorted(wanted.items()):
+            grey = self.grey(int(self.views.image[row]))
+            for number in numbers:
+                found[number].append(self._contrast(grey, row, corners_map[number]))
+        return np.array([np.nanmedian(own) if np.isfinite(own).any() else np.nan for own in found])
+
+    def _contrast(self, grey: NDArray[np.float32], row: int, corners: FloatArray) -> float:
+        """The log ratio of the mean grey values within an outline (4, 2) and beside it."""
+        camera, pose = self.views.camera[row], self.rig.map_from_vehicle[self.views.frame[row]]
+        cam_from_map = self.rig.cam_from_vehicle[camera] @ np.linalg.inv(pose)
+        means = []
+        for points in _samples(corners):
+            pinhole, depth_m = project_ground(self.rig.intrinsic[camera], cam_from_map, points)
+            pixel = distort_points(self.cameras[camera].info, pinhole).astype(np.float32)
+            values = cv2.remap(grey, pixel[None, :, 0], pixel[None, :, 1], cv2.INTER_LINEAR, borderValue=-1.0)
+            if not (depth_m > 0).all() or not (values >= 0).all():
+                return float("nan")
+            means.append(float(values.mean()) + 1.0)
+        return float(np.log(means[0] / means[1]))
 
 
 def find_rates(observer: Observer, markings: Sequence[Marking]) -> Mapping[str, float]:
@@ -298,21 +243,18 @@ def with_paint(
     watched: Watched, observer: Observer, old: Sequence[Marking], new: Sequence[Marking]
 ) -> Watched:
     """How ``old`` markings were ``watched``, and what images show where no ``new`` one of a class lies."""
-    pictures = observer.pictures
-    if pictures is None or not old or not new:
+    if observer.grey is None or not old or not new:
         return watched
     old_at, new_at = (np.array([one.corners_map.mean(axis=0) for one in some]) for some in (old, new))
     paint_map = np.concatenate([one.corners_map for one in (*old, *new)] + [old_at, new_at])
-    paints = learn_paint(pictures, new, paint_map, observer.easy_views)
     there, bare = watched.there.copy(), watched.bare.copy()
-    for kind, paint in paints.items():
+    for kind, paint in learn_paint(observer, new, paint_map).items():
         alike = np.array([one.kind == kind for one in new])
         near_m = cKDTree(new_at[alike]).query(old_at)[0]
         doubtful = [k for k, one in enumerate(old) if one.kind == kind and near_m[k] > _SAME_PLACE_M]
         if not doubtful:
             continue
-        corners = np.stack([old[k].corners_map for k in doubtful])
-        contrast = pictures.contrasts(corners, *observer.easy_views(corners))
+        contrast = observer.contrasts(np.stack([old[k].corners_map for k in doubtful]))
         known = np.isfinite(contrast)
         rows = np.array(doubtful)[known]
         there[rows] += paint.log_there(contrast[known])

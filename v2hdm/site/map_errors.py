@@ -20,11 +20,10 @@ from scipy.spatial import cKDTree
 
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
-UNKNOWN_SIGMA_M = 0.02
+_UNKNOWN_SIGMA_M = 0.02
 """Sigma of a corner of a map that states none, m a coordinate: a marking drawn by hand over an image."""
 
-_LEAST_SIGMA_M = 1e-4
-"""Floor of the sigmas of a marking's own error, m: the rounding of a survey."""
+_LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
 
 SHIFT = np.tile(np.eye(2), (4, 1))
 """How the stacked corners (8,) move with a shift (2,)."""
@@ -47,15 +46,11 @@ class Errors:
     def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
         """The errors that ``markings`` state: covariance in all, relative sigma alone."""
         centres = np.array([one.corners_map.mean(axis=0) for one in markings]).reshape(-1, 2)
-        stated = [
-            np.eye(8) * UNKNOWN_SIGMA_M**2 if one.covariance_m2 is None else one.covariance_m2
-            for one in markings
-        ]
-        whole = np.array(stated).reshape(-1, 8, 8)
+        unknown = np.eye(8) * _UNKNOWN_SIGMA_M**2
+        stated = [unknown if one.covariance_m2 is None else one.covariance_m2 for one in markings]
+        relative_m = [np.nan if one.relative_sigma_m is None else one.relative_sigma_m for one in markings]
+        whole, own_m2 = np.array(stated).reshape(-1, 8, 8), np.array(relative_m) ** 2
         centre_m2 = np.einsum("miaja->m", whole.reshape(-1, 4, 2, 4, 2)) / 32
-        own_m2 = np.array(
-            [np.nan if one.relative_sigma_m is None else one.relative_sigma_m**2 for one in markings]
-        )
         shared_m2 = np.maximum(centre_m2 - own_m2, 0.0)
         # One without neighbours has no relative sigma: it shares what the others do.
         usual_m2 = float(np.nanmedian(shared_m2)) if np.isfinite(shared_m2).any() else 0.0
@@ -106,10 +101,9 @@ class Shift:
     @cached_property
     def _inverse(self) -> FloatArray:
         """Of the joint covariance (2 P, 2 P) of all that is off."""
-        count = len(self.old)
         shared = self.of_old.between(self.old, self.old) + self.of_new.between(self.new, self.new)
         total = np.kron(shared, np.eye(2))
-        for k in range(count):
+        for k in range(len(self.old)):
             total[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += self.noise_m2[k]
         return np.asarray(np.linalg.inv(total))
 
@@ -136,11 +130,8 @@ class Shift:
         if not len(self.old):
             return np.zeros(2), prior_m2 * np.eye(2)
         known = self.of_old.between(self.old, one) + self.of_new.between(self.new, other)
-        return self._conditional(known[:, 0], np.array([prior_m2]))
-
-    def _conditional(self, known: FloatArray, prior_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
-        gain = np.kron(known[None], np.eye(2)) @ self._inverse
-        covariance = prior_m2[0] * np.eye(2) - gain @ np.kron(known[:, None], np.eye(2))
+        gain = np.kron(known.T, np.eye(2)) @ self._inverse
+        covariance = prior_m2 * np.eye(2) - gain @ np.kron(known, np.eye(2))
         return gain @ self.off_map.ravel(), _positive(covariance[None])[0]
 
     def of_old_at(self, points_map: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -174,17 +165,7 @@ class Shift:
 _SAME_LINE_M = 0.3
 """Distance of two maps' lines up to which they are one, m: two lines side by side lie twice as far apart."""
 
-_LEAST_SHARED = 0.5
-"""Share of a new line's vertices that lie on an earlier line, from which it is that line."""
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """A new line that lies on an earlier one: from ``begin`` to ``end`` of its stations, m, along that."""
-
-    begin: float
-    end: float
-    lane: Lane
+_LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier line, from which it is that line
 
 
 def updated_lanes(
@@ -195,7 +176,7 @@ def updated_lanes(
     ``shift`` is how the maps lie to each other; ``number`` gives a fresh id.
     """
     before = [replace(one, points_map=_moved(one.points_map, shift, of_old=True)) for one in old]
-    pieces: list[list[_Piece]] = [[] for _ in before]
+    pieces: list[list[Lane]] = [[] for _ in before]
     added = []
     for one in new:
         lane = replace(one, points_map=_moved(one.points_map, shift, of_old=False))
@@ -203,7 +184,7 @@ def updated_lanes(
         if owner is None:
             added.append(replace(lane, id=number()))
         else:
-            pieces[owner].append(_piece(lane, before[owner]))
+            pieces[owner].append(lane)
     kept = [_renewed(lane, parts) for lane, parts in zip(before, pieces, strict=True)]
     return (*kept, *added)
 
@@ -225,9 +206,8 @@ def updated_symbols(
             out.append(replace(symbol, id=number()))
         else:
             taken.add(same)
-            out[same] = replace(
-                symbol, id=old[same].id, sightings=old[same].sightings + one.sightings, heights_m=None
-            )
+            sightings = old[same].sightings + one.sightings
+            out[same] = replace(symbol, id=old[same].id, sightings=sightings, heights_m=None)
     return tuple(out)
 
 
@@ -240,10 +220,12 @@ def _moved(points_map: FloatArray, shift: Shift, of_old: bool) -> FloatArray:
 
 def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
     """The earlier line of the same class that most of a new line lies on."""
-    alike = [k for k, one in enumerate(lanes) if one.kind == lane.kind]
-    shares = [(_apart(lane.points_map, lanes[k].points_map) <= _SAME_LINE_M).mean() for k in alike]
+    shares = [
+        (_apart(lane.points_map, one.points_map) <= _SAME_LINE_M).mean() * (one.kind == lane.kind)
+        for one in lanes
+    ]
     best = int(np.argmax(shares)) if shares else 0
-    return alike[best] if shares and shares[best] >= _LEAST_SHARED else None
+    return best if shares and shares[best] >= _LEAST_SHARED else None
 
 
 def _apart(points: FloatArray, line: FloatArray) -> FloatArray:
@@ -275,15 +257,7 @@ def _stations(points: FloatArray, line: FloatArray) -> FloatArray:
     return station
 
 
-def _piece(lane: Lane, on: Lane) -> _Piece:
-    """The line, in the direction of the earlier one that it lies on."""
-    station = _stations(lane.points_map, on.points_map)
-    if station[-1] < station[0]:
-        lane, station = replace(lane, points_map=lane.points_map[::-1]), station[::-1]
-    return _Piece(float(station.min()), float(station.max()), lane)
-
-
-def _renewed(lane: Lane, pieces: Sequence[_Piece]) -> Lane:
+def _renewed(lane: Lane, pieces: Sequence[Lane]) -> Lane:
     """The earlier line with its course replaced where new lines lie on it."""
     if not pieces:
         return lane
@@ -291,17 +265,19 @@ def _renewed(lane: Lane, pieces: Sequence[_Piece]) -> Lane:
     points: list[FloatArray] = []
     up: list[FloatArray] = []
     reached = -1.0
-    for piece in sorted(pieces, key=lambda one: one.begin):
-        old = (along > reached) & (along < piece.begin)
+    placed = [(_stations(piece.points_map, lane.points_map), piece.points_map) for piece in pieces]
+    for station, course in sorted(placed, key=lambda one: float(one[0].min())):
+        if station[-1] < station[0]:
+            station, course = station[::-1], course[::-1]
+        old = (along > reached) & (along < station.min())
         # Of two new pieces that overlap, the later one begins where the earlier one ends.
-        station = _stations(piece.lane.points_map, lane.points_map)
         own = (station > reached) | (reached < 0)
-        points += [lane.points_map[old], piece.lane.points_map[own]]
+        points += [lane.points_map[old], course[own]]
         if heights is not None:
             up += [heights[old], np.interp(station[own], along, heights)]
-        reached = max(reached, piece.end)
+        reached = max(reached, float(station.max()))
     left = along > reached
-    sightings = lane.sightings + max(piece.lane.sightings for piece in pieces)
+    sightings = lane.sightings + max(piece.sightings for piece in pieces)
     course = np.concatenate([*points, lane.points_map[left]])
     heights = None if heights is None else np.concatenate([*up, heights[left]])
     return replace(lane, points_map=course, heights_m=heights, sightings=sightings)

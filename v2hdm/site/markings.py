@@ -24,7 +24,7 @@ OF_SYMBOL = "part of a symbol, such as an arrow"
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 COVERED = "lies on a better supported marking"
-CLUTTER_BY = (
+_CLUTTER_BY = (
     "not shaped like a marking of its class",
     "seen in too few images",
     "found in too few of its images",
@@ -63,7 +63,7 @@ class Support:
         group, image = self.group[self.accepted], self.sightings.image[self.row[self.accepted]]
         shown = np.unique(np.stack([group, image]), axis=1)
         easy = np.stack(easy_views(self.views, self.rig, list(self.cameras), corners_map))
-        found = np.isin(_pair_keys(easy), _pair_keys(shown))
+        found = np.isin(*(pairs[0] * (1 << 32) + pairs[1] for pairs in (easy, shown)))
         return Counts(
             images=np.bincount(shown[0], minlength=count),
             observations=np.bincount(self.group, minlength=count),
@@ -95,7 +95,12 @@ class Classified:
             MappingError: there is none.
         """
         if not len(self.accepted):
-            raise MappingError(_no_marking_message(self.exclusions()))
+            reasons = [exclusion.reason for exclusion in self.exclusions()]
+            commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
+            raise MappingError(
+                f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); "
+                "check the camera's IPM, the detector and that the drive passes its markings closely."
+            )
         return tuple(
             Marking(
                 kind=self.kind[group],
@@ -130,8 +135,10 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
     counts = seen.counts(first.candidates.corners_map)
     found = posterior(solved, seen.kind, counts)
     least = np.log(options.min_probability / (1 - options.min_probability))
+    part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
     verdict: list[str | None] = [
-        None if odds >= least else _reason(found, group) for group, odds in enumerate(found.log_odds)
+        None if odds >= least else OF_SYMBOL if part[group] else _CLUTTER_BY[found.evidence[group].argmin()]
+        for group, odds in enumerate(found.log_odds)
     ]
     sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
     # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
@@ -141,13 +148,6 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
     return Classified(seen.names(), found.candidates, counts.images, verdict)
-
-
-def _reason(found: Posterior, group: int) -> str:
-    """The hypothesis that has won against a marking, in words."""
-    if found.probability[group, PART_OF_SYMBOL] > found.probability[group, CLUTTER]:
-        return OF_SYMBOL
-    return CLUTTER_BY[int(np.argmin(found.evidence[group]))]
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:
@@ -171,30 +171,13 @@ def _overlap(a: FloatArray, b: FloatArray) -> float:
     return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)
 
 
-def _pair_keys(pairs: IntArray) -> IntArray:
-    """One number per column of ``pairs`` (2, P)."""
-    return np.asarray(pairs[0] * (1 << 32) + pairs[1])
-
-
-def _no_marking_message(excluded: tuple[Exclusion, ...]) -> str:
-    """The error message where no candidate was accepted."""
-    reasons = [exclusion.reason for exclusion in excluded]
-    commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
-    return (
-        f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); check the "
-        "camera's IPM, the detector and that the drive passes its markings closely."
-    )
-
-
 JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""
 
-NEIGHBOUR_M = 10.0
+_NEIGHBOUR_M = 10.0
 """How far apart markings are compared, m: about a vehicle's length, over which it manoeuvres."""
 
-_FARTHEST_M = 15.0
-"""A marking without another one within so many metres has no relative standard deviation."""
-
+_FARTHEST_M = 15.0  # a marking without another one within so many metres has no relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
 
 
@@ -211,14 +194,17 @@ def with_relative_sigma(
     if not len(seen):
         return tuple(markings)
     chosen = [markings[m] for m in seen.tolist()]
-    diagonal = _diagonals(corner_index[seen])
+    # Two corners that are opposite each other: of a marking at least three are known.
+    even, odd = corner_index[seen][:, [0, 2]], corner_index[seen][:, [1, 3]]
+    diagonal = np.where((even >= 0).all(axis=1, keepdims=True), even, odd)
     first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
     if not len(first):
         return tuple(markings)
     covariance = joint(np.concatenate([diagonal[first], diagonal[second]], axis=1))
     apart = _CENTRES @ covariance @ _CENTRES.T
     formal = _CENTRES[:, :4] @ covariance[:, :4, :4] @ _CENTRES[:, :4].T
-    stated = np.array([_centre_variance_m2(chosen[k]) for k in first])
+    stated_m2 = np.array([chosen[k].covariance_m2 for k in first]).reshape(-1, 4, 2, 4, 2)
+    stated = np.array([np.einsum("iaja->", one) for one in stated_m2]) / 32
     own = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
     # The difference of two centres has the errors of both.
     sigma_m = np.sqrt(np.trace(apart, axis1=1, axis2=2) / 4 + own)
@@ -226,12 +212,6 @@ def with_relative_sigma(
     for marking, sigma in zip(seen[first].tolist(), sigma_m.tolist(), strict=True):
         out[marking] = replace(markings[marking], relative_sigma_m=sigma)
     return tuple(out)
-
-
-def _centre_variance_m2(marking: Marking) -> float:
-    """Variance of a coordinate of the mean of its corners."""
-    assert marking.covariance_m2 is not None
-    return float(np.einsum("iaja->", marking.covariance_m2.reshape(4, 2, 4, 2)) / 32)
 
 
 def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
@@ -243,11 +223,5 @@ def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
         if len(others):
             distance_m = np.linalg.norm(centres_map[others] - centres_map[own], axis=1)
             first.append(own)
-            second.append(int(others[np.argmin(np.abs(distance_m - NEIGHBOUR_M))]))
+            second.append(int(others[np.argmin(np.abs(distance_m - _NEIGHBOUR_M))]))
     return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
-
-
-def _diagonals(corner_index: IntArray) -> IntArray:
-    """Of markings (M, 4) of which three corners are known, two (M, 2) that are opposite each other."""
-    even = np.asarray((corner_index[:, [0, 2]] >= 0).all(axis=1, keepdims=True))
-    return np.where(even, corner_index[:, [0, 2]], corner_index[:, [1, 3]])

@@ -28,11 +28,8 @@ from v2hdm.records import FloatArray, IntArray, Marking, Symbol
 _CELL_M = 0.01
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
 
-_COARSE_M = 0.05
-"""Cells, m, of the raster that overlaps are measured on."""
-
-_COMMON = 0.5
-"""Outlines are of one symbol if they share this part of the smaller one's area."""
+_COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
+_COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
 
 
 def map_symbols(
@@ -40,15 +37,13 @@ def map_symbols(
 ) -> tuple[Symbol, ...]:
     """The symbols that at least three images show.
 
-    Args:
-        symbols: all sightings.
-        rig: cameras and poses.
-        jitter_rad: standard deviation of the viewing direction: far outlines are less certain.
-        markings: of the map; paint that is one of them is no symbol.
+    Far outlines are less certain by ``jitter_rad``, the standard deviation of the viewing direction; paint
+    that is one of the map's ``markings`` is no symbol.
     """
-    grounds = outlines_on_ground(symbols, rig)
-    rows = [row for row, ground in enumerate(grounds) if ground is not None]
-    shapes = [ground for ground in grounds if ground is not None]
+    grounds = {
+        row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
+    }
+    rows, shapes = list(grounds), list(grounds.values())
     if not shapes:
         return ()
     centre = camera_centre(rig.cam_from_vehicle[symbols.camera[rows]])

@@ -29,9 +29,7 @@ from v2hdm.detection.network import as_probability
 from v2hdm.detection.weights import LANE_SCORE_FILE
 from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, FloatArray, IntArray, LaneDetection
 
-DRAWN_STEP_PX = 8.0
-"""Rows of the image from one point of a line to the next, px."""
-
+_DRAWN_STEP_PX = 8.0  # rows of the image from one point of a line to the next, px
 _ENDED, _GAP, _SOLID, _DASH = range(4)
 _DASH_STAGES = 3
 """Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
@@ -61,22 +59,12 @@ _CROSSING_M = 0.3
 _DOUBLE_M = 0.75
 """Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
 
-_LEAST_ABREAST_M = 1.0
-"""Both strands of a double line show paint on so much ground abreast."""
-
-_ONE_LINE_M = 0.12
-"""Lines nearer to each other than this are one."""
-
-_CERTAIN_SIGMA_M = 0.3
-"""Rows on which a line is known worse than this do not show its place beside others."""
-
-_EVEN = 0.5
-"""A line is where it is present rather than not."""
-
+_LEAST_ABREAST_M = 1.0  # both strands of a double line show paint on so much ground abreast
+_ONE_LINE_M = 0.12  # lines nearer to each other than this are one
+_CERTAIN_SIGMA_M = 0.3  # rows on which a line is known worse than this do not show its place beside others
+_EVEN = 0.5  # a line is where it is present rather than not
 _SMOOTH_PX = 24.0
-_FREEDOM_M = 0.03
-"""A line follows its points within such a distance, and by so much."""
-
+_FREEDOM_M = 0.03  # a line follows its points within such a distance, and by so much
 _EXTENSION_SIGMA = 0.03
 """Beyond its own points a line is drawn while it is known within this share of the image's width."""
 
@@ -95,18 +83,16 @@ image and down the image (upright things are as tall as they are long); the log 
 road; the log odds of its surest paint; the mean log odds of paint along it, and the share of that which the
 network takes for dashes."""
 
-SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
+_SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
 """Features of a line's span: the root of its log likelihood, the length of ground on which it is present,
 that on which it shows paint between its points, and the share of rows there that do."""
 
-AMONG = ("alone", "near_horizon", *SPAN, "a_lane_apart", "too_near")
+AMONG = ("alone", "near_horizon", *_SPAN, "a_lane_apart", "too_near")
 """Features of a line among others: its log odds alone, how far from the horizon it begins, its span; and of
 the others that run beside it, weighed by their probability, the likest one a lane away and the number of
 those nearer than a lane can be."""
 
-_NO_PAINT = -3.0
-"""Log odds of the surest paint of a line that shows none."""
-
+_NO_PAINT = -3.0  # log odds of the surest paint of a line that shows none
 _BEST = 3
 _MOST_LOG_RATIO = 6.0
 _UNKNOWN = (2.3, 0.4)
@@ -116,16 +102,10 @@ _PLACES = 24
 _ON_M = np.linspace(-0.25, 0.25, 7)
 """Paint of a line, be it a double one, is within such a distance of where it is drawn."""
 
-_LEAST_WEIGHT = 0.05
-"""Places without paint have this weight, that of paint being one."""
-
-_LANE_M, _LANE_SIGMA_M = 3.2, 0.65
-"""Lanes of roads are 2.5 to 4 m wide."""
-
+_LEAST_WEIGHT = 0.05  # places without paint have this weight, that of paint being one
+_LANE_M, _LANE_SIGMA_M = 3.2, 0.65  # lanes of roads are 2.5 to 4 m wide
 _TOO_NEAR_M = 1.8
-_MOST_NEAR = 2.0
-"""More lines than this add nothing."""
-
+_MOST_NEAR = 2.0  # more lines than this add nothing
 _CHANGE_M, _CHANGE_SHARE = 0.15, 0.06
 """The distance between lines that run beside each other changes by so much and by this share of it."""
 
@@ -135,16 +115,16 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     if not lines:
         return []
     camera, horizon = image.camera, image.horizon
-    corners = np.array([[0.0, camera.info.height - 1.0], [camera.info.width - 1.0, camera.info.height - 1.0]])
+    corners = (camera.info.height - 1.0) * np.array([[0.0, 1.0], [0.0, 1.0]])
+    corners[1, 0] = camera.info.width - 1.0
     lowest = float(horizon.coordinates(camera.undistort(corners))[1].max())
-    below = np.arange(horizon.below_px(FARTHEST_M), lowest + DRAWN_STEP_PX, DRAWN_STEP_PX)
+    below = np.arange(horizon.below_px(FARTHEST_M), lowest + _DRAWN_STEP_PX, _DRAWN_STEP_PX)
     along = np.array([line.curve.parameters for line in lines]) @ horizon.basis(below).T
     beside_m = (along - horizon.centre_px) / (horizon.px_per_m * below)
     step_m = np.hypot(np.diff(horizon.depth_m(below)), np.diff(beside_m, axis=1))
     half_px = np.maximum(_HALF_WIDTH_M * horizon.px_per_m * below, _LEAST_HALF_WIDTH_PX)
     across = along[..., None] + half_px[:, None] * _ACROSS
-    rows = np.broadcast_to(below[:, None], across.shape)
-    places_px = camera.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(*across.shape, 2)
+    places_px = _places_px(image, across, below[:, None])
     likelihood = np.zeros((*along.shape, _STATES))
     crossing = _crossings(lines, points, image, below)
     likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
@@ -159,6 +139,13 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     present, painted = 1 - states[..., _ENDED], states[..., _SOLID:].sum(axis=2)
     each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
     return [replace(line, span=Span(below, *rest)) for line, *rest in each]
+
+
+def _places_px(image: LaneImage, along: FloatArray, below: FloatArray) -> FloatArray:
+    """Recorded px (..., 2) of places along and below the horizon, which broadcast."""
+    rows = np.broadcast_to(below, along.shape)
+    pinhole_px = image.horizon.pinhole_px(along.ravel(), rows.ravel())
+    return image.camera.distort(pinhole_px).reshape(*along.shape, 2)
 
 
 def _evidence(odds: FloatArray, weight: float, even: float, bounds: tuple[float, float]) -> FloatArray:
@@ -247,7 +234,7 @@ def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> 
     phi, px_per_m = image.horizon.basis(line.span.below), image.horizon.px_per_m * line.span.below
     sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
-    known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
+    known = np.maximum(sigma_m, other_sigma_m) < _CERTAIN_SIGMA_M
     shown, other_shown = (_shown(each, points, line.span.below) for each in (line, other))
     from_row = max(int(np.argmax(shown)), int(np.argmax(other_shown)))
     crossed = offset_m[from_row:][(known & (shown | other_shown))[from_row:]]
@@ -290,7 +277,7 @@ def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | No
         return None
     points_px = camera.distort(image.horizon.pinhole_px(along, below))
     own = points.below[line.members]
-    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -DRAWN_STEP_PX)
+    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -_DRAWN_STEP_PX)
     kept &= (sigma < _EXTENSION_SIGMA * camera.info.width) | ((below >= own.min()) & (below <= own.max()))
     if kept.sum() < 2:
         return None
@@ -332,11 +319,9 @@ def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
     """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
     if not lines:
         return np.empty((0, len(AMONG)))
-    far = [points.below[line.members].min() for line in lines]
+    far = np.log([points.below[line.members].min() for line in lines])
     spans = [_span_features(line, points) for line in lines]
-    return np.column_stack(
-        [[line.log_odds for line in lines], np.log(far), spans, _company(points, lines, image)]
-    )
+    return np.column_stack([[line.log_odds for line in lines], far, spans, _company(points, lines, image)])
 
 
 def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
@@ -397,10 +382,7 @@ def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) ->
     phi = horizon.basis(below.ravel()).reshape(len(lines), _PLACES, 3)
     along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
     across = along[..., None] + horizon.px_per_m * below[..., None] * _ON_M
-    rows = np.broadcast_to(below[..., None], across.shape)
-    places_px = image.camera.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(
-        *across.shape, 2
-    )
+    places_px = _places_px(image, across, below[..., None])
     paint = output.odds_at(places_px).max(axis=2)
     weight = as_probability(paint) + _LEAST_WEIGHT
     dashes = output.shares_at(places_px[:, :, len(_ON_M) // 2])[:, output.classes.index(LANE_DASH)]

@@ -29,8 +29,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 NEIGHBOURS = 3.0
 """Points of one line err together: that many are worth as much as one."""
 
-_MODEL_SIGMA_M = 0.02
-"""By how much painted lines leave the curve."""
+_MODEL_SIGMA_M = 0.02  # by how much painted lines leave the curve
 
 
 @dataclass(frozen=True)
@@ -259,13 +258,9 @@ class Line:
 
 
 _MIN_CHAIN = 3
-_CHAIN_ODDS = 0.0
-"""Chains are made of crossings more likely than not."""
-
+_CHAIN_ODDS = 0.0  # chains are made of crossings more likely than not
 _MAX_GAP_PX = 40.0
-_SLOPE_POINTS = 6
-"""Over how many of its last points a chain's direction is taken."""
-
+_SLOPE_POINTS = 6  # over how many of its last points a chain's direction is taken
 _MAX_SLOPE = 4.5
 _GATE_PX = 12.0
 
@@ -278,16 +273,12 @@ _PARALLEL_SIGMAS = (0.012, 0.0, 0.001)
 An error of half a degree in the camera's pitch turns lines 2 m to the side of a low camera by as much.
 """
 
-_SHARE = 0.85
-"""So many lines keep to the road; kerbs and strokes of letters need not."""
-
+_SHARE = 0.85  # so many lines keep to the road; kerbs and strokes of letters need not
 _FREE_KEPT = np.diag([0.04, 0.04, 1.0])
 _ALONG_KEPT = np.array([[1.0, 0.0, 1.0], [0.0, 0.04, 0.0], [1.0, 0.0, 1.0]])
 """Where lines tend to be says what is one line, not where that one is: so much of the prior is kept there."""
 
-_CANDIDATES = 4
-"""So many of the groups known best are tried as the road's direction."""
-
+_CANDIDATES = 4  # so many of the groups known best are tried as the road's direction
 _SHARED = [0, 2]
 _SHARED_BLOCK = np.ix_(_SHARED, _SHARED)
 

@@ -6,7 +6,7 @@ where to where it runs, and a logistic function gives its probability (:mod:`.bo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,23 +35,24 @@ def trace_lanes(
     branches = [(paint, edges) for paint in paints for edges in _branches(paint[0].blob)]
     if not branches:
         return []
-    edges_px = np.concatenate([edges for _, edges in branches])
-    edges_vehicle = camera.unproject(edges_px)
-    ends = np.cumsum([len(edges) for _, edges in branches])[:-1]
+    edges_vehicle = _at_once(camera.unproject, [edges for _, edges in branches])
     traced = [
         (paint, points)
-        for (paint, _), edges in zip(branches, np.split(edges_vehicle, ends), strict=True)
+        for (paint, _), edges in zip(branches, edges_vehicle, strict=True)
         if len(points := _resample(_centre(edges), camera, step_m, max_range_m)) >= _MIN_POINTS
     ]
     if not traced:
         return []
-    points_vehicle = np.concatenate([points for _, points in traced])
-    points_px = camera.project(points_vehicle)
-    ends = np.cumsum([len(points) for _, points in traced])[:-1]
+    points_px = _at_once(camera.project, [points for _, points in traced])
     return [
         LaneDetection(piece.kind, score, points)
-        for ((piece, score), _), points in zip(traced, np.split(points_px, ends), strict=True)
+        for ((piece, score), _), points in zip(traced, points_px, strict=True)
     ]
+
+
+def _at_once(function: Callable[[FloatArray], FloatArray], parts: Sequence[FloatArray]) -> list[FloatArray]:
+    """A function of points, of several arrays of them by one call."""
+    return np.split(function(np.concatenate(parts)), np.cumsum([len(part) for part in parts])[:-1])
 
 
 def _branches(blob: Blob) -> list[FloatArray]:
@@ -80,26 +81,16 @@ def _chains(runs: FloatArray) -> list[FloatArray]:
     linked = (below[:, 0] == above[:, 0] + 1) & (above[:, 1] < below[:, 2]) & (below[:, 1] < above[:, 2])
     if linked.all():
         return [runs]
-    breaks = np.flatnonzero(np.diff(runs[:, 0])) + 1
-    return _branching_chains(np.split(runs, breaks))
-
-
-def _branching_chains(cuts: list[FloatArray]) -> list[FloatArray]:
-    """The chains of a blob some rows of which hold several runs; ``cuts`` has the runs row by row."""
+    # Some rows hold several runs.
+    cuts = np.split(runs, np.flatnonzero(np.diff(runs[:, 0])) + 1)
     open_chains: list[list[FloatArray]] = []
     closed: list[list[FloatArray]] = []
     for runs in cuts:
         following: list[list[FloatArray]] = []
         taken = set()
         for run in runs:
-            match = next(
-                (
-                    c
-                    for c, chain in enumerate(open_chains)
-                    if c not in taken and chain[-1][1] < run[2] and run[1] < chain[-1][2]
-                ),
-                None,
-            )
+            meets = (chain[-1][1] < run[2] and run[1] < chain[-1][2] for chain in open_chains)
+            match = next((c for c, met in enumerate(meets) if met and c not in taken), None)
             if match is None:
                 following.append([run])
             else:
@@ -126,11 +117,11 @@ def _resample(
     centre_vehicle: FloatArray, camera: RoadCamera, step_m: float, max_range_m: float
 ) -> FloatArray:
     """Means of the points within each ``step_m`` along the line, from near to far."""
-    range_m = camera.range_m(centre_vehicle)
-    centre_vehicle, range_m = centre_vehicle[range_m <= max_range_m], range_m[range_m <= max_range_m]
+    centre_vehicle = centre_vehicle[camera.range_m(centre_vehicle) <= max_range_m]
     if len(centre_vehicle) < _MIN_POINTS:
         return np.empty((0, 2))
-    if range_m[0] > range_m[-1]:
+    first_m, last_m = camera.range_m(centre_vehicle[[0, -1]])
+    if first_m > last_m:
         centre_vehicle = centre_vehicle[::-1]
     gap_m = np.linalg.norm(np.diff(centre_vehicle, axis=0), axis=1)
     bins = np.floor(np.concatenate([[0.0], np.cumsum(gap_m)]) / step_m)
@@ -199,7 +190,8 @@ def _with_paint(points: LinePoints, image: LaneImage) -> tuple[LinePoints, list[
     if not pieces:
         return points, []
     length = [len(lane.points_px) for lane in pieces]
-    odds = np.repeat([_logit(lane.score) for lane in pieces], length)
+    score = np.clip([lane.score for lane in pieces], 1e-3, 1 - 1e-3)
+    odds = np.repeat(np.log(score / (1 - score)), length)
     points_px = np.concatenate([lane.points_px for lane in pieces])
     painted = LinePoints.of(image, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX), paint=True)
     ends_at = len(points.odds) + np.cumsum(length)
@@ -219,24 +211,15 @@ def _along_the_view(image: LaneImage) -> list[LaneDetection]:
     return [lane for lane, use in zip(image.paint, usable, strict=True) if use]
 
 
-def _logit(probability: float) -> float:
-    clipped = min(max(probability, 1e-3), 1 - 1e-3)
-    return float(np.log(clipped / (1 - clipped)))
-
-
 def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDetection]:
     """Number the lines from the vehicle outwards, by where each is beside the vehicle."""
     if not lanes:
         return []
-    ground = camera.unproject(np.concatenate([lane.points_px for lane in lanes]))
-    parts = np.split(ground, np.cumsum([len(lane.points_px) for lane in lanes])[:-1])
-    beside_m = np.array([_lateral_m(part, camera) for part in parts])
-    order = np.argsort(beside_m)
-    left = [k for k in order if beside_m[k] >= 0]
-    right = [k for k in order[::-1] if beside_m[k] < 0]
-    identity = {int(k): n for n, k in enumerate(left, start=1)} | {
-        int(k): -n for n, k in enumerate(right, start=1)
-    }
+    ground = _at_once(camera.unproject, [lane.points_px for lane in lanes])
+    beside_m = np.array([_lateral_m(part, camera) for part in ground])
+    order = np.argsort(beside_m).tolist()
+    identity = {k: n for n, k in enumerate((k for k in order if beside_m[k] >= 0), start=1)}
+    identity |= {k: -n for n, k in enumerate((k for k in order[::-1] if beside_m[k] < 0), start=1)}
     return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 

@@ -103,16 +103,15 @@ def digest(path: Path) -> str:
 def _problem(folder: Path) -> str | None:
     """The defect of a folder's files, in one line; None if they belong together."""
     files = read_manifest(folder)["files"]
-    network = files[NETWORK_FILE.name]["sha256"]
     for name, command in COMMANDS.items():
-        path = folder / name
+        path, problem = folder / name, None
         if not path.is_file():
-            return f"{path}: no such file; install v2hdm again, or make it with `{command}`"
-        if digest(path) != files[name]["sha256"]:
-            return (
-                f"{path}: not the file of the manifest beside it; restore both from one commit, or make it "
-                f"with `{command}`"
-            )
-        if files[name]["network"] != network:
-            return f"{path}: was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
+            problem = f"no such file; install v2hdm again, or make it with `{command}`"
+        elif digest(path) != files[name]["sha256"]:
+            problem = "not the file of the manifest beside it; restore both from one commit, or make it with "
+            problem += f"`{command}`"
+        elif files[name]["network"] != files[NETWORK_FILE.name]["sha256"]:
+            problem = f"was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
+        if problem:
+            return f"{path}: {problem}"
     return None

@@ -42,8 +42,8 @@ _REJECTED_LIMIT = 0.06
 # Variance of observations over the detector's statement: clean drives reach .2, no distortion 6.
 _VARIANCE_LIMIT = 3.0
 _WINDOW_LIMIT = 8.0  # the worst window of the route as a multiple of the median one: clean drives reach 2
-# Root mean square of a recorded pose's corrections, in its sigmas: at most 1 where these are right.
-_POSE_PULL_LIMIT = 1.4
+# Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
+_POSE_NOISE_LIMIT = 3.0
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
 # Sigma of the point that the poses are of, m, up to which a drive makes it observable.
 _LEVER_OBSERVABLE_M = 0.15
@@ -95,7 +95,6 @@ _CORRECTED_BY = {
 _RIVAL_LOG_ODDS = float(np.log(10.0))
 """A cause that is up to ten times less likely than the likeliest is named beside it."""
 
-_POSE_KEYS = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 _MAP_AXES = ("east", "north")
 
@@ -178,8 +177,8 @@ def _corrected(one: Contradiction) -> Finding:
 def _unknown(one: Contradiction) -> Finding:
     """No input can be off by as much as would explain the residuals."""
     says = (
-        "the markings contradict the inputs, and no wrong input of a plausible size explains them: compare the "
-        "images with the poses, in time and in place"
+        "the markings contradict the inputs, and no wrong input of a plausible size explains them: compare "
+        "images and poses, in time and in place"
     )
     return Finding("cause unknown", Status.FAIL, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, "map")
 
@@ -270,18 +269,18 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
             wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
             "left",
         )  # fmt: skip
-    if evidence.pose_innovations:
+    if evidence.pose_noise:
         yield from _poses(evidence)
 
 
 def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
-    state = max(evidence.pose_innovations, key=lambda name: evidence.pose_innovations[name])
-    pull = evidence.pose_innovations[state]
+    kind = max(evidence.pose_noise, key=lambda name: evidence.pose_noise[name])
+    factor = evidence.pose_noise[kind]
     yield judge(
-        "pose noise", "poses", pull, _POSE_PULL_LIMIT, "sigmas",
-        fine="the poses are as good as pose_noise says, or better",
-        wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map "
-        f"are too small; state a larger {_POSE_KEYS.get(state, 'position_m')}",
+        "pose noise", "poses", factor, _POSE_NOISE_LIMIT, "",
+        fine=f"the poses err {factor:.1f} times as much as pose_noise says, which map and tests allow for",
+        wrong=f"the poses err {factor:.1f} times as much as pose_noise.{kind} says: state it, or find out "
+        "why the receiver, or its clock, is worse than it says",
         status=Status.WARN,
     )  # fmt: skip
     yield judge(
@@ -332,8 +331,8 @@ def _words(one: Contradiction) -> str:
             return f"the ground {way} by {100 * size:.1f} % to both sides of the route, as on a crown"
         case Fault.COURSE:
             return (
-                f"the heading is the course of a point {size:.1f} m {'ahead of' if one.value > 0 else 'behind'} "
-                "the rear axle, not that of the vehicle"
+                f"the heading is not the vehicle's, but the course of a point {size:.1f} m "
+                f"{'ahead of' if one.value > 0 else 'behind'} the rear axle"
             )
         case Fault.STEP:
             axis = _MAP_AXES[one.axis]
@@ -341,7 +340,8 @@ def _words(one: Contradiction) -> str:
         case Fault.KNOCK:
             turned = ("in roll", "in pitch", "in yaw")[one.axis]
             cause = "by load" if len(one.cameras) > 1 else "as by a knock"
-            return f"the mounting of {whose} is turned by {np.rad2deg(size):.1f} deg {turned} {one.about}, {cause}"
+            by = f"{np.rad2deg(size):.1f} deg {turned}"
+            return f"the mounting of {whose} is turned by {by} {one.about}, {cause}"
         case Fault.FOCAL:
             longer = "longer" if one.value > 0 else "shorter"
             return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"

@@ -1,0 +1,178 @@
+"""PASS means a goal: how well map and mountings have to be known, by what they state of themselves."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from v2hdm.pipeline.finished import RunResult
+
+from tests.mapping.scene import extrinsic
+from tests.verdict.test_solution import INFO, square_at
+from v2hdm.cli import terminal
+from v2hdm.errors import ConfigError
+from v2hdm.geometry.rigid import camera_centre, exp
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.results import AdjustedPoses, MethodResult
+from v2hdm.pipeline.config import RunConfig, check_choice
+from v2hdm.pipeline.map_drive import map_drive
+from v2hdm.records import Calibration, FloatArray, HdMap, Marking
+from v2hdm.site.candidates import Exclusion
+from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.verdict import Finding, Status, Verdict
+from v2hdm.verdict.results.goal import check_goal, ground_ahead, worst_corner_m
+
+SURE = np.diag([0.003**2] * 3 + [1e-4**2] * 3)
+
+
+def marking(number: int, shared_m: float = 0.01, own_m: float = 0.002) -> Marking:
+    """A marking whose corners share an error, and have one of their own; sigmas of a coordinate."""
+    covariance = shared_m**2 * np.kron(np.ones((4, 4)), np.eye(2)) + own_m**2 * np.eye(8)
+    return replace(square_at(3.0 * number, 0.0), covariance_m2=covariance, relative_sigma_m=own_m)
+
+
+def mounted(covariance: FloatArray | None = SURE, pitch_deg: float = 15.0) -> Calibration:
+    return Calibration(INFO, extrinsic(10.0, pitch_deg, 2.0, (1.0, 0.2, 2.4)), covariance)
+
+
+def mapped(
+    markings: list[Marking], calibration: Calibration | None = None, position_m: float = 0.003
+) -> MethodResult:
+    still = np.tile(np.eye(4), (5, 1, 1))
+    sigma, seen = np.full((5, 6), position_m), np.ones(5, dtype=bool)
+    poses = AdjustedPoses(np.arange(5.0), still, still, sigma, seen, {}, np.zeros(5, dtype=np.int64))
+    calibrations = {"front": calibration or mounted()}
+    return MethodResult("Opt", ("front",), HdMap(tuple(markings)), calibrations, poses=poses)
+
+
+def judged(one: MethodResult, goal_m: float = 0.05) -> Verdict:
+    return Verdict.of(check_goal(one, goal_m, "poses"))
+
+
+def of_map(one: MethodResult, goal_m: float = 0.05) -> Finding:
+    return next(finding for finding in judged(one, goal_m).findings if finding.about == "map")
+
+
+def test_a_good_map_passes_and_says_how_good_it_is_first() -> None:
+    verdict = judged(mapped([marking(n) for n in range(40)]))
+    says = (
+        "95 % of 40 markings within 2.5 cm in the frame of the poses, 0.5 cm from marking to marking; "
+        "goal 5 cm"
+    )
+    assert verdict.headline == f"PASS: {says}"
+    assert verdict.lines == (f"verdict: PASS (nothing raised, 2 checks passed): {says}",)
+    assert verdict.as_json()["headline"] == verdict.headline
+
+
+def test_a_straight_drive_with_70_cm_of_uncertainty_is_no_pass_and_names_the_mounting() -> None:
+    straight = mounted(np.diag([0.28**2] * 3 + [1e-4**2] * 3))
+    verdict = judged(mapped([marking(n, shared_m=0.28) for n in range(34)], straight))
+    assert verdict.status is Status.WARN
+    assert verdict.headline.startswith(
+        "WARN: 95 % of 34 markings within 69 cm in the frame of the poses, 0.5 cm"
+    )
+    says = {finding.about: finding.says for finding in verdict.raised}
+    assert "0 % of them meet it; the largest part" in says["map"]
+    assert all("drive a turn, or survey the camera's place" in one for one in says.values())
+
+
+@pytest.mark.parametrize(("coarse", "status"), [(5, Status.PASS), (6, Status.WARN)])
+def test_one_marking_in_twenty_may_miss_the_goal(coarse: int, status: Status) -> None:
+    markings = [marking(n, own_m=0.002 if n >= coarse else 0.05) for n in range(100)]
+    found = of_map(mapped(markings))
+    assert found.status is status
+    assert (found.limit, found.unit) == (5.0, "cm")
+    if status is Status.WARN:
+        assert "94 % of them meet it" in found.says
+        assert "is each marking's own views: pass them nearer" in found.says
+
+
+def test_poses_that_drift_are_named_as_the_largest_part() -> None:
+    found = of_map(mapped([marking(n, shared_m=0.05) for n in range(30)], position_m=0.045))
+    assert "the largest part, 11 cm, is the poses: tie them down by mapping.survey" in found.says
+
+
+def test_what_the_map_leaves_out_as_too_uncertain_is_said_beside_the_share() -> None:
+    left_out = (
+        Exclusion("diamond", np.zeros(2), 3, TOO_UNCERTAIN),
+        Exclusion("diamond", np.zeros(2), 3, "odd"),
+    )
+    one = replace(mapped([marking(n) for n in range(9)]), excluded=left_out)
+    assert judged(one).headline.endswith("goal 5 cm; 1 more left out as too uncertain")
+
+
+def test_what_states_no_covariance_promises_nothing() -> None:
+    unknown = [replace(marking(n), covariance_m2=None, relative_sigma_m=None) for n in range(3)]
+    for one in (mapped(unknown), mapped(unknown, mounted(None))):
+        verdict = judged(one)
+        assert verdict.status is Status.WARN
+        assert "within an unknown distance" in verdict.headline
+        json.dumps(verdict.as_json(), allow_nan=False)
+    assert "it saw no marking" in next(f.says for f in judged(one).raised if f.about == "front")
+
+
+def test_the_terminal_ends_with_how_good_the_map_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verdict = judged(mapped([marking(n, shared_m=0.05) for n in range(30)]))
+    result = RunResult(Path("out"), {"results": {}}, (), verdict)
+    monkeypatch.setattr(terminal, "run", lambda *_: result)
+    assert terminal.run_on_terminal(RunConfig(name="yard"), "") is verdict
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert [line.split(":")[0] for line in lines] == ["WARN coarse (map)", "results in out", "verdict"]
+    assert "95 % of 30 markings within 12 cm" in lines[-1]
+
+
+def test_a_failed_run_promises_no_accuracy() -> None:
+    wrong = Finding("focal length", Status.FAIL, 40.0, 5.0, "sigmas", "4.5 % shorter: mend it", "front")
+    verdict = Verdict.of([*check_goal(mapped([marking(1)]), 0.05, "poses"), wrong])
+    assert verdict.headline == "FAIL: no accuracy can be promised, see focal length (front)"
+    assert verdict.lines[0].startswith("verdict: FAIL (1 finding, 2 checks passed): no accuracy")
+
+
+def test_checks_without_a_map_have_no_headline() -> None:
+    verdict = Verdict.of([Finding("clock", Status.PASS, 1.0, 15.0, "ms", "on one clock", "front")])
+    assert verdict.headline == ""
+    assert verdict.lines == ("verdict: PASS (nothing raised, 1 checks passed)",)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 0.5, 0.8, 1.0])
+def test_of_a_hundred_corners_95_are_within_the_radius(ratio: float) -> None:
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    worst = turn @ np.diag([0.02, 0.02 * ratio]) ** 2 @ turn.T
+    covariance = np.zeros((8, 8))
+    covariance[2:4, 2:4] = worst
+    radius_m = worst_corner_m(replace(marking(0), covariance_m2=covariance))
+    errors = np.random.default_rng(1).normal(size=(400_000, 2)) * [0.02, 0.02 * ratio]
+    assert np.mean(np.hypot(*errors.T) < radius_m) == pytest.approx(0.95, abs=0.002)
+
+
+@pytest.mark.parametrize(("pitch_deg", "ahead_m"), [(2.0, 10.0), (-5.0, 10.0), (20.0, 6.59), (90.0, 0.0)])
+def test_a_mounting_moves_the_ground_ahead_as_far_as_its_covariance_says(
+    pitch_deg: float, ahead_m: float
+) -> None:
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(6, 6)) * ([[0.01]] * 3 + [[0.001]] * 3)
+    calibration = mounted(root @ root.T, pitch_deg)
+    cam_from_vehicle = calibration.cam_from_vehicle
+    centre, axis = camera_centre(cam_from_vehicle), cam_from_vehicle[2, :3]
+    level = axis[:2] / max(float(np.hypot(*axis[:2])), 1e-12)
+    ground = np.append(centre[:2] + ahead_m * level, 0.0)
+    ray_cam = cam_from_vehicle[:3, :3] @ (ground - centre)
+    moved = np.stack([exp(root @ one) @ cam_from_vehicle for one in rng.normal(size=(4000, 6))])
+    rays, centres = np.einsum("nji,j->ni", moved[:, :3, :3], ray_cam), camera_centre(moved)
+    hit = centres[:, :2] - rays[:, :2] * (centres[:, 2] / rays[:, 2])[:, None]
+    off_m = np.linalg.norm(hit - ground[:2], axis=1)
+    assert ground_ahead(calibration)[0] == pytest.approx(np.quantile(off_m, 0.95), rel=0.06)
+
+
+@pytest.mark.parametrize("goal_cm", [0.0, -1.0, math.nan, math.inf])
+def test_a_goal_without_size_is_refused_before_any_work(goal_cm: float) -> None:
+    with pytest.raises(ConfigError, match=r"accuracy_goal_cm is .*: set more than 0"):
+        check_choice(MappingOptions(), 1, False, goal_cm)
+    with pytest.raises(ConfigError, match="accuracy_goal_cm"):
+        map_drive("no such drive", accuracy_goal_cm=goal_cm)
