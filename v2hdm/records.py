@@ -117,7 +117,7 @@ class PoseNoise:
     heading_drift_rad: float = 0.0
     heading_drift_over_m: float = 5.0
     roll_pitch_drift_rad: float = 0.0
-    roll_pitch_drift_over_m: float = 1.0
+    roll_pitch_drift_over_m: float = 5.0
 
     @classmethod
     def as_far_as_stated(cls, **stated: float) -> PoseNoise:

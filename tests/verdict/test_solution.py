@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from tests.cameras import mounted
 from tests.mapping.scene import SceneOptions, make_scene
@@ -19,8 +20,14 @@ from v2hdm.verdict.results.solution import check_inputs, check_solution
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02, bias_px=0.03)
-CLOCK = Contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
-LEVER = Contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
+
+
+def contradiction(fault, cameras, axis, about, value, sigma, sigmas):
+    return Contradiction(fault, cameras, axis, about, value, sigma, 2 * norm.sf(sigmas), sigmas**2 / 2, 0.5)
+
+
+CLOCK = contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
+LEVER = contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
 FINE = SolveEvidence(
     score_tests=(CLOCK, LEVER),
     corrected=(),
@@ -30,7 +37,7 @@ FINE = SolveEvidence(
     variance_factor=0.15,
     along_route=np.array([0.15, 0.2, 0.15]),
     window_s=np.array([0.0, 5.0, 10.0]),
-    pose_innovations={"x": 0.7, "heading": 0.8},
+    pose_noise={"position_m": 0.7, "heading_rad": 0.8},
     worst_innovation=3.0,
     worst_innovation_s=4.0,
 )
@@ -56,7 +63,7 @@ def test_a_clean_result_raises_nothing(drive):
 
 
 def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
-    dropped = replace(LEVER, value=-1.2, sigmas=70.0)
+    dropped = replace(LEVER, value=-1.2, p_value=1e-200)
     found = raised(result(replace(FINE, corrected=(dropped,))), drive)
     assert found["survey"].status is Status.WARN
     assert "antenna" in found["survey"].says
@@ -64,8 +71,8 @@ def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
 
 
 def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive):
-    focal = Contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
-    late = replace(CLOCK, value=0.2, sigmas=20.0)
+    focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
+    late = replace(CLOCK, value=0.2, p_value=1e-80)
     evidence = replace(FINE, score_tests=(focal, late, LEVER), held_out={"heave": 9.0})
     found = raised(result(evidence), drive)
     assert set(found) == {"focal length", "held out"}, "the clock explains less of the same residuals"
@@ -75,14 +82,14 @@ def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(driv
 
 
 def test_a_rival_that_explains_as_much_is_named_as_well():
-    one = Contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 41.0)
-    other = Contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 39.0)
+    one = contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
+    other = contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)
     finding = check_inputs(replace(FINE, score_tests=(one, other)))[0]
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
 def test_a_small_contradiction_is_none_however_sure_it_is():
-    tiny = replace(CLOCK, value=0.0008, sigma=0.0001, sigmas=8.0)
+    tiny = replace(CLOCK, value=0.0008, sigma=0.0001, p_value=1e-15)
     assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, score_tests=(tiny,))))
 
 
@@ -100,7 +107,7 @@ def test_a_straight_drive_says_what_it_cannot_tell():
         ("fit along the route", {"along_route": np.array([0.15, 3.0, 0.15])}),
         ("rejected", {"fits": {"front": replace(FIT, rejected_share=0.14)}}),
         ("held out", {"held_out": {"heave": 6.5}}),
-        ("pose noise", {"pose_innovations": {"heading": 4.0}}),
+        ("pose noise", {"pose_noise": {"heading_rad": 4.0}}),
         ("pose jump", {"worst_innovation": 20.0}),
     ],
 )

@@ -54,13 +54,14 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     )
 
 
-# Least step between frames, as a fraction of the correlation length.
-_MIN_STEP = 1e-4
+MIN_STEP = 1e-4
+"""Least step between frames, as a fraction of the distance over which a drift fades."""
+
 # Below this share of an error its white part is rounding left over from the drift.
 _MIN_WHITE_SHARE = 1e-3
 
 
-def _state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
+def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
     """The states of a frame: for each error its white part, then its drift, where there are any.
 
     All visits have the same states; what only others have is rounding in a visit's own, and none outlasts its
@@ -89,7 +90,7 @@ def _state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArr
     memory = np.zeros((len(poses), len(columns)))
     fades = np.arange(len(columns)) >= len(scattering)
     # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
-    faded = np.exp(-np.maximum(step_m[:, None] / over_m[visit][1:, fading], _MIN_STEP))
+    faded = np.exp(-np.maximum(step_m[:, None] / over_m[visit][1:, fading], MIN_STEP))
     memory[1:, fades] = (np.diff(visit) == 0)[:, None] * faded
     turn = np.tile(np.eye(6), (max(len(poses) - 1, 0), 1, 1))
     turn[:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
@@ -127,7 +128,7 @@ def make_arrays(
     order, corner, pair = _sorted_observations(seen, rank, len(problem.map_from_vehicle))
     measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
     whiten_observations(seen, order, measured, root)
-    states, transition, information_root = _state_prior(problem, pose_states)
+    states, transition, information_root = state_prior(problem, pose_states)
     # Without a survey the information is 0.
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
     if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
