@@ -70,7 +70,14 @@ def test_what_is_saved_is_what_the_command_writes(names, tmp_path):
 
     saved = names["result"].save(tmp_path / "saved")
     drive = f"drive.path={names['port'].root}"
-    given = [drive, "name=run", f"output={tmp_path}", f"cache={tmp_path / 'cache'}", "workers=1"]
+    given = [
+        drive,
+        "name=run",
+        f"output={tmp_path}",
+        f"cache={tmp_path / 'cache'}",
+        "workers=1",
+        "accuracy_goal_cm=10",
+    ]
     assert run(["map", *given]) == 0
     written = {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*") if path.is_file()}
     of_runs = {Path("config.yaml"), Path("run.log")}

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from v2hdm.adjust import Status, estimate_noise, select_model, solve
+from v2hdm.adjust import PoseSigma, Status, estimate_noise, select_model, solve
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -227,16 +227,13 @@ class Optimiser:
         return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
-        """The solve under the attitude's and the height's noise that ``bundle`` shows, whatever was stated.
+        """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
 
         The positions' stays as stated: images do not see what moves the vehicle and its map alike.
         """
         stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
-        self._pose_sigma = tuple(
-            replace(own, position_m=one.position_m, position_drift=one.position_drift)
-            for own, one in zip(self._own_noise, stated, strict=True)
-        )
+        self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
         bundle = self._solve(bundle.association, self._usable(bundle.association, bundle.rig), bundle.rig)
         self._reweigh(bundle)
         return bundle
@@ -272,6 +269,17 @@ class Optimiser:
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
+
+
+def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
+    """``stated``, with the noise of height, attitude or heading that a drive shows where that is larger."""
+    kinds = {
+        "height_m": ("height_m",),
+        "roll_pitch_rad": ("roll_pitch_rad", "roll_pitch_drift"),
+        "heading_rad": ("heading_rad", "heading_drift"),
+    }
+    larger = [names for kind, names in kinds.items() if getattr(own, kind) > getattr(stated, kind)]
+    return replace(stated, **{name: getattr(own, name) for names in larger for name in names})
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:

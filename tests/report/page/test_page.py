@@ -38,7 +38,7 @@ def page(drive, result):
 
 
 def test_the_page_begins_with_how_good_the_map_is(page, result, drive):
-    assert page.verdict.headline == "95 % of 12 markings within 2.1 cm; goal 5 cm"
+    assert page.headline == "95 % of 12 markings within 2.1 cm; goal 5 cm"
     text = write_page(result, drive).read_text()
     first = re.search(r'class="says">([^<]*)<', text)
     assert first[1] == "95 % of 12 markings within 2.1 cm; goal 5 cm."
