@@ -10,7 +10,7 @@ import pytest
 from v2hdm.site.candidates import Candidates, Counts
 from v2hdm.site.markings import Classified, classify
 from v2hdm.site.options import AcceptanceOptions
-from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
+from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, PIECE, Posterior, posterior
 from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
@@ -300,3 +300,23 @@ def test_a_place_less_certain_than_allowed_is_left_out() -> None:
     candidates = solved(painted([DIAMOND] * 20, rng), rng)
     candidates.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
     assert verdict(candidates).verdict[3] == "its position is too uncertain"
+
+
+def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diamond() -> None:
+    rng = np.random.default_rng(16)
+    true = painted([DIAMOND] * 40, rng)
+    candidates = solved(true, rng)
+    # A barrier stands on two adjacent sides: .7 of one extent and .5 of the other are left to be seen.
+    kept, u, v = true[7, 0].copy(), true[7, 1] - true[7, 0], true[7, 3] - true[7, 0]
+    candidates.corners_map[7] = kept + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
+    found = of_one_class(candidates)
+    assert found.probability[7, PIECE] > 0.8
+    assert normalised(found, true)[7] < 20
+
+
+def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first() -> None:
+    rng = np.random.default_rng(17)
+    true = painted([DIAMOND] * 30 + [0.7 * DIAMOND] * 10, rng)
+    found = of_one_class(solved(true, rng))
+    assert (found.probability[:, OF_CLASS] > 0.9).all()
+    assert shape_rmse(found.candidates.corners_map, true) < 0.02
