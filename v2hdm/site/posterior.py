@@ -38,6 +38,8 @@ OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, PIECE, OWN_SHAPE, PART_OF_SYMBO
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
 
+_KINDS = len(_PRIOR_COUNT)
+
 _SIZE_SIGMA_M = 1.0
 """Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
 
@@ -51,7 +53,7 @@ _WORN_SHARE = 0.5
 """The same as a share of the length, where a whole stretch is worn away: any part of a marking may be."""
 
 _CUT_SHARE = 0.1
-"""Share of the breadth, one sigma, by which a corner of a piece lies off its sides: a cut is seldom parallel."""
+"""Share of the breadth, one sigma, by which a corner of a piece lies off its sides: cuts are not parallel."""
 
 _RUN_ON_M = 1.0
 """Sigma, m, of an end that runs on into other paint: letters and lines are about as long."""
@@ -113,7 +115,11 @@ class Posterior:
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
     """The posterior of G candidates of classes ``kind`` (G,), given where and how often they were seen."""
     total = len(candidates)
-    probability, log_odds, evidence = np.zeros((total, len(_PRIOR_COUNT))), np.zeros(total), np.zeros((total, 4))
+    probability, log_odds, evidence = (
+        np.zeros((total, len(_PRIOR_COUNT))),
+        np.zeros(total),
+        np.zeros((total, 4)),
+    )
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
@@ -135,7 +141,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
         joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
         joint += sources.sum(axis=0)[:, np.maximum(by_kind - OWN_SHAPE, 0)].T
         each = np.exp(joint - logsumexp(joint, axis=0))
-        probability = np.stack([each[by_kind == one].sum(axis=0) for one in range(len(_PRIOR_COUNT))], axis=1)
+        probability = np.stack([each[by_kind == one].sum(axis=0) for one in range(_KINDS)], axis=1)
         weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
