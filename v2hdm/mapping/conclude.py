@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, 
 from v2hdm.site.candidates import Candidates, Dissent, Exclusion, with_dissent, with_shared_errors
 from v2hdm.site.markings import Support, classify, with_relative_sigma
 from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.suspicion import Suspicion, most_suspicious
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Optimised:
     ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``;
     ``usable`` (S, 4) are the accepted corner observations. Reprojection errors are root mean squares
     over the points seen of the accepted markings, under the optimised and the initial extrinsics.
+    ``suspicions`` are of the most suspicious markings, the worst first.
     """
 
     bundle: Bundle
@@ -52,6 +54,7 @@ class Optimised:
     calibrations: Mapping[str, Calibration]
     reprojection_rmse_px: float
     initial_reprojection_rmse_px: float
+    suspicions: Sequence[Suspicion] = ()
 
 
 def conclude(
@@ -87,6 +90,7 @@ def conclude(
         final.corner_index[classified.accepted],
         lambda pairs: scale * final.solution.corner_covariance(pairs),
     )
+    squared = np.bincount(final.group, final.solution.mahalanobis2, len(classified.kind)).astype(np.float64)
     used = np.isin(final.group, classified.accepted) & evidence.sightings.valid[final.row, final.own_corner]
     at_start = _residuals_under(initial_rig, evidence.sightings, final, jitter_rad)
     return Optimised(
@@ -106,6 +110,7 @@ def conclude(
         },
         reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
         initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
+        suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
     )
 
 

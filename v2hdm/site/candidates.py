@@ -43,7 +43,7 @@ class Candidates:
 
         One without any corner lies at its ``about`` (G, 2).
         """
-        unseen = np.asarray(np.isnan(corners_map).any(axis=2))
+        unseen: BoolArray = np.isnan(corners_map).any(axis=2)
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
         centre = np.where(unseen.all(axis=1)[:, None], about, centre)
@@ -139,9 +139,8 @@ def with_dissent(candidates: Candidates, fused: FusedGroups, dissent: Dissent) -
     )
     moved = np.zeros((sightings.shape[1], 4, 2))
     moved[number.ravel(), dissent.corner[usable]] = np.sqrt(share)[:, None] * off
-    moved = moved.reshape(-1, 8)
-    covariance = candidates.covariance_m2.copy()
-    np.add.at(covariance, sightings[0], moved[:, :, None] * moved[:, None, :])
+    covariance, ways = candidates.covariance_m2.copy(), moved.reshape(-1, 8)
+    np.add.at(covariance, sightings[0], ways[:, :, None] * ways[:, None, :])
     return Candidates(candidates.corners_map, covariance)
 
 

@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.special import betaln, logsumexp
-from scipy.stats import norm
+from scipy.stats import f, norm
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
@@ -76,7 +76,7 @@ _CLUTTER_REPEATS = 0.7
 _AGREEING = (0.93, 0.6)
 """Share of the observations of a marking, and of clutter, that agree with the joint solution."""
 
-_CORNERS_OF_IMAGE = 4.0
+CORNERS_OF_IMAGE = 4.0
 """Observations that err together: those of one image."""
 
 _UNDER_SYMBOL = (0.02, 0.5)
@@ -103,13 +103,15 @@ class Posterior:
 
     ``probability`` (G, 8) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
     of a marking. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
-    images show it, how many of its easy views, and how well they agree.
+    images show it, how many of its easy views, and how well they agree. ``misfit`` (G,) is the p-value of its
+    deviation from its class's nearest shape, 1 where the class has none.
     """
 
     probability: FloatArray
     log_odds: FloatArray
     candidates: Candidates
     evidence: FloatArray
+    misfit: FloatArray
 
 
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
@@ -121,12 +123,14 @@ def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posteri
         np.zeros((total, 4)),
     )
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
+    misfit = np.ones(total)
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
         found = _of_class(candidates.subset(own), counts.subset(own))
         probability[own], log_odds[own], evidence[own] = found.probability, found.log_odds, found.evidence
         corners[own], covariance[own] = found.candidates.corners_map, found.candidates.covariance_m2
-    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence)
+        misfit[own] = found.misfit
+    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit)
 
 
 def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
@@ -150,7 +154,10 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
-    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence)
+    like_others = [one.squared for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
+    # A paint error has the tails of Student's t distribution, its square those of Fisher's.
+    misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
+    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
 
 
 def _weight_before(candidates: Candidates, counts: Counts) -> FloatArray:
@@ -173,7 +180,7 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
     under, alone = counts.as_symbol, counts.images
     plain, covered = (under[:, None] * np.log(p) + alone[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL)
-    rest = np.hstack([right, right, wrong]) / _CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
+    rest = np.hstack([right, right, wrong]) / CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
     return np.stack([shown, found, rest])
 
 
@@ -229,14 +236,25 @@ class _Hypothesis:
         """Covariance (N, 5, 5) of the residual by that of the solved corners alone."""
         return _within(self.directions, self.candidates.covariance_m2)
 
+    @cached_property
+    def _innovation(self) -> FloatArray:
+        innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
+        return np.asarray(innovation + self.paint_m2 * np.eye(5))
+
+    @cached_property
+    def _solved(self) -> FloatArray:
+        return np.asarray(np.linalg.solve(self._innovation, self.residual[..., None])[..., 0])
+
+    @property
+    def squared(self) -> FloatArray:
+        """Squared residual (N,), in sigmas."""
+        return np.asarray(np.sum(self.residual * self._solved, axis=1))
+
     @property
     def log_likelihood(self) -> FloatArray:
         """Marginal likelihood (N,) of the residual."""
-        innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
-        innovation = innovation + self.paint_m2 * np.eye(5)
-        solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
-        squared = np.sum(self.residual * solved, axis=1)
-        both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
+        innovation, solved = self._innovation, self._solved
+        both_ways = -0.5 * (self.squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
         if self.one_way is None:
             return np.asarray(both_ways)
         moved = self.directions @ self.one_way
@@ -309,9 +327,11 @@ def _hypotheses(
                 weight = part * likely / len(ends) / len(ways) / len(cuts)
                 add(WRONG_END, weight, laid, size, _outer(way) + cut, way[..., None])
         for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
-            ways = _WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2)
-            cut = _slanted(laid.corners_map, one + other_end, _CUT_SHARE)
-            add(PIECE, part / 4, laid, scatter, ways @ np.swapaxes(ways, 1, 2) + cut, ways)
+            both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
+            misplaced = both @ np.swapaxes(both, 1, 2) + _slanted(
+                laid.corners_map, one + other_end, _CUT_SHARE
+            )
+            add(PIECE, part / 4, laid, scatter, misplaced, both)
         for moved in _CORNERS_MOVED:
             block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
             add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))

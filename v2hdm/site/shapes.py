@@ -176,7 +176,7 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
     while len(whole) >= _FEWEST_MEMBERS:
         left = candidates.subset(whole)
         corners, members = _commonest(left)
-        count = np.count_nonzero(members)
+        count = int(np.count_nonzero(members))
         if count < _FEWEST_MEMBERS:
             break
         spread_m, about_m = _spread_m(corners, left.subset(members))
