@@ -92,6 +92,7 @@ def test_pointing_names_the_marking_and_selecting_shows_its_images(
 ) -> None:
     with opened(browser, report, width, height) as watched:
         page = watched.page
+        assert page.locator("#suspicious .shots figure").count() == 1
         page.locator("#map").scroll_into_view_if_needed()
         for number, place in enumerate(PLACES, start=1):
             page.mouse.move(*page.evaluate(ON_SCREEN, place.tolist()))
@@ -109,7 +110,7 @@ def test_pointing_names_the_marking_and_selecting_shows_its_images(
             shots = page.locator("#details .shots figure")
             assert shots.count() == 2
             assert "front/" in shots.first.inner_text()
-            size = page.evaluate("document.querySelector('.shots image').getBBox().width")
+            size = page.evaluate("document.querySelector('#details .shots image').getBBox().width")
             assert size > 30
         is_quiet(watched)
 
