@@ -315,10 +315,9 @@ def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diam
     assert normalised(found, true)[7] < 20
 
 
-@pytest.mark.parametrize("few", [3, 12])
-def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first(few: int) -> None:
+def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first() -> None:
     rng = np.random.default_rng(17)
-    true = painted([DIAMOND] * 40 + [0.7 * DIAMOND] * few, rng)
+    true = painted([DIAMOND] * 40 + [0.7 * DIAMOND] * 12, rng)
     found = of_one_class(solved(true, rng))
     assert (found.probability[:, OF_CLASS] > 0.9).all()
     assert shape_rmse(found.candidates.corners_map, true) < 0.02

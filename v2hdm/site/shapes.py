@@ -31,7 +31,8 @@ _LEAST_MEMBERS = 8
 """Markings of one shape from which the shape is one of the class."""
 
 _FEWEST_MEMBERS = 3
-"""The same where they agree as only one stencil makes them: from three on, two agree against a third one."""
+"""The same where they are half of the class or more, and agree as only one stencil makes them: from three on,
+two agree against a third one. Beside a commoner shape, pieces of it are soon alike by threes."""
 
 _STENCIL_M = 0.03
 """Sigma of a corner's coordinate about a shape, m, up to which markings agree so: a brush's width."""
@@ -181,8 +182,7 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
             break
         spread_m, about_m = _spread_m(corners, left.subset(members))
         shape = Shape(corners, spread_m * _predictive(count), count / len(candidates))
-        # Rolled paint has lengths of its own, of which three are soon alike.
-        if count < least and (shape.is_elongated or about_m > _STENCIL_M):
+        if count < least and (shapes or 2 * count < len(whole) or about_m > _STENCIL_M):
             break
         shapes.append(shape)
         whole = whole[~members]
