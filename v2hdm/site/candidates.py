@@ -43,10 +43,10 @@ class Candidates:
 
         One without any corner lies at its ``about`` (G, 2).
         """
-        unseen: BoolArray = np.isnan(corners_map).any(axis=2)
+        unseen = np.isnan(corners_map[..., 0]) | np.isnan(corners_map[..., 1])
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
-        centre = np.where(unseen.all(axis=1)[:, None], about, centre)
+        centre = np.where(np.all(unseen, axis=1)[:, None], about, centre)
         rows = np.repeat(unseen, 2, axis=1)
         covariance = np.where(rows[:, :, None] | rows[:, None, :], _UNSEEN_M2 * np.eye(8), covariance_m2)
         return cls(np.where(unseen[..., None], centre[:, None], corners_map), covariance)
