@@ -35,7 +35,7 @@ from v2hdm.site.shapes import (
 OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, PIECE, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(8)
 """Hypotheses about a candidate; the first six are markings."""
 
-_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
+_PRIOR_COUNT = np.array([14.0, 1.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
 
 _KINDS = len(_PRIOR_COUNT)
@@ -117,13 +117,9 @@ class Posterior:
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
     """The posterior of G candidates of classes ``kind`` (G,), given where and how often they were seen."""
     total = len(candidates)
-    probability, log_odds, evidence = (
-        np.zeros((total, len(_PRIOR_COUNT))),
-        np.zeros(total),
-        np.zeros((total, 4)),
-    )
+    probability, evidence = np.zeros((total, _KINDS)), np.zeros((total, 4))
+    log_odds, misfit = np.zeros(total), np.ones(total)
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
-    misfit = np.ones(total)
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
         found = _of_class(candidates.subset(own), counts.subset(own))
@@ -154,7 +150,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
-    like_others = [one.squared for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
+    like_others = [one.fit[2] for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
     # A paint error has the tails of Student's t distribution, its square those of Fisher's.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
     return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
@@ -237,24 +233,18 @@ class _Hypothesis:
         return _within(self.directions, self.candidates.covariance_m2)
 
     @cached_property
-    def _innovation(self) -> FloatArray:
+    def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Covariance of the residual, its inverse times the residual, and the residual squared, in sigmas."""
         innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
-        return np.asarray(innovation + self.paint_m2 * np.eye(5))
-
-    @cached_property
-    def _solved(self) -> FloatArray:
-        return np.asarray(np.linalg.solve(self._innovation, self.residual[..., None])[..., 0])
-
-    @property
-    def squared(self) -> FloatArray:
-        """Squared residual (N,), in sigmas."""
-        return np.asarray(np.sum(self.residual * self._solved, axis=1))
+        innovation = innovation + self.paint_m2 * np.eye(5)
+        solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
+        return innovation, solved, np.sum(self.residual * solved, axis=1)
 
     @property
     def log_likelihood(self) -> FloatArray:
         """Marginal likelihood (N,) of the residual."""
-        innovation, solved = self._innovation, self._solved
-        both_ways = -0.5 * (self.squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
+        innovation, solved, squared = self.fit
+        both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
         if self.one_way is None:
             return np.asarray(both_ways)
         moved = self.directions @ self.one_way
