@@ -51,6 +51,14 @@ def test_ids_count_the_accepted_candidates_alone() -> None:
     assert found[0].marking == 11
 
 
+def test_residuals_of_a_corner_behind_the_camera_are_suspicious_and_end_in_no_traceback() -> None:
+    squared = usual(np.random.default_rng(4))
+    squared[[3, 5]] = np.nan, np.inf
+    found = most_suspicious(ALL, np.ones(COUNT), squared, counts())
+    assert {one.marking for one in found[:2]} == {4, 6}
+    assert all(np.isfinite(one.p) for one in found)
+
+
 def test_two_markings_have_no_spread_to_be_held_against() -> None:
     found = most_suspicious(ALL[:2], np.ones(COUNT), usual(np.random.default_rng(3)), counts())
     assert [one.p for one in found] == [1.0, 1.0]

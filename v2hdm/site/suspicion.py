@@ -20,6 +20,9 @@ _LISTED = 10
 _LEAST_TO_COMPARE = 3
 """Markings from which their residuals have a spread."""
 
+_LARGEST = 1e9
+"""Variance of residuals, in squared sigmas, beyond which (and below whose inverse) all are alike."""
+
 _PRIOR_FREEDOM = (1.0, 1e4)
 """Between these is the freedom of the prior of a variance: from tails as heavy as Cauchy's to none."""
 
@@ -72,7 +75,8 @@ def _too_large(variance: FloatArray, freedom: FloatArray) -> FloatArray:
     """
     if len(variance) < _LEAST_TO_COMPARE:
         return np.ones(len(variance))
-    off = np.log(np.maximum(variance, 1e-9)) - psi(freedom / 2) + np.log(freedom / 2)
+    variance = np.clip(np.nan_to_num(variance, nan=_LARGEST), 1 / _LARGEST, _LARGEST)
+    off = np.log(variance) - psi(freedom / 2) + np.log(freedom / 2)
     beyond = off.var(ddof=1) - polygamma(1, freedom / 2).mean()
     low, high = _PRIOR_FREEDOM
     beyond = float(np.clip(beyond, polygamma(1, high / 2) * 1.001, polygamma(1, low / 2) * 0.999))
