@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from v2hdm.site.candidates import Candidates, Counts
+from v2hdm.association.groups import FusedGroups
+from v2hdm.site.candidates import Candidates, Counts, Dissent, with_dissent
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
-from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, posterior
+from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, PIECE, posterior
 from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
@@ -277,3 +278,61 @@ def test_a_place_less_certain_than_allowed_is_left_out():
     _, candidates = row(16, [DIAMOND] * 20)
     candidates.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
     assert verdict(candidates).verdict[3] == "its position is too uncertain"
+
+
+def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diamond():
+    rng = np.random.default_rng(16)
+    true = painted([DIAMOND] * 40, rng)
+    candidates = solved(true, rng)
+    # A barrier stands on two adjacent sides: .7 of one extent and .5 of the other are left to be seen.
+    kept, u, v = true[7, 0].copy(), true[7, 1] - true[7, 0], true[7, 3] - true[7, 0]
+    candidates.corners_map[7] = kept + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
+    found = of_one_class(candidates)
+    assert found.probability[7, PIECE] > 0.8
+    assert normalised(found, true)[7] < 20
+
+
+def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first():
+    rng = np.random.default_rng(17)
+    true = painted([DIAMOND] * 40 + [0.7 * DIAMOND] * 12, rng)
+    found = of_one_class(solved(true, rng))
+    assert (found.probability[:, OF_CLASS] > 0.9).all()
+    assert shape_rmse(found.candidates.corners_map, true) < 0.02
+
+
+def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size():
+    rng = np.random.default_rng(18)
+    true = painted([DIAMOND] * 5, rng)
+    candidates = solved(true, rng)
+    kept, u, v = true[2, 0].copy(), true[2, 1] - true[2, 0], true[2, 3] - true[2, 0]
+    candidates.corners_map[2] = kept + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
+    found = of_one_class(candidates)
+    assert (normalised(found, true) < 25).all()
+    assert (found.probability[[0, 1, 3, 4], OF_CLASS] > 0.8).all()
+
+
+def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
+    rng = np.random.default_rng(19)
+    true = painted([DASH] * 3, rng)
+    candidates = solved(true, rng, 0.02)
+    many = FusedGroups(candidates.corners_map, np.tile(1e-4 * np.eye(2), (3, 4, 1, 1)), np.full((3, 4), 9))
+    longer = 0.1 * (true[1, 0] - true[1].mean(axis=0)) / np.linalg.norm(true[1, 0] - true[1].mean(axis=0))
+    # One sighting of a tenth of the information sees the end 10 cm farther, one a metre beyond its reach.
+    dissent = Dissent(
+        row=np.array([5, 6]),
+        group=np.array([1, 2]),
+        corner=np.array([0, 0]),
+        seen_map=np.stack([candidates.corners_map[1, 0] + longer, candidates.corners_map[2, 0] + [2.0, 0]]),
+        covariance_m2=np.tile(9e-4 * np.eye(2), (2, 1, 1)),
+    )
+    found = with_dissent(candidates, many, dissent)
+    added = found.covariance_m2 - candidates.covariance_m2
+    assert np.trace(added[1]) == pytest.approx(0.1 * 0.1**2, rel=0.1)
+    np.testing.assert_allclose(added[1][2:, 2:], 0)
+    np.testing.assert_allclose(added[[0, 2]], 0)
+
+
+def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen():
+    unseen = np.full((1, 4, 2), np.nan)
+    found = Candidates.seen(unseen, np.full((1, 8, 8), np.nan), np.array([[30.0, 4.0]]))
+    np.testing.assert_array_equal(found.corners_map, np.broadcast_to([30.0, 4.0], (1, 4, 2)))

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.association.ground import Views, locate
+from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Candidates, Exclusion, with_shared_errors
+from v2hdm.site.candidates import Candidates, Dissent, Exclusion, with_dissent, with_shared_errors
 from v2hdm.site.markings import Support, classify, with_relative_sigma
 from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.suspicion import Suspicion, most_suspicious
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Optimised:
     ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``;
     ``usable`` (S, 4) are the accepted corner observations. Reprojection errors are root mean squares
     over the points seen of the accepted markings, under the optimised and the initial extrinsics.
+    ``suspicions`` are of the most suspicious markings, the worst first.
     """
 
     bundle: Bundle
@@ -52,6 +54,7 @@ class Optimised:
     calibrations: Mapping[str, Calibration]
     reprojection_rmse_px: float
     initial_reprojection_rmse_px: float
+    suspicions: Sequence[Suspicion] = ()
 
 
 def conclude(
@@ -76,7 +79,9 @@ def conclude(
     located = locate(evidence.sightings, final.rig)
     located.informs[:] &= evidence.usable
     fused = fuse_groups(final.association, located, jitter_rad=0.0)
-    classified = classify(with_shared_errors(_solved_candidates(final), fused), seen, options)
+    solved = _solved_candidates(final, ungated)
+    solved = with_dissent(with_shared_errors(solved, fused), fused, _dissent(evidence, located))
+    classified = classify(solved, seen, options)
     scale = max(1.0, final.solution.chi2_per_dof)
     covariance = final.solution.extrinsic_covariance * scale
     index, names = final.camera_index, evidence.sightings.cameras
@@ -85,6 +90,7 @@ def conclude(
         final.corner_index[classified.accepted],
         lambda pairs: scale * final.solution.corner_covariance(pairs),
     )
+    squared = np.bincount(final.group, final.solution.mahalanobis2, len(classified.kind)).astype(np.float64)
     used = np.isin(final.group, classified.accepted) & evidence.sightings.valid[final.row, final.own_corner]
     at_start = _residuals_under(initial_rig, evidence.sightings, final, jitter_rad)
     return Optimised(
@@ -104,11 +110,27 @@ def conclude(
         },
         reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
         initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
+        suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
     )
 
 
-def _solved_candidates(bundle: Bundle) -> Candidates:
-    """The corners of every group of ``bundle``.
+def _dissent(evidence: Evidence, located: Located) -> Dissent:
+    """The corners seen as points that were left out of the final solve, under its rig."""
+    ungated = evidence.ungated
+    own = ungated.own_corner
+    left_out = np.flatnonzero(~evidence.inlier & evidence.sightings.valid[ungated.row, own])
+    row, own = ungated.row[left_out], own[left_out]
+    return Dissent(
+        row=row,
+        group=ungated.group[left_out],
+        corner=ungated.corner[left_out],
+        seen_map=located.corners_map[row, own],
+        covariance_m2=located.covariance_m2[row, own],
+    )
+
+
+def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
+    """The corners of every group of ``bundle``; one that has lost them all lies where ``ungated`` had it.
 
     Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than stated
     make the map less certain than the noise model claims.
@@ -125,7 +147,10 @@ def _solved_candidates(bundle: Bundle) -> Candidates:
         rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
         blocks = scale * bundle.solution.corner_covariance(indices)
         covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
-    return Candidates.seen(bundle.corners_map, covariance)
+    before = ungated.corners_map
+    count = np.maximum(np.isfinite(before[..., 0]).sum(axis=1), 1)
+    about = np.nansum(before, axis=1) / count[:, None]
+    return Candidates.seen(bundle.corners_map, covariance, about)
 
 
 def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:

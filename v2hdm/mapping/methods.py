@@ -335,6 +335,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         clocks=clock_offsets(outcome),
         corners=JointCorners(optimised),
         residuals=residuals_of(outcome, optimised),
+        suspicions=optimised.suspicions,
     )
 
 
@@ -360,7 +361,10 @@ def _brought_up_to_date(
     corners, residuals = StatedCorners(hd_map.markings), made.residuals
     if residuals is not None:
         residuals = residuals.renamed(names.id, names.corner)
-    return replace(made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals)
+    suspicions = [replace(one, marking=int(names.id[one.marking - 1])) for one in made.suspicions]
+    return replace(
+        made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals, suspicions=suspicions
+    )
 
 
 def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:

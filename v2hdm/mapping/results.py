@@ -13,6 +13,7 @@ from v2hdm.adjust import Fault, sigmas_of
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 from v2hdm.site.candidates import Exclusion
+from v2hdm.site.suspicion import Suspicion
 
 WINDOW_OBSERVATIONS = 200
 """Observations of a window along the route: their median varies by a tenth by chance."""
@@ -158,6 +159,7 @@ class MethodResult:
         clocks: by visit the offsets of the cameras' clocks, corrections before the solve included.
         corners: how the errors of the map's corners hang together, None where unknown.
         residuals: of the accepted corner observations.
+        suspicions: of the most suspicious markings, the worst first.
         changes: of an earlier map that was brought up to date.
     """
 
@@ -176,4 +178,5 @@ class MethodResult:
     clocks: Sequence[Mapping[str, ClockOffset]] = ({},)
     corners: Corners | None = None
     residuals: Residuals | None = None
+    suspicions: Sequence[Suspicion] = ()
     changes: Changes | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,8 @@ def _own_figures(result: MethodResult) -> dict[str, Any]:
     if result.reprojection_rmse_px is not None:
         figures["reprojection_rmse_px"] = result.reprojection_rmse_px
         figures["initial_reprojection_rmse_px"] = result.initial_reprojection_rmse_px
+    if result.suspicions:
+        figures["suspicious"] = [asdict(one) | {"p": one.p} for one in result.suspicions]
     if result.diagnostics:
         figures["diagnostics"] = dict(result.diagnostics)
     return figures

@@ -20,6 +20,11 @@ small."""
 _KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
 
 
+_OTHER_EDGE_M = 0.3
+"""Sigma, m, of where a sighting sees an edge of the same marking that others do not: a worn end's, as in the
+posterior; what lies farther off is of something else."""
+
+
 @dataclass(frozen=True)
 class Candidates:
     """Corners ``corners_map`` (G, 4, 2), m, of G candidates and their joint covariances (G, 8, 8), m^2.
@@ -31,11 +36,17 @@ class Candidates:
     covariance_m2: FloatArray
 
     @classmethod
-    def seen(cls, corners_map: FloatArray, covariance_m2: FloatArray) -> Candidates:
-        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where one was not seen."""
-        unseen = np.asarray(np.isnan(corners_map).any(axis=2))
+    def seen(
+        cls, corners_map: FloatArray, covariance_m2: FloatArray, about: FloatArray | float = 0.0
+    ) -> Candidates:
+        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where one was not seen.
+
+        One without any corner lies at its ``about`` (G, 2).
+        """
+        unseen = np.isnan(corners_map[..., 0]) | np.isnan(corners_map[..., 1])
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
+        centre = np.where(np.all(unseen, axis=1)[:, None], about, centre)
         rows = np.repeat(unseen, 2, axis=1)
         covariance = np.where(rows[:, :, None] | rows[:, None, :], _UNSEEN_M2 * np.eye(8), covariance_m2)
         return cls(np.where(unseen[..., None], centre[:, None], corners_map), covariance)
@@ -88,6 +99,49 @@ class Exclusion:
     position_map: FloatArray
     sightings: int
     reason: str
+
+
+@dataclass(frozen=True)
+class Dissent:
+    """R corners that the joint solution rejected: candidate ``group`` (R,) and its ``corner`` (R,).
+
+    A sighting ``row`` (R,) saw it at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
+    """
+
+    row: IntArray
+    group: IntArray
+    corner: IntArray
+    seen_map: FloatArray
+    covariance_m2: FloatArray
+
+
+def with_dissent(candidates: Candidates, fused: FusedGroups, dissent: Dissent) -> Candidates:
+    """The candidates (G,), less certain where sightings contradict what ``fused`` ones agree on.
+
+    Most images may see where bright paint ends, and the nearest ones a worn end beyond it. Either is right in
+    proportion to its information, not to a power of it: images of one view err alike. A mixture of two places
+    has the variance p (1 - p) of their distance squared; p is small. Corners of one sighting go together.
+    """
+    off = dissent.seen_map - candidates.corners_map[dissent.group, dissent.corner]
+    away_m = np.linalg.norm(off, axis=1)
+    # x' C^-1 x is the information along the line between both places, times its length squared.
+    agreed = fused.covariance_m2[dissent.group, dissent.corner]
+    usable = fused.valid[dissent.group, dissent.corner] & (away_m < 3 * _OTHER_EDGE_M)
+    usable &= np.isfinite(dissent.covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
+    off, away_m, agreed = off[usable], away_m[usable], agreed[usable]
+    one, all_others = (
+        np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off)
+        for each in (dissent.covariance_m2[usable], agreed)
+    )
+    share = one / (one + all_others) * np.exp(-0.5 * (away_m / _OTHER_EDGE_M) ** 2)
+    sightings, number = np.unique(
+        np.stack([dissent.group, dissent.row])[:, usable], axis=1, return_inverse=True
+    )
+    moved = np.zeros((sightings.shape[1], 4, 2))
+    moved[number.ravel(), dissent.corner[usable]] = np.sqrt(share)[:, None] * off
+    covariance, ways = candidates.covariance_m2.copy(), moved.reshape(-1, 8)
+    np.add.at(covariance, sightings[0], ways[:, :, None] * ways[:, None, :])
+    return Candidates(candidates.corners_map, covariance)
 
 
 def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates:

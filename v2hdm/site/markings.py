@@ -76,11 +76,15 @@ class Support:
 
 @dataclass(frozen=True)
 class Classified:
-    """G candidates, and of each the reason why it is no marking of the map, None if it is one."""
+    """G candidates, and of each the reason why it is no marking of the map, None if it is one.
+
+    ``misfit`` (G,) is that of the posterior.
+    """
 
     kind: tuple[str, ...]
     candidates: Candidates
-    images: IntArray
+    counts: Counts
+    misfit: FloatArray
     verdict: list[str | None]
 
     @property
@@ -105,7 +109,7 @@ class Classified:
             Marking(
                 kind=self.kind[group],
                 corners_map=self.candidates.corners_map[group],
-                sightings=int(self.images[group]),
+                sightings=int(self.counts.images[group]),
                 covariance_m2=self.candidates.covariance_m2[group],
             )
             for group in self.accepted
@@ -117,13 +121,13 @@ class Classified:
             Exclusion(
                 kind=self.kind[group],
                 position_map=self.candidates.corners_map[group].mean(axis=0),
-                sightings=int(self.images[group]),
+                sightings=int(self.counts.images[group]),
                 reason=reason,
             )
             for group, reason in enumerate(self.verdict)
             if reason is not None
             and np.isfinite(self.candidates.corners_map[group]).all()
-            and self.images[group]
+            and self.counts.images[group]
         )
 
 
@@ -147,7 +151,7 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
-    return Classified(seen.names(), found.candidates, counts.images, verdict)
+    return Classified(seen.names(), found.candidates, counts, found.misfit, verdict)
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:

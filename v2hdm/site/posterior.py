@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.special import betaln, logsumexp
-from scipy.stats import norm
+from scipy.stats import f, norm
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
@@ -32,11 +32,13 @@ from v2hdm.site.shapes import (
     parallelograms,
 )
 
-OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
-"""Hypotheses about a candidate; the first five are markings."""
+OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, PIECE, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(8)
+"""Hypotheses about a candidate; the first six are markings."""
 
-_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
+_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
+
+_KINDS = len(_PRIOR_COUNT)
 
 _SIZE_SIGMA_M = 1.0
 """Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
@@ -49,6 +51,9 @@ _MISPLACED_M = 0.3
 
 _WORN_SHARE = 0.5
 """The same as a share of the length, where a whole stretch is worn away: any part of a marking may be."""
+
+_CUT_SHARE = 0.1
+"""Share of the breadth, one sigma, by which a corner of a piece lies off its sides: cuts are not parallel."""
 
 _RUN_ON_M = 1.0
 """Sigma, m, of an end that runs on into other paint: letters and lines are about as long."""
@@ -71,7 +76,7 @@ _CLUTTER_REPEATS = 0.7
 _AGREEING = (0.93, 0.6)
 """Share of the observations of a marking, and of clutter, that agree with the joint solution."""
 
-_CORNERS_OF_IMAGE = 4.0
+CORNERS_OF_IMAGE = 4.0
 """Observations that err together: those of one image."""
 
 _UNDER_SYMBOL = (0.02, 0.5)
@@ -96,28 +101,32 @@ _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECO
 class Posterior:
     """The posterior of G candidates.
 
-    ``probability`` (G, 7) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
+    ``probability`` (G, 8) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
     of a marking. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
-    images show it, how many of its easy views, and how well they agree.
+    images show it, how many of its easy views, and how well they agree. ``misfit`` (G,) is the p-value of its
+    deviation from its class's nearest shape, 1 where the class has none.
     """
 
     probability: FloatArray
     log_odds: FloatArray
     candidates: Candidates
     evidence: FloatArray
+    misfit: FloatArray
 
 
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
     """The posterior of G candidates of classes ``kind`` (G,), given where and how often they were seen."""
     total = len(candidates)
-    probability, log_odds, evidence = np.zeros((total, 7)), np.zeros(total), np.zeros((total, 4))
+    probability, evidence = np.zeros((total, _KINDS)), np.zeros((total, 4))
+    log_odds, misfit = np.zeros(total), np.ones(total)
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
         found = _of_class(candidates.subset(own), counts.subset(own))
         probability[own], log_odds[own], evidence[own] = found.probability, found.log_odds, found.evidence
         corners[own], covariance[own] = found.candidates.corners_map, found.candidates.covariance_m2
-    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence)
+        misfit[own] = found.misfit
+    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit)
 
 
 def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
@@ -132,7 +141,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
         joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
         joint += sources.sum(axis=0)[:, np.maximum(by_kind - OWN_SHAPE, 0)].T
         each = np.exp(joint - logsumexp(joint, axis=0))
-        probability = np.stack([each[by_kind == one].sum(axis=0) for one in range(7)], axis=1)
+        probability = np.stack([each[by_kind == one].sum(axis=0) for one in range(_KINDS)], axis=1)
         weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
@@ -141,7 +150,10 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
-    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence)
+    like_others = [one.fit[2] for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
+    # A paint error has the tails of Student's t distribution, its square those of Fisher's.
+    misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
+    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
 
 
 def _weight_before(candidates: Candidates, counts: Counts) -> FloatArray:
@@ -164,7 +176,7 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
     under, alone = counts.as_symbol, counts.images
     plain, covered = (under[:, None] * np.log(p) + alone[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL)
-    rest = np.hstack([right, right, wrong]) / _CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
+    rest = np.hstack([right, right, wrong]) / CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
     return np.stack([shown, found, rest])
 
 
@@ -201,7 +213,8 @@ class _Hypothesis:
 
     In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
     laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced`` (..., 8,
-    8), only along ``one_way`` (N, 8) if given: paint wears inwards, and runs on outwards.
+    8), only along each of the K columns of ``one_way`` (N, 8, K) if given: paint wears inwards, and runs on
+    outwards.
     """
 
     kind: int
@@ -219,20 +232,27 @@ class _Hypothesis:
         """Covariance (N, 5, 5) of the residual by that of the solved corners alone."""
         return _within(self.directions, self.candidates.covariance_m2)
 
-    @property
-    def log_likelihood(self) -> FloatArray:
-        """Marginal likelihood (N,) of the residual."""
+    @cached_property
+    def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Covariance of the residual, its inverse times the residual, and the residual squared, in sigmas."""
         innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
         innovation = innovation + self.paint_m2 * np.eye(5)
         solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
-        squared = np.sum(self.residual * solved, axis=1)
+        return innovation, solved, np.sum(self.residual * solved, axis=1)
+
+    @property
+    def log_likelihood(self) -> FloatArray:
+        """Marginal likelihood (N,) of the residual."""
+        innovation, solved, squared = self.fit
         both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
         if self.one_way is None:
             return np.asarray(both_ways)
-        moved = (self.directions @ self.one_way[..., None])[..., 0]
-        mean = np.sum(moved * solved, axis=1)
-        held = np.sum(moved * np.linalg.solve(innovation, moved[..., None])[..., 0], axis=1)
-        return np.asarray(both_ways + norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2))
+        moved = self.directions @ self.one_way
+        mean = np.sum(moved * solved[..., None], axis=1)
+        held = np.sum(moved * np.linalg.solve(innovation, moved), axis=1)
+        # Of two ways each by itself: how their errors hang together changes the quadrant by little.
+        inside = norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2)
+        return np.asarray(both_ways + inside.sum(axis=1))
 
     def corners(self, paint_m2: FloatArray) -> Candidates:
         """The corners under the hypothesis (a Kalman update), where edges err by ``paint_m2`` (N,)."""
@@ -295,7 +315,13 @@ def _hypotheses(
             ways = (_MISPLACED_M * end, _WORN_SHARE * extent_m * end, -_RUN_ON_M * end)
             for way, cut, (likely, size) in itertools.product(ways, cuts, lengths):
                 weight = part * likely / len(ends) / len(ways) / len(cuts)
-                add(WRONG_END, weight, laid, size, _outer(way) + cut, way)
+                add(WRONG_END, weight, laid, size, _outer(way) + cut, way[..., None])
+        for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
+            both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
+            misplaced = both @ np.swapaxes(both, 1, 2) + _slanted(
+                laid.corners_map, one + other_end, _CUT_SHARE
+            )
+            add(PIECE, part / 4, laid, scatter, misplaced, both)
         for moved in _CORNERS_MOVED:
             block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
             add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
@@ -331,11 +357,11 @@ def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, Flo
     return [(np.where(first, a[0], b[0]), np.where(first, a[1], b[1])) for a, b in zip(*ways, strict=True)]
 
 
-def _slanted(corners: FloatArray, end: FloatArray) -> FloatArray:
+def _slanted(corners: FloatArray, end: FloatArray, share: float = 0.5) -> FloatArray:
     """Covariance (N, 8, 8), m^2, of an ``end`` cut off at any angle: by half the breadth at 45 degrees."""
     breadth_m = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
     each = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
-    return np.asarray((breadth_m / 2)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))
+    return np.asarray((share * breadth_m)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))
 
 
 def _outer(vectors: FloatArray) -> FloatArray:

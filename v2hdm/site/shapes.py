@@ -30,6 +30,13 @@ from v2hdm.site.candidates import Candidates
 _LEAST_MEMBERS = 8
 """Markings of one shape from which the shape is one of the class."""
 
+_FEWEST_MEMBERS = 3
+"""The same where they are half of the class or more, and agree as only one stencil makes them: from three on,
+two agree against a third one. Beside a commoner shape, pieces of it are soon alike by threes."""
+
+_STENCIL_M = 0.03
+"""Sigma of a corner's coordinate about a shape, m, up to which markings agree so: a brush's width."""
+
 _LEAST_SHARE = 0.1
 """Share of a class's markings from which their shape is one of the class."""
 
@@ -167,15 +174,29 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
     whole = np.flatnonzero(candidates.known.all(axis=1))
     least = max(_LEAST_MEMBERS, _LEAST_SHARE * len(whole))
     shapes: list[Shape] = []
-    while len(whole) >= least:
+    while len(whole) >= _FEWEST_MEMBERS:
         left = candidates.subset(whole)
-        shape, members = _commonest(left)
-        if np.count_nonzero(members) < least:
+        corners, members = _commonest(left)
+        count = int(np.count_nonzero(members))
+        if count < _FEWEST_MEMBERS:
             break
-        sigma_m = _spread_m(shape, left.subset(members))
-        shapes.append(Shape(shape, sigma_m, np.count_nonzero(members) / len(candidates)))
+        spread_m, about_m = _spread_m(corners, left.subset(members))
+        shape = Shape(corners, spread_m * _predictive(count), count / len(candidates))
+        if count < least and (shapes or 2 * count < len(whole) or about_m > _STENCIL_M):
+            break
+        shapes.append(shape)
         whole = whole[~members]
     return tuple(shapes)
+
+
+def _predictive(members: int) -> float:
+    """How much wider than their spread the next one's is after so few members, whose mean and spread err.
+
+    Each has five directions; sigma of Student's t distribution about a mean (Gelman et al., Bayesian Data
+    Analysis, section 3.2).
+    """
+    freedom = 5 * (members - 1)
+    return float(np.sqrt((1 + 1 / members) * freedom / (freedom - 2)))
 
 
 def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
@@ -204,8 +225,8 @@ def _lengths(corners: FloatArray) -> FloatArray:
     return np.concatenate([pairs, diagonals], axis=1)
 
 
-def _spread_m(shape: FloatArray, candidates: Candidates) -> float:
-    """How far members' corners lie from their shape beyond their covariances, by the median."""
+def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
+    """How far members' corners lie from their shape: beyond their covariances, by the median; with them."""
     laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
     directions = laid.directions
     off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
@@ -217,7 +238,7 @@ def _spread_m(shape: FloatArray, candidates: Candidates) -> float:
         innovation = own + sigma_m**2 * np.eye(off.shape[1])
         squared = (np.swapaxes(off, 1, 2) @ np.linalg.solve(innovation, off))[:, 0, 0]
         low, high = (sigma_m, high) if np.median(squared) > wanted else (low, sigma_m)
-    return float(low)
+    return float(low), float(np.sqrt(low**2 + np.median(np.trace(own, axis1=1, axis2=2)) / off.shape[1]))
 
 
 _FREEDOM_BOUNDS = (1.0, 30.0)

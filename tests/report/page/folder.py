@@ -93,6 +93,24 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
             "markings": len(hd_map.markings),
             "reprojection_rmse_px": 0.36,
             "lanes": {"length_m": 12.0},
+            "suspicious": [
+                {
+                    "marking": 2,
+                    "p": 3e-5,
+                    "p_shape": 1e-5,
+                    "p_residuals": 0.4,
+                    "p_sightings": 0.2,
+                    "disputed": 0.25,
+                },
+                {
+                    "marking": 99,
+                    "p": 1.0,
+                    "p_shape": 1.0,
+                    "p_residuals": 1.0,
+                    "p_sightings": 1.0,
+                    "disputed": 0.0,
+                },
+            ],
         }
         metrics = {
             "name": name, "version": "0.1.0", "date": "2026-11-23", "verdict": verdict(status),

@@ -82,6 +82,7 @@ def test_every_layer_changes_the_picture_when_it_is_switched(browser, report):
 def test_pointing_names_the_marking_and_selecting_shows_its_images(browser, report, width, height):
     with opened(browser, report, width, height) as watched:
         page = watched.page
+        assert page.locator("#suspicious .shots figure").count() == 1
         page.locator("#map").scroll_into_view_if_needed()
         for number, place in enumerate(PLACES, start=1):
             page.mouse.move(*page.evaluate(ON_SCREEN, place.tolist()))
@@ -99,7 +100,7 @@ def test_pointing_names_the_marking_and_selecting_shows_its_images(browser, repo
             shots = page.locator("#details .shots figure")
             assert shots.count() == 2
             assert "front/" in shots.first.inner_text()
-            size = page.evaluate("document.querySelector('.shots image').getBBox().width")
+            size = page.evaluate("document.querySelector('#details .shots image').getBBox().width")
             assert size > 30
         is_quiet(watched)
 

@@ -44,6 +44,12 @@ def test_the_page_begins_with_how_good_the_map_is(page, result, drive):
     assert first[1] == "95 % of 12 markings within 2.1 cm; goal 5 cm."
 
 
+def test_suspicious_markings_are_listed_with_their_reason_and_pictures(page):
+    # A marking that is not in the map, such as one that an update of the map has dropped, has no row.
+    assert page.suspicious == {"m2": ["2", "diamond", "3e-05", "shape", "1e-05", "0.4", "0.2", "25"]}
+    assert "m2" in page.pictures
+
+
 def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance():
     turned = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     one = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T

@@ -46,6 +46,7 @@ def document(facts: Facts) -> SimpleNamespace:
         check_points=tables.check_point_table(facts),
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
+        suspicious=_suspicious(facts),
         cameras=tables.camera_pages(facts, overlays(facts)),
         ground=ground_page(facts.folder),
         residuals=charts.residual_charts(facts, residuals) if residuals else {},
@@ -130,3 +131,24 @@ def _json(content: object) -> str:
     """JSON that may stand in a script element: nothing in it ends the element or begins a comment."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def _suspicious(facts: Facts) -> dict[str, list[str]]:
+    """The most suspicious markings, the worst first: cells of a row by the key of their pictures."""
+    kinds = {one.id: one.kind for one in facts.hd_map.markings} if facts.hd_map else {}
+    rows = {}
+    for one in facts.best.get("suspicious") or []:
+        number, tests = (
+            one["marking"],
+            {name: one[f"p_{name}"] for name in ("shape", "residuals", "sightings")},
+        )
+        if number in kinds:
+            cells = [
+                str(number),
+                tables.name_of(kinds[number]),
+                f"{one['p']:.2g}",
+                min(tests, key=tests.__getitem__),
+            ]
+            cells += [*(f"{p:.2g}" for p in tests.values()), f"{100 * one['disputed']:.0f}"]
+            rows[f"m{number}"] = cells
+    return rows

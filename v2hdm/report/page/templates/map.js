@@ -322,6 +322,12 @@
   for (const name of ["ellipses", "arrows"]) layers[name].on("add remove", legend);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
   paint();
+  addEventListener("DOMContentLoaded", () => { // the pictures stand below this script
+    for (const cell of document.querySelectorAll("[data-shots]")) {
+      const shots = picturesOf(cell.dataset.shots).slice(0, 1).map(shot);
+      if (shots.length) cell.replaceChildren(...shots);
+    }
+  });
   byId("map").dataset.ready = String(Math.round(performance.now()));
   window.v2hdmMap = { map, things }; // for tests, and for those who want more of it
 })();
