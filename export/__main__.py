@@ -23,18 +23,16 @@ def _export() -> int:
     from export.config import ExportConfig
     from v2hdm.cli.compose import work_on
 
-    return work_on(_COMMAND, "export", ExportConfig, _run, sys.argv[1:])
+    advice = "`python -m export checkpoint=... output=...`"
+    return work_on(_COMMAND, "export", ExportConfig, _run, sys.argv[1:], advice)
 
 
 def _run(job: Job) -> None:
-    from export.config import ExportConfig
     from export.console import export
-    from v2hdm.cli.compose import to_dataclass
 
-    config = to_dataclass(job.composed, ExportConfig, "`python -m export checkpoint=... output=...`")
-    output = Path(config.output)
-    config.output = str(Path(job.folder(str(output.parent))) / output.name)
-    export(config)
+    output = Path(job.settings.output)
+    job.settings.output = str(Path(job.folder(str(output.parent))) / output.name)
+    export(job.settings)
 
 
 if __name__ == "__main__":

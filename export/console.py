@@ -10,7 +10,7 @@ from export.config import ExportConfig, Precision, check_export
 from export.manifest import record_network
 from export.onnx_file import export_float, export_int8
 from export.source import Source, read_source
-from v2hdm.progress import Share, share_of_work
+from train.bar import Share, share_of_work
 from v2hdm.store.inputs import note_input, refuse_input
 
 

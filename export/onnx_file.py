@@ -22,10 +22,10 @@ from export.parity import Parity, int8_parity, largest_difference
 from export.source import STRIDES, Source, of_checkpoint, weights_not_finite
 from models import MarkingNet, Prediction
 from models.marking_net import MULTIPLE
+from train.bar import Share
 from train.checkpoint import Checkpoint
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
-from v2hdm.progress import Share
 from v2hdm.store.files import whole_file
 
 _PARITY_SEED_OFFSET = 1_000_003

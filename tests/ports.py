@@ -1,7 +1,5 @@
 """The rendered ports that tests share: each is rendered once a run, whichever process asks for it first."""
 
-from __future__ import annotations
-
 import fcntl
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,10 +17,7 @@ ROUTE = [[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]]
 
 
 def short_port() -> PortConfig:
-    """A straight and a bend of the default port, with another vehicle's IPM to start from.
-
-    The default numbers of obstacles are those of a whole port, so there are fewer here.
-    """
+    """A straight and a bend of the default port, fewer obstacles, another vehicle's IPM to start from."""
     route = RouteConfig(pieces=ROUTE, image_spacing_m=1.0)
     yard = YardConfig(parked_trucks=1, barriers=2, lamp_posts=2, moving_trucks=1, shadow_strips=2)
     return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route, yard=yard)
@@ -36,9 +31,7 @@ def small_port(**changes: object) -> PortConfig:
         initial_ipm="estimated",
         route=RouteConfig(pieces=ROUTE, image_spacing_m=2.0),
         yard=YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=1),
-        cameras={
-            "front": replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0),
-        },
+        cameras={"front": replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)},
     )
     return replace(port, **changes)  # type: ignore[arg-type]
 

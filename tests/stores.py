@@ -1,7 +1,5 @@
 """Stores to test against: one in memory, and an S3 server on this machine where moto is installed."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 from collections.abc import Iterator
@@ -10,7 +8,6 @@ from typing import Any
 import fsspec
 import pytest
 
-from v2hdm.store import remote
 from v2hdm.store.remote import RemoteFolder
 
 
@@ -19,12 +16,6 @@ def memory() -> Iterator[RemoteFolder]:
     """An empty store in memory."""
     yield RemoteFolder.at(f"memory://{secrets.token_hex(4)}/place", "output=")
     fsspec.filesystem("memory").store.clear()
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seconds become hundredths."""
-    monkeypatch.setattr(remote, "_WAITS_S", (0.01, 0.01))
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """The commands: a list of them, their versions, and one line for Ctrl-C or a missing library."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -30,86 +28,52 @@ finally:
 """
 
 
-def run_command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_command(folder, *arguments, **variables):
     """A command that finds modules of ``folder`` in place of those of the same name."""
+    environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"} | variables
+    command = [sys.executable, "-m", *arguments]
     return subprocess.run(
-        [sys.executable, "-m", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
-        capture_output=True,
-        text=True,
-        timeout=60,
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=60, check=False
     )
 
 
-@pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM"])
-@pytest.mark.parametrize(
-    ("arguments", "slow"),
-    [
-        (("v2hdm", "map", "+run=port2"), "torch"),
-        (("train",), "torch"),
-        (("train.ship", "runs/gpu"), "onnx"),
-        (("export", "checkpoint=a", "output=b"), "onnx"),
-        (("v2hdm", "mosaic", "outputs/port2"), "torch"),
-        (("v2hdm", "detect", "images"), "cv2"),
-        (("v2hdm", "check", "drive"), "cv2"),
-        (("v2hdm", "report", "results"), "cv2"),
-        (
-            (
-                "v2hdm",
-                "experiment",
-            ),
-            "torch",
-        ),
-        (("v2hdm", "fleet", "drive.yaml"), "ray"),
-        (("v2hdm", "export", "map.geojson", "--format", "csv"), "cv2"),
-        (("v2hdm", "calibrate", "points", "points.csv", "--intrinsics", "a.yaml"), "torch"),
-    ],
-)
-def test_an_interruption_while_libraries_are_loaded_is_one_line(
-    arguments: tuple[str, ...], slow: str, signal: str, tmp_path: Path
-) -> None:
+NEEDED = {
+    "v2hdm map +run=port2": ("map", "torch", "kornia"),
+    "v2hdm experiment": ("map", "torch", "matplotlib"),
+    "v2hdm check drive": ("map", "cv2", "matplotlib"),
+    "v2hdm calibrate points points.csv --intrinsics a.yaml": ("map", "torch", "kornia"),
+    "v2hdm mosaic outputs/port2": ("map", "torch", "kornia"),
+    "v2hdm report results": ("map", "cv2", "jinja2"),
+    "v2hdm fleet drive.yaml": ("fleet", "ray", "ray"),
+    "v2hdm detect images": ("", "cv2", ""),
+    "v2hdm export map.geojson --format csv": ("", "cv2", ""),
+    "train": ("train", "torch", "tensorboard"),
+    "train.ship runs/gpu": ("train", "onnx", "onnx"),
+    "export checkpoint=a output=b": ("train", "onnx", "onnx"),
+}
+"""By command line: the extra that it needs, a library that it loads, and one that the base install lacks."""
+
+
+@pytest.mark.parametrize("number", range(len(NEEDED)))
+def test_an_interruption_while_libraries_are_loaded_is_one_line(number, tmp_path):
+    line, (_, slow, _) = list(NEEDED.items())[number]
+    signal = "SIGINT" if number % 2 else "SIGTERM"
     (tmp_path / f"{slow}.py").write_text(PRESSED_TWICE.format(signal=signal))
-    done = run_command(tmp_path, *arguments)
+    done = run_command(tmp_path, *line.split())
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("error: interrupted")
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "missing", "extra"),
-    [
-        (("v2hdm", "map", "+run=port2"), "torch", "map"),
-        (("v2hdm", "map", "+run=port2"), "kornia", "map"),
-        (
-            (
-                "v2hdm",
-                "experiment",
-            ),
-            "matplotlib",
-            "map",
-        ),
-        (("v2hdm", "check", "drive"), "matplotlib", "map"),
-        (("v2hdm", "calibrate", "points", "points.csv", "--intrinsics", "a.yaml"), "kornia", "map"),
-        (("v2hdm", "mosaic", "outputs/port2"), "kornia", "map"),
-        (("v2hdm", "report", "results"), "jinja2", "map"),
-        (("v2hdm", "fleet", "drive.yaml"), "ray", "fleet"),
-        (("train",), "tensorboard", "train"),
-        (("train.ship", "runs/gpu"), "onnx", "train"),
-        (("export", "checkpoint=a", "output=b"), "onnx", "train"),
-    ],
-)
-def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(
-    arguments: tuple[str, ...], missing: str, extra: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("line", [line for line, (extra, *_) in NEEDED.items() if extra])
+def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(line, tmp_path):
+    extra, _, missing = NEEDED[line]
     text = f'raise ModuleNotFoundError("not installed", name="{missing}")'
     (tmp_path / f"{missing}.py").write_text(text)
-    done = run_command(tmp_path, *arguments)
+    done = run_command(tmp_path, *line.split())
     assert done.returncode == 2, done.stderr
-    called = next(
-        (f"v2hdm {name}" for name in COMMANDS if " ".join(arguments).startswith(f"v2hdm {name}")),
-        f"python -m {arguments[0]}",
-    )
+    own = [f"v2hdm {name}" for name in COMMANDS if line.startswith(f"v2hdm {name}")]
+    (called,) = own or [f"python -m {line.split()[0]}"]
     assert done.stderr.startswith(f"error: {called} needs {missing}: install the {extra} extra")
     assert done.stderr.count("\n") == 1
 
@@ -117,7 +81,7 @@ def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(
 @pytest.mark.parametrize(
     "arguments", [("v2hdm.map", "--help"), ("v2hdm", "detect", "--help"), ("v2hdm", "--help")]
 )
-def test_help_that_nobody_reads_to_its_end_is_no_error(arguments: tuple[str, ...]) -> None:
+def test_help_that_nobody_reads_to_its_end_is_no_error(arguments):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as closed:
@@ -127,23 +91,17 @@ def test_help_that_nobody_reads_to_its_end_is_no_error(arguments: tuple[str, ...
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-@pytest.mark.parametrize(("given", "expected"), [(None, "passive"), ("active", "active")])
-def test_openmp_waits_without_spinning_unless_the_user_says_so(
-    given: str | None, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("given", "expected"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
+def test_openmp_waits_without_spinning_unless_the_user_says_so(given, expected, tmp_path, monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    if given is not None:
-        monkeypatch.setenv("OMP_WAIT_POLICY", given)
     (tmp_path / "torch.py").write_text("import os; raise SystemExit(os.environ['OMP_WAIT_POLICY'])")
-    assert run_command(tmp_path, "v2hdm.map", "+run=port2").stderr.strip() == expected
+    assert run_command(tmp_path, "v2hdm.map", "+run=port2", **given).stderr.strip() == expected
 
 
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 
 
-def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(capsys):
     assert run([]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
     assert {line.split("  ")[1].strip() for line in lines} == set(COMMANDS)
@@ -159,7 +117,7 @@ def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_explains_each_command_and_names_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_explains_each_command_and_names_it(name, capsys):
     with suppress(SystemExit):  # of argparse
         assert run([*name.split(), "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
@@ -167,19 +125,43 @@ def test_help_explains_each_command_and_names_it(name: str, capsys: pytest.Captu
     assert COMMANDS[name].says in text
 
 
-def test_help_is_there_at_once() -> None:
-    code = "import sys; from v2hdm.cli.main import run; run([]); print(*sys.modules, file=sys.stderr)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert not {"numpy", "cv2", "torch", "hydra", "yaml"} & set(done.stderr.split())
+IMPORTS = """
+import importlib, pkgutil, sys
+from pathlib import Path
+def loaded(*names): return set(names) & {name for name, module in sys.modules.items() if module}
+import v2hdm
+assert not loaded("numpy", "cv2", "torch", "scipy", "yaml", "v2hdm.errors"), "the library"
+from v2hdm.cli.main import run
+run([])
+assert not loaded("numpy", "cv2", "torch", "hydra", "yaml"), "the list of commands"
+missing = ["torch", "kornia", "hydra", "omegaconf", "scipy", "msgspec", "fsspec", "filelock"]
+sys.modules.update(dict.fromkeys(missing))
+import v2hdm.detect, v2hdm.detection.batch, v2hdm.detection.road, v2hdm.store
+for one in pkgutil.iter_modules(v2hdm.store.__path__, "v2hdm.store."):
+    importlib.import_module(one.name)
+with v2hdm.store.results.growing_folder(Path("drawn"), "--draw") as folder:
+    folder.write("a.jpg", b"a")
+try: v2hdm.store.cache.StageCache(Path("cache")).key(1)
+except v2hdm.errors.ConfigError as error: assert "install the map extra, pip" in str(error)
+else: raise AssertionError("the cache needs msgspec")
+for name in missing[4:]: del sys.modules[name]
+import v2hdm.verdict.check
+"""
+
+
+def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_on_a_vehicle(tmp_path):
+    """The library, help, the detector, the store and the checks, in one process from light to heavy."""
+    (tmp_path / "probe.py").write_text(IMPORTS)
+    done = run_command(tmp_path, "probe")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "drawn" / "a.jpg").is_file()
 
 
 OLD = {"extrinsic": "calibrate ground", "calibration": "calibrate compare", "calibrate": "calibrate points"}
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_every_console_script_is_a_command_old_names_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_console_script_is_a_command_old_names_too(name, monkeypatch):
     script = EntryPoint(name, SCRIPTS[name], "console_scripts").load()
     asked: list[list[str]] = []
     monkeypatch.setattr("v2hdm.cli.main.answer_signals", lambda: None)
@@ -194,21 +176,21 @@ def test_every_console_script_is_a_command_old_names_too(name: str, monkeypatch:
 @pytest.mark.parametrize(
     "how", [["v2hdm"], ["v2hdm", "map"], ["v2hdm.map"], ["v2hdm", "calibrate", "ground"]]
 )
-def test_every_command_reports_the_version(how: list[str], tmp_path: Path) -> None:
+def test_every_command_reports_the_version(how, tmp_path):
     line = f"v2hdm {re.escape(__version__)}, (torch|no torch).*, (onnxruntime|no onnx).*, (numba|no numba).*"
     told = run_command(tmp_path, *how, "--version").stdout
     assert re.fullmatch(line + ", weights [0-9a-f]{8}\n", told)
 
 
-def test_a_version_is_told_where_libraries_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> str:
+def test_a_version_is_told_where_libraries_are_missing(monkeypatch):
+    def absent(name):
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", absent)
     assert version_line().startswith(f"v2hdm {__version__}, no torch, no onnxruntime, no numba, weights ")
 
 
-def test_every_file_that_states_the_version_states_the_same() -> None:
+def test_every_file_that_states_the_version_states_the_same():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert project["version"] == citation["version"] == __version__

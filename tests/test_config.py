@@ -1,9 +1,5 @@
-"""Every shipped run composes; a typo is one line that names the key."""
+"""Every shipped run composes, every key is explained, a typo is one line, a sweep does all its jobs."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,25 +7,30 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from export.config import ExportConfig
+from train.config import TrainConfig
 from v2hdm.cli import compose as config
+from v2hdm.cli.compose import work_on
+from v2hdm.cli.keys_help import help_text, keys_of
+from v2hdm.cli.main import Command, run
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.config import RunConfig
 
 RUNS = sorted(path.stem for path in (config.conf_dir() / "run").glob("*.yaml"))
 
 
-def composed(*overrides: str) -> RunConfig:
+def composed(*overrides):
     config.register("map", RunConfig)
     with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
         return config.to_dataclass(compose("map", overrides=list(overrides)), RunConfig, "choose a run")
 
 
-def test_the_runs_that_the_readme_names_are_shipped() -> None:
+def test_the_runs_that_the_readme_names_are_shipped():
     assert set(RUNS) >= {"port1", "port2", "kitti"}
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_every_shipped_run_composes_into_dataclasses(run: str) -> None:
+def test_every_shipped_run_composes_into_dataclasses(run):
     assert composed(f"+run={run}", "drive.path=x" if run == "kitti" else "workers=1").name == run
 
 
@@ -40,58 +41,97 @@ class Needy:
     path: str
 
 
-def test_a_missing_value_is_an_error_that_gives_the_advice_of_the_door() -> None:
+def test_a_missing_value_is_an_error_that_gives_the_advice_of_the_door():
     with pytest.raises(ConfigError, match="no value for path; choose a run"):
         config.to_dataclass(OmegaConf.structured(Needy), Needy, "choose a run")
 
 
-def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "v2hdm.map", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
-
-
 @pytest.mark.parametrize(
-    ("arguments", "named"),
+    ("line", "named"),
     [
-        (("+run=port2", "maping.max_range_m=3"), "maping"),
-        (("+run=port2", "mapping.max_rnge_m=3"), "max_range_m"),
-        (("+run=port9",), "port9"),
-        (
-            (),
-            "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, or choose a run",
-        ),
-        (("drive.path=nowhere",), "nowhere: no such drive folder"),
-        (("+run=port2", "workers=many"), "workers"),
-        (("+run=port2", "simulate.route.pieces=[[62.0,0.0],[23,-90.0]]"), "write 23.0"),
-        (("+run=port2", "+mapping.known_sizes.by_class_m={diamond: [1, 0.7]}"), "write 1.0"),
-        (("+run=kitti",), "drive.path"),
-        (("+run=kitti", "drive.path=nowhere"), "nowhere"),
-        (("+run=kitti", "drive.path=straße"), "wants quotes"),
-        (("+run=kitti", "drive.path=a(1)"), "wants quotes"),
+        ("+run=port2 maping.max_range_m=3", "maping"),
+        ("+run=port2 mapping.max_rnge_m=3", "max_range_m"),
+        ("+run=port9", "port9"),
+        ("", "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, or choose"),
+        ("drive.path=nowhere", "nowhere: no such drive folder"),
+        ("+run=port2 workers=many", "workers"),
+        ("+run=port2 simulate.route.pieces=[[62.0,0.0],[23,-90.0]]", "write 23.0"),
+        ("+run=port2 +mapping.known_sizes.by_class_m={diamond:[1,0.7]}", "write 1.0"),
+        ("+run=kitti", "drive.path"),
+        ("+run=kitti drive.path=nowhere", "nowhere"),
+        ("+run=kitti drive.path=straße", "wants quotes"),
+        ("+run=kitti drive.path=a(1)", "wants quotes"),
     ],
 )
-def test_a_wrong_argument_is_one_line_that_names_it(
-    arguments: tuple[str, ...], named: str, tmp_path: Path
-) -> None:
-    done = run_door(*arguments, folder=tmp_path)
-    assert done.returncode == 2
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    assert named in lines[0]
+def test_a_wrong_argument_is_one_line_that_names_it(line, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(["map", *line.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert named in error
+    assert error.count("\n") == 1
     assert not list(tmp_path.rglob("metrics.json"))
 
 
-def test_a_users_own_runs_join_the_shipped_ones(tmp_path: Path) -> None:
+def test_a_users_own_runs_join_the_shipped_ones(tmp_path, monkeypatch, capsys):
     own = tmp_path / "conf" / "run"
     own.mkdir(parents=True)
     (own / "mysite.yaml").write_text("# @package _global_\nname: mysite\ndrive:\n  path: nowhere_at_all\n")
-    done = run_door("--config-dir", str(tmp_path / "conf"), "+run=mysite", folder=tmp_path)
-    assert done.returncode == 2
-    assert "nowhere_at_all" in done.stderr
+    monkeypatch.chdir(tmp_path)
+    assert run(["map", "--config-dir", str(tmp_path / "conf"), "+run=mysite"]) == 2
+    assert "nowhere_at_all" in capsys.readouterr().err
 
 
-def test_device_and_mode_reach_the_mapping() -> None:
+def test_device_and_mode_reach_the_mapping():
     mapping = composed("+run=port1", "device=cuda", "mode=incremental").mapping
     assert (mapping.device, mapping.mode) == ("cuda", "incremental")
     assert composed("+run=port1").mapping.mode == "batch"
+
+
+@pytest.mark.parametrize("schema", [RunConfig, TrainConfig, ExportConfig])
+def test_every_key_is_explained(schema):
+    keys = list(keys_of(schema))
+    assert len(keys) > 10
+    assert [key.name for key in keys if not key.meaning] == []
+    assert not [key.name for key in keys if "`" in key.meaning or "\n" in key.meaning]
+
+
+def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped():
+    page = help_text("v2hdm map", "Maps.", RunConfig, Path(__file__).parents[1] / "conf")
+    assert "v2hdm map [key=value ...]" in page
+    assert "mapping.max_range_m (number, 16.0)\n      Observations farther than" in page
+    assert "Shipped runs: kitti, port1, port2" in page
+    assert all(key.name in page for key in keys_of(RunConfig))
+    assert max(map(len, page.splitlines())) <= 110
+
+
+COMMAND = Command("export", "Exports.")
+
+
+def sweep(folder):
+    return ["--multirun", "checkpoint=a", "opset=18,19", f"output={folder / 'net.onnx'}"]
+
+
+def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(tmp_path):
+    def work(job):
+        folder = Path(job.folder(str(tmp_path)))
+        folder.mkdir()
+        (folder / "opset").write_text(str(job.settings.opset))
+        return 3 if job.settings.opset == 19 else 0
+
+    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path), "") == 3
+    written = {path.parent.name: path.read_text() for path in tmp_path.glob("*/opset")}
+    assert written == {"0-opset=18": "18", "1-opset=19": "19"}
+
+
+def test_a_job_that_fails_names_itself_and_the_others_go_on(tmp_path, capsys):
+    done: list[int] = []
+
+    def work(job):
+        if job.settings.opset == 18:
+            raise ConfigError("not this one")
+        done.append(job.settings.opset)
+
+    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path), "") == 2
+    assert done == [19]
+    assert "error: job 0-opset=18: not this one" in capsys.readouterr().err.splitlines()

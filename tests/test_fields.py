@@ -1,20 +1,23 @@
-"""Cameras that files describe: which of them can be."""
+"""Cameras, images and classes that files describe: which of them can be."""
 
-from __future__ import annotations
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from v2hdm.errors import MapFileError
+from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES, SHIPPED, load_catalogue
+from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.io.safe.fields import check_camera, lens_reach
+from v2hdm.io.safe.pixels import read_header, read_pixels
 from v2hdm.records import CameraInfo
 
 INTRINSIC = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 KITTI = np.array([[984.2, 0.0, 690.0], [0.0, 980.8, 233.2], [0.0, 0.0, 1.0]])
 
 
-def camera(model: str, distortion: tuple[float, ...]) -> CameraInfo:
+def camera(model, distortion):
     return CameraInfo("front", 640, 480, INTRINSIC, model, distortion)
 
 
@@ -36,7 +39,7 @@ FOLDED = [
 
 
 @pytest.mark.parametrize("info", GOOD, ids=lambda info: info.distortion_model)
-def test_a_lens_that_is_taken_can_be_undone_up_to_the_corners(info: CameraInfo) -> None:
+def test_a_lens_that_is_taken_can_be_undone_up_to_the_corners(info):
     check_camera(info, "front.yaml", MapFileError)
     u, v = np.meshgrid(np.linspace(0, info.width - 1, 9), np.linspace(0, info.height - 1, 9))
     points = np.column_stack([u.ravel(), v.ravel()])
@@ -44,20 +47,136 @@ def test_a_lens_that_is_taken_can_be_undone_up_to_the_corners(info: CameraInfo) 
 
 
 @pytest.mark.parametrize("info", FOLDED, ids=lambda info: f"{info.distortion_model} {info.distortion[0]:g}")
-def test_a_lens_that_folds_over_itself_within_the_image_is_refused(info: CameraInfo) -> None:
+def test_a_lens_that_folds_over_itself_within_the_image_is_refused(info):
     message = r"front\.yaml: distortion_coefficients: this lens folds over itself \d+ px .* reaches 40\d px"
     with pytest.raises(MapFileError, match=message):
         check_camera(info, "front.yaml", MapFileError)
 
 
-def test_a_lens_that_folds_in_the_corners_only_is_warned_of(caplog) -> None:
+def test_a_lens_that_folds_in_the_corners_only_is_warned_of(caplog):
     check_camera(camera("plumb_bob", (-0.35, 0.0, 0.0, 0.0, 0.0)), "front.yaml", MapFileError)
     (record,) = caplog.records
     assert "front.yaml: distortion_coefficients: this lens folds over itself 325 px" in record.getMessage()
 
 
-def test_the_reach_of_a_lens_is_where_it_turns() -> None:
+def test_the_reach_of_a_lens_is_where_it_turns():
     # r - 0.6 r^3 is greatest at r = 1 / sqrt(1.8).
     turn = 1 / np.sqrt(1.8)
     assert lens_reach(FOLDED[0]) == pytest.approx(turn - 0.6 * turn**3, rel=1e-5)
     assert lens_reach(GOOD[0]) == np.inf
+
+
+FORMS = [".png", ".tiff", ".bmp", ".webp", ".jpg"]
+
+
+@pytest.fixture(scope="module")
+def noise():
+    """Pixels that no coder makes small."""
+    return np.random.default_rng(1).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_large_image_has_the_size_that_its_header_says(form, noise, tmp_path):
+    path = tmp_path / f"image{form}"
+    cv2.imwrite(str(path), noise)
+    assert path.stat().st_size > 1 << 18
+    header = read_header(path)
+    assert (header.height, header.width) == noise.shape[:2] == read_pixels(path, cv2.IMREAD_COLOR).shape[:2]
+
+
+def test_a_jpeg_whose_frame_stands_after_much_else_is_read(noise, tmp_path):
+    data = cv2.imencode(".jpg", noise)[1].tobytes()
+    colours = b"\xff\xe2" + (60_002).to_bytes(2, "big") + bytes(60_000)
+    path = tmp_path / "image.jpg"
+    path.write_bytes(data[:2] + 8 * colours + data[2:])
+    assert read_header(path).width == 640
+
+
+def test_a_large_png_with_a_flipped_bit_is_refused_before_it_is_worked_on(noise, tmp_path):
+    data = bytearray(cv2.imencode(".png", noise)[1].tobytes())
+    data[len(data) // 2] ^= 1
+    path = tmp_path / "image.png"
+    path.write_bytes(data)
+    with pytest.raises(DriveError, match="damaged"):
+        read_pixels(path, cv2.IMREAD_COLOR)
+
+
+ROOT = Path(__file__).resolve().parents[1]
+SIZES = "length_m: [0.8, 1.4], width_m: [0.4, 1.2]"
+
+
+def written(folder, text):
+    path = folder / "classes.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_own_classes_come_after_the_shipped_ones(tmp_path):
+    text = f"classes:\n  parking_t: {{family: symbol, {SIZES}}}\n  pad: {{family: quadrilateral, {SIZES}}}\n"
+    catalogue = load_catalogue(written(tmp_path, text))
+    assert catalogue.names == (*PAINT_CLASSES, "parking_t", "pad")
+    assert catalogue.cornered == (*CORNERED_CLASSES, "pad")
+    assert catalogue.classes["pad"].group == "pad"
+    assert catalogue.lane_paint == SHIPPED.lane_paint
+
+
+def test_own_classes_survive_as_plain_data(tmp_path):
+    text = f"classes:\n  pad: {{family: stripe, {SIZES}, softness: 0.1, group: stop_line}}\n"
+    catalogue = load_catalogue(written(tmp_path, text))
+    assert SHIPPED.with_own(catalogue.own_entries(), "a file") == catalogue
+    assert SHIPPED.own_entries() == {}
+
+
+def test_the_catalogue_of_the_documentation_is_read():
+    assert load_catalogue(ROOT / "docs" / "own-class" / "classes.yaml").names[-2:] == ("parking_t", "pad")
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (f"pad: {{family: quadrilateral, {SIZES}}}\n  pad: {{family: stripe, {SIZES}}}", "'pad' is there"),
+        (f"pad: {{family: other, {SIZES}}}\n  Pad: {{family: other, {SIZES}}}", "'Pad' is the name of 'pad'"),
+        (f"diamond: {{family: quadrilateral, {SIZES}}}", "'diamond' is the name of 'diamond' already"),
+        (f"Stop_Line: {{family: stripe, {SIZES}}}", "'Stop_Line' is the name of 'stop_line' already"),
+        (f"none: {{family: other, {SIZES}}}", "'none' is the name of 'none' already"),
+        (f"lane_boundary: {{family: other, {SIZES}}}", "'lane_boundary'"),
+        (f"../pad: {{family: other, {SIZES}}}", "letters, digits and underscores"),
+        (f'"a pad": {{family: other, {SIZES}}}', "letters, digits and underscores"),
+        (f"{'x' * 65}: {{family: other, {SIZES}}}", "64 at most"),
+        (f"pad: {{family: circle, {SIZES}}}", "family of 'pad' is 'circle'"),
+        (f"pad: {{family: line, {SIZES}}}", "'pad' would be paint of lanes"),
+        (f"pad: {{family: stripe, {SIZES}, group: lane}}", "'pad' would be paint of lanes"),
+        (f"pad: {{family: stripe, {SIZES}, group: pads}}", "group of 'pad' is 'pads'"),
+        (f"pad: {{family: stripe, {SIZES}, group: [pad]}}", "give the name of a group"),
+        (f"pad: {{family: stripe, {SIZES}, colour: red}}", "nothing else"),
+        ("pad: {family: stripe, width_m: [1, 2]}", "length_m of 'pad' is nothing"),
+        ("pad: {family: stripe, length_m: [2, 1], width_m: [1, 2]}", r"length_m of 'pad' is \[2, 1\]"),
+        ("pad: {family: stripe, length_m: [a, b], width_m: [1, 2]}", "length_m of 'pad'"),
+        ("pad: {family: stripe, length_m: [.nan, 1], width_m: [1, 2]}", "length_m of 'pad'"),
+        ("pad: {family: stripe, length_m: 1.2, width_m: [1, 2]}", "length_m of 'pad'"),
+        (f"pad: {{family: stripe, {SIZES}, softness: soft}}", "softness of 'pad'"),
+        (f"pad: {{family: stripe, {SIZES}, softness: .inf}}", "softness of 'pad'"),
+        ("pad: stripe", "'pad' may have"),
+    ],
+)
+def test_a_wrong_entry_is_refused_in_one_line(tmp_path, entry, words):
+    path = written(tmp_path, f"classes:\n  {entry}\n")
+    with pytest.raises(ConfigError, match=words) as failure:
+        load_catalogue(path)
+    assert str(path) in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+@pytest.mark.parametrize("text", ["", "classes:", "classes: [pad]", "- pad", "classes: {", "\x00"])
+def test_a_file_that_is_no_catalogue_is_refused(tmp_path, text):
+    with pytest.raises(ConfigError, match=r"classes\.yaml") as failure:
+        load_catalogue(written(tmp_path, text))
+    assert "\n" not in str(failure.value)
+    with pytest.raises(ConfigError, match="no such file"):
+        load_catalogue(tmp_path / "none.yaml")
+
+
+def test_labels_have_room_for_all_classes(tmp_path):
+    many = "".join(f"  c{n}: {{family: other, {SIZES}}}\n" for n in range(255))
+    with pytest.raises(ConfigError, match="more than 254"):
+        load_catalogue(written(tmp_path, "classes:\n" + many))

@@ -24,17 +24,14 @@ def _train() -> int:
     from train.config import TrainConfig
     from v2hdm.cli.compose import work_on
 
-    return work_on(_COMMAND, "train", TrainConfig, _run, sys.argv[1:])
+    return work_on(_COMMAND, "train", TrainConfig, _run, sys.argv[1:], "set it on the command line")
 
 
 def _run(job: Job) -> None:
-    from train.config import TrainConfig
     from train.console import train
-    from v2hdm.cli.compose import to_dataclass
 
-    config = to_dataclass(job.composed, TrainConfig, "set it on the command line")
-    config.output = job.folder(config.output)
-    train(config)
+    job.settings.output = job.folder(job.settings.output)
+    train(job.settings)
 
 
 if __name__ == "__main__":

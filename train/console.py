@@ -12,10 +12,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.logging import RichHandler
 
+from train.bar import share_of_work
 from train.config import TrainConfig, check_training
 from train.distributed import Team, joined_team
 from train.loop import Trainer
-from v2hdm.progress import share_of_work
 from v2hdm.store.results import locked_folder
 
 

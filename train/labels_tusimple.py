@@ -9,9 +9,8 @@ import numpy as np
 
 from train.labels_image import LabelledImage
 from v2hdm.errors import LabelError
-from v2hdm.io.safe.texts import parse_json, shown
+from v2hdm.io.safe.texts import parse_json, read_text, shown
 from v2hdm.records import FloatArray
-from v2hdm.store.files import read_text
 
 _KEYS = ("raw_file", "lanes", "h_samples")
 _LEAST_POINTS = 2

@@ -20,11 +20,11 @@ from export.config import ExportConfig, Precision
 from export.console import run as export
 from export.manifest import record
 from train import fit_judge, fit_lane_score
+from train.bar import Share, share_of_work
 from train.exported import read_exported
 from train.fit_judge import Gathered
 from v2hdm.detection import weights
 from v2hdm.errors import ConfigError
-from v2hdm.progress import Share, share_of_work
 from v2hdm.store.files import whole_file
 from v2hdm.workers import share_out
 

@@ -13,78 +13,58 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from v2hdm.adjust.problem import Problem as Problem
-    from v2hdm.adjust.solve import solve as solve
-    from v2hdm.detection.detector import Detector as Detector
-    from v2hdm.detection.options import DetectorOptions as DetectorOptions
-    from v2hdm.errors import V2hdmError as V2hdmError
-    from v2hdm.io.drive import ReadOptions as ReadOptions
-    from v2hdm.library import (
-        build_problem as build_problem,
-    )
-    from v2hdm.library import (
-        calibrate_from_ground as calibrate_from_ground,
-    )
-    from v2hdm.library import (
-        calibrate_from_points as calibrate_from_points,
-    )
-    from v2hdm.library import (
-        check_drive as check_drive,
-    )
-    from v2hdm.library import (
-        localize as localize,
-    )
-    from v2hdm.library import (
-        read_drive as read_drive,
-    )
-    from v2hdm.library import (
-        read_map as read_map,
-    )
-    from v2hdm.library import (
-        simulate_port as simulate_port,
-    )
-    from v2hdm.mapping.options import MappingOptions as MappingOptions
-    from v2hdm.pipeline.detect_images import detect_images as detect_images
-    from v2hdm.pipeline.map_drive import map_drive as map_drive
-    from v2hdm.pipeline.result import Result as Result
-    from v2hdm.records import Calibration as Calibration
-    from v2hdm.records import HdMap as HDMap  # noqa: F401
-    from v2hdm.verdict.verdict import Verdict as Verdict
+    from v2hdm.adjust.problem import Problem
+    from v2hdm.adjust.solve import solve
+    from v2hdm.calibration.from_ground import calibrate_from_ground
+    from v2hdm.calibration.from_points import calibrate_from_points
+    from v2hdm.detection.detector import Detector
+    from v2hdm.detection.options import DetectorOptions
+    from v2hdm.errors import V2hdmError
+    from v2hdm.io.drive import ReadOptions, read_drive
+    from v2hdm.library import build_problem, read_map, simulate_port
+    from v2hdm.localization.run import localize
+    from v2hdm.mapping.options import MappingOptions
+    from v2hdm.pipeline.detect_images import detect_images
+    from v2hdm.pipeline.map_drive import map_drive
+    from v2hdm.pipeline.result import Result
+    from v2hdm.records import Calibration
+    from v2hdm.records import HdMap as HDMap
+    from v2hdm.verdict.inputs.drive import check_drive
+    from v2hdm.verdict.verdict import Verdict
 
 __version__ = "0.1.0"
+__all__ = [
+    "Calibration", "Detector", "DetectorOptions", "HDMap", "MappingOptions", "Problem", "ReadOptions",
+    "Result", "V2hdmError", "Verdict", "build_problem", "calibrate_from_ground", "calibrate_from_points",
+    "check_drive", "detect_images", "localize", "map_drive", "read_drive", "read_map", "simulate_port",
+    "solve",
+]  # fmt: skip
 
-_NAMES = {
-    "v2hdm.adjust.problem": "Problem",
-    "v2hdm.adjust.solve": "solve",
-    "v2hdm.detection.detector": "Detector",
-    "v2hdm.detection.options": "DetectorOptions",
-    "v2hdm.errors": "V2hdmError",
-    "v2hdm.io.drive": "ReadOptions",
-    "v2hdm.library": "build_problem calibrate_from_ground calibrate_from_points check_drive localize "
-    "read_drive read_map simulate_port",
-    "v2hdm.mapping.options": "MappingOptions",
-    "v2hdm.pipeline.detect_images": "detect_images",
-    "v2hdm.pipeline.map_drive": "map_drive",
-    "v2hdm.pipeline.result": "Result",
-    "v2hdm.records": "Calibration HDMap",
-    "v2hdm.verdict.verdict": "Verdict",
-}
-_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
-_CALLED = {"HDMap": "HdMap"}
-
-__all__ = sorted(_HOMES)
+_HOMES = {
+    "adjust.problem": "Problem", "adjust.solve": "solve", "calibration.from_ground": "calibrate_from_ground",
+    "calibration.from_points": "calibrate_from_points", "detection.detector": "Detector",
+    "detection.options": "DetectorOptions", "errors": "V2hdmError", "io.drive": "ReadOptions read_drive",
+    "library": "build_problem read_map simulate_port", "localization.run": "localize",
+    "mapping.options": "MappingOptions", "pipeline.detect_images": "detect_images",
+    "pipeline.map_drive": "map_drive", "pipeline.result": "Result", "records": "Calibration HDMap",
+    "verdict.inputs.drive": "check_drive", "verdict.verdict": "Verdict",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    module = next((one for one, names in _HOMES.items() if name in names.split()), None)
+    if module is None:
         raise AttributeError(f"module 'v2hdm' has no attribute '{name}'")
-    from v2hdm.extras import of_extra
-
-    with of_extra("map", f"v2hdm.{name}"):
-        found = getattr(importlib.import_module(_HOMES[name]), _CALLED.get(name, name))
-    globals()[name] = found
+    try:
+        home = importlib.import_module(f"v2hdm.{module}")
+    except ModuleNotFoundError as missing:
+        if (missing.name or "v2hdm").split(".")[0] == "v2hdm":
+            raise
+        line = f"v2hdm.{name} needs {missing.name}: install the map extra, pip install 'v2hdm[map]'"
+        raise ModuleNotFoundError(line, name=missing.name) from None
+    globals()[name] = found = getattr(home, "HdMap" if name == "HDMap" else name)
     return found
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES})
+    return sorted({*globals(), *__all__})

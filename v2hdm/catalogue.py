@@ -103,23 +103,17 @@ class Catalogue:
 
     def own_entries(self) -> dict[str, dict[str, Any]]:
         """The classes that are not shipped, as plain data that :meth:`with_own` takes."""
+        own = {name: asdict(one) for name, one in self.classes.items() if name not in SHIPPED.classes}
         return {
-            name: {
-                key: list(v) if isinstance(v, tuple) else v for key, v in asdict(one).items() if key in _KEYS
-            }
-            for name, one in self.classes.items()
-            if name not in SHIPPED.classes
+            name: {key: list(v) if isinstance(v, tuple) else v for key, v in one.items() if key in _KEYS}
+            for name, one in own.items()
         }
 
     def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
-        """This catalogue and a user's classes after it.
+        """This catalogue and a user's classes after it, by name as ``catalogue.yaml`` has them.
 
-        Args:
-            entries: by name, what ``catalogue.yaml`` says of a class.
-            where: they come from, for errors.
-
-        Raises:
-            ConfigError: an entry is wrong, or its name is taken.
+        Raises ConfigError, which says ``where`` they come from, where an entry is wrong, or its name is
+        taken.
         """
         taken = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
         for name in entries:
@@ -127,8 +121,7 @@ class Catalogue:
                 raise ConfigError(
                     f"{where}: class {shown(name)}: use letters, digits and underscores, 64 at most"
                 )
-            if name.lower() in taken:
-                other = taken[name.lower()]
+            if (other := taken.get(name.lower())) is not None:
                 raise ConfigError(
                     f"{where}: {shown(name)} is the name of {shown(other)} already; choose another"
                 )
@@ -154,11 +147,7 @@ class Catalogue:
 
 
 def load_catalogue(path: Path | None = None) -> Catalogue:
-    """The shipped classes and, after them, those of a user's file.
-
-    Raises:
-        ConfigError: the file is missing, is no YAML, or an entry is wrong.
-    """
+    """The shipped classes and, after them, those of a user's file; raises ConfigError where that is wrong."""
     return SHIPPED if path is None else SHIPPED.with_own(_read_entries(path), str(path))
 
 
@@ -175,42 +164,33 @@ def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
         raise ConfigError(
             f"{where}: class {shown(name)} may have {', '.join(sorted(_KEYS))} and nothing else"
         )
-    family = entry.get("family")
-    if family not in FAMILIES:
-        raise ConfigError(
-            f"{where}: family of {shown(name)} is {shown(family)}; choose from {', '.join(FAMILIES)}"
-        )
-    ranges = {}
+    said = {"softness": _SOFTNESS, "group": name, **entry}
+
+    def refuse(key: str, advice: str) -> ConfigError:
+        return ConfigError(f"{where}: {key} of {shown(name)} is {shown(said.get(key))}; {advice}")
+
+    if said.get("family") not in FAMILIES:
+        raise refuse("family", f"choose from {', '.join(FAMILIES)}")
     for key in ("length_m", "width_m"):
-        value = entry.get(key)
-        if not (
-            isinstance(value, list)
-            and len(value) == 2
-            and all(map(_is_number, value))
-            and 0 <= value[0] <= value[1]
-            and value[1] > 0
-        ):
-            raise ConfigError(f"{where}: {key} of {shown(name)} is {shown(value)}; give [from, to] in m")
-        ranges[key] = (float(value[0]), float(value[1]))
-    softness = entry.get("softness", _SOFTNESS)
-    if not (_is_number(softness) and 0 < softness < math.inf):
-        raise ConfigError(f"{where}: softness of {shown(name)} is {shown(softness)}; give a positive number")
-    group = entry.get("group", name)
-    if not isinstance(group, str):
-        raise ConfigError(f"{where}: group of {shown(name)} is {shown(group)}; give the name of a group")
-    return MarkingClass(name, family, ranges["length_m"], ranges["width_m"], group, float(softness))
+        value = said.get(key)
+        if not (isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))):
+            raise refuse(key, "give [from, to] in m")
+        if not (0 <= value[0] <= value[1] and value[1] > 0):
+            raise refuse(key, "give [from, to] in m")
+    if not (_is_number(said["softness"]) and 0 < said["softness"] < math.inf):
+        raise refuse("softness", "give a positive number")
+    if not isinstance(said["group"], str):
+        raise refuse("group", "give the name of a group")
+    length_m, width_m = ((float(low), float(high)) for low, high in (said["length_m"], said["width_m"]))
+    return MarkingClass(name, said["family"], length_m, width_m, said["group"], float(said["softness"]))
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-SHIPPED = Catalogue(
-    {
-        name: _read_class(name, entry, str(CATALOGUE_FILE))
-        for name, entry in _read_entries(CATALOGUE_FILE).items()
-    }
-)
+_SHIPPED = _read_entries(CATALOGUE_FILE).items()
+SHIPPED = Catalogue({name: _read_class(name, entry, str(CATALOGUE_FILE)) for name, entry in _SHIPPED})
 """The shipped classes."""
 
 PAINT_CLASSES = SHIPPED.names

@@ -17,9 +17,6 @@ _EVERY_S = 10.0
 Steps = Callable[[int, int], None]
 """Progress of one task: called with how many steps are done, and of how many."""
 
-Share = Callable[[float, str], None]
-"""Called with the share of the work that is done, and with what is being done."""
-
 
 class Progress(Protocol):
     """Shows how many steps of a named piece of long work are done, and of how many."""
@@ -54,13 +51,8 @@ def progress_bars(console: Console) -> Iterator[Progress]:
     if not console.is_terminal:
         yield progress_lines(console.print)
         return
-    columns = (
-        TextColumn("{task.description:<28}"),
-        BarColumn(40),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Bars(*columns, console=console) as bars:
+    title = TextColumn("{task.description:<28}")
+    with Bars(title, BarColumn(40), MofNCompleteColumn(), TimeRemainingColumn(), console=console) as bars:
         tasks = {}
 
         def advance(task: str, done: int, total: int) -> None:
@@ -69,39 +61,3 @@ def progress_bars(console: Console) -> Iterator[Progress]:
             bars.update(tasks[task], completed=done, total=total)
 
         yield advance
-
-
-@contextmanager
-def share_of_work(console: Console, first: str, transient: bool = False) -> Iterator[Share]:
-    """One bar over all that is done, which begins with ``first``; it goes away in the end if ``transient``.
-
-    In a log there is a line every ten seconds, and one in the end.
-    """
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bars
-
-    if not console.is_terminal:
-        yield _share_lines(lambda line: console.print(line, highlight=False, markup=False, soft_wrap=True))
-        return
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Bars(*columns, console=console, transient=transient) as bar:
-        task = bar.add_task(first, total=1.0)
-        yield lambda share, doing: bar.update(task, completed=share, description=doing)
-
-
-def _share_lines(write: Callable[[str], None]) -> Share:
-    written_s = -_EVERY_S
-
-    def show(share: float, doing: str) -> None:
-        nonlocal written_s
-        now_s = time.monotonic()
-        if now_s - written_s >= _EVERY_S or share >= 1.0:
-            written_s = now_s
-            write(f"{share:4.0%}  {doing}")
-
-    return show

@@ -117,7 +117,7 @@ class PoseNoise:
     heading_drift_rad: float = 0.0
     heading_drift_over_m: float = 5.0
     roll_pitch_drift_rad: float = 0.0
-    roll_pitch_drift_over_m: float = 1.0
+    roll_pitch_drift_over_m: float = 5.0
 
     @classmethod
     def as_far_as_stated(cls, **stated: float) -> PoseNoise:
@@ -384,16 +384,19 @@ class HdMap:
         except ModuleNotFoundError as missing:
             what = "to_geodataframe needs geopandas: install the gis extra, pip install 'v2hdm[gis]'"
             raise ModuleNotFoundError(what, name=missing.name) from None
-        layers = (("marking", self.markings), ("lane", self.lanes), ("symbol", self.symbols))
+        layers = (
+            ("marking", self.markings, "corners_map"),
+            ("lane", self.lanes, "points_map"),
+            ("symbol", self.symbols, "outline_map"),
+        )
         rows = []
-        for layer, features in layers:
+        for layer, features, name in layers:
+            shape = shapely.LineString if layer == "lane" else shapely.Polygon
             for one in features:
-                points = getattr(one, _POINTS[type(one)])
+                points = getattr(one, name)
                 heights_m = np.zeros(len(points)) if one.heights_m is None else one.heights_m
-                shape = (shapely.LineString if layer == "lane" else shapely.Polygon)(
-                    np.column_stack([points, heights_m])
-                )
-                rows.append((one.id, layer, one.kind, one.sightings, shape))
+                geometry = shape(np.column_stack([points, heights_m]))
+                rows.append((one.id, layer, one.kind, one.sightings, geometry))
         columns = ["id", "layer", "kind", "sightings", "geometry"]
         frame = geopandas.GeoDataFrame(rows, columns=columns, geometry="geometry")
         if self.origin is None:
@@ -407,9 +410,6 @@ class HdMap:
             frame.geometry.values, lambda xyz: np.column_stack(on_earth.transform(*xyz.T)), include_z=True
         )
         return frame.set_geometry(geometry, crs="EPSG:4326")
-
-
-_POINTS = {Marking: "corners_map", Lane: "points_map", Symbol: "outline_map"}
 
 
 class Fate(Enum):

@@ -45,11 +45,7 @@ SEED = Within(0, 2**63 - 1)
 
 
 def check_workers(workers: int) -> None:
-    """Refuse a number of processes that no machine has.
-
-    Raises:
-        ConfigError: it is negative or too large.
-    """
+    """Raise ConfigError for a number of processes that no machine has."""
     if not 0 <= workers <= MOST_PROCESSES:
         raise ConfigError(f"--workers {workers}: give 1 to {MOST_PROCESSES} processes, or 0 for one per core")
 
@@ -57,13 +53,8 @@ def check_workers(workers: int) -> None:
 def check_settings(config: object, ranges: Mapping[str, Within], prefix: str = "") -> None:
     """Refuse numbers that are not finite or out of range.
 
-    Args:
-        config: a dataclass of settings, perhaps with others in it.
-        ranges: by dotted key; ``*`` stands for the entries of a mapping.
-        prefix: what errors put before keys.
-
-    Raises:
-        ConfigError: the message names the key, its value and the range.
+    ``ranges`` are by dotted key; ``*`` stands for the entries of a mapping. Raises ConfigError, which puts
+    ``prefix`` before the key and names its value and the range.
     """
     for key, pattern, value in _numbers(config, "", ""):
         if not math.isfinite(value):

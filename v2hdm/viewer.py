@@ -20,7 +20,7 @@ from v2hdm.extras import need
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.safe.texts import shown
-from v2hdm.mapping.results import AdjustedPoses, MethodResult
+from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Camera, Drive, FloatArray, HdMap, ImageDetections
 from v2hdm.report.style import METHOD, OKABE_ITO, ROUTE
 
@@ -70,14 +70,13 @@ class RerunViewer:
         route = [np.array([image.map_from_vehicle[:3, 3] for image in drive.images])]
         self._log("map/route_recorded", rr.LineStrips3D(route, colors=[_ROUTE]))
         for name, camera in drive.cameras.items():
-            self._log_camera(name, camera, _guess(camera))
+            self._log_camera(name, camera, extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]))
 
     def detected(self, detections: Sequence[ImageDetections]) -> None:
         """Add images and what was found in them."""
-        if self._stream is None or self._drive is None:
-            return
-        for found in detections:
-            self._show_image(self._drive, found)
+        if self._stream is not None and self._drive is not None:
+            for found in detections:
+                self._show_image(self._drive, found)
 
     def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
         """Add the map of a set of cameras; the vehicle and its cameras move to where it has them."""
@@ -88,7 +87,12 @@ class RerunViewer:
         for name, calibration in best.calibrations.items():
             self._log_camera(name, self._drive.cameras[name], calibration.cam_from_vehicle)
         if best.poses is not None:
-            self._show_poses(cameras, self._drive, best.poses)
+            adjusted = [best.poses.of_image(image) for image in self._drive.images]
+            for index, pose in enumerate(adjusted):
+                self._at(self._drive, index)
+                self._stream.log("map/vehicle", self._pose(pose))
+            route = [np.array([pose[:3, 3] for pose in adjusted])]
+            self._log(f"map/{cameras}/route", self._rr.LineStrips3D(route, colors=[_MARKING]))
         self._stream.flush()
 
     def close(self) -> None:
@@ -112,11 +116,8 @@ class RerunViewer:
     def _log_camera(self, name: str, camera: Camera, cam_from_vehicle: FloatArray) -> None:
         rr, info = self._rr, camera.info
         self._log(f"map/vehicle/{name}", self._pose(inverse(cam_from_vehicle)))
-        lens = rr.Pinhole(
-            image_from_camera=info.intrinsic,
-            resolution=[info.width, info.height],
-            image_plane_distance=_FRUSTUM_M,
-        )
+        size, matrix = [info.width, info.height], info.intrinsic
+        lens = rr.Pinhole(image_from_camera=matrix, resolution=size, image_plane_distance=_FRUSTUM_M)
         self._log(f"map/vehicle/{name}/image", lens)
 
     def _show_image(self, drive: Drive, found: ImageDetections) -> None:
@@ -129,35 +130,21 @@ class RerunViewer:
         self._stream.log(path, rr.EncodedImage(contents=coded, media_type=kind))
         outlines = [one.outline_px if len(one.outline_px) else one.corners_px for one in found.markings]
         kinds = [f"{one.kind} {one.score:.2f}" for one in found.markings]
-        self._stream.log(
-            f"{path}/markings",
-            rr.LineStrips2D(_closed(outlines), labels=kinds, colors=[_MARKING] * len(kinds)),
-        )
+        drawn = rr.LineStrips2D(_closed(outlines), labels=kinds, colors=[_MARKING] * len(kinds))
+        self._stream.log(f"{path}/markings", drawn)
         lines = [one.points_px for one in found.lanes]
         self._stream.log(f"{path}/lanes", rr.LineStrips2D(lines, colors=[_LANE] * len(lines)))
 
     def _show_map(self, path: str, hd_map: HdMap) -> None:
-        rr = self._rr
-        markings = [_ground(one) for one in _closed(marking.corners_map for marking in hd_map.markings)]
         kinds = [marking.kind for marking in hd_map.markings]
-        lanes = [_ground(lane.points_map) for lane in hd_map.lanes]
-        symbols = [_ground(one) for one in _closed(symbol.outline_map for symbol in hd_map.symbols)]
-        for name, strips, colour, labels in (
-            ("markings", markings, _MARKING, kinds),
-            ("lanes", lanes, _LANE, None),
-            ("symbols", symbols, _SYMBOL, None),
+        for name, lines, colour, labels in (
+            ("markings", _closed(one.corners_map for one in hd_map.markings), _MARKING, kinds),
+            ("lanes", [one.points_map for one in hd_map.lanes], _LANE, None),
+            ("symbols", _closed(one.outline_map for one in hd_map.symbols), _SYMBOL, None),
         ):
-            colours = [colour] * len(strips)
-            drawn = rr.LineStrips3D(strips, colors=colours, labels=labels, show_labels=False)
-            self._log(f"{path}/{name}", drawn)
-
-    def _show_poses(self, cameras: str, drive: Drive, poses: AdjustedPoses) -> None:
-        adjusted = [poses.of_image(image) for image in drive.images]
-        for index, pose in enumerate(adjusted):
-            self._at(drive, index)
-            self._stream.log("map/vehicle", self._pose(pose))
-        route = [np.array([pose[:3, 3] for pose in adjusted])]
-        self._log(f"map/{cameras}/route", self._rr.LineStrips3D(route, colors=[_MARKING]))
+            look: dict[str, Any] = {"colors": [colour] * len(lines), "labels": labels, "show_labels": False}
+            strips = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
+            self._log(f"{path}/{name}", self._rr.LineStrips3D(strips, **look))
 
     def _at(self, drive: Drive, index: int) -> None:
         self._stream.set_time("image", sequence=index)
@@ -180,18 +167,9 @@ def check_viewer(name: str) -> bool:
 
 def has_display() -> bool:
     """Whether a window can be opened here."""
-    if sys.platform.startswith(("win", "darwin")):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _guess(camera: Camera) -> FloatArray:
-    return extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+    windows = sys.platform.startswith(("win", "darwin"))
+    return windows or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _closed(outlines: Iterable[FloatArray]) -> list[FloatArray]:
     return [np.vstack([one, one[:1]]) for one in outlines]
-
-
-def _ground(points_map: FloatArray) -> FloatArray:
-    return np.column_stack([points_map, np.zeros(len(points_map))])

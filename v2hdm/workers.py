@@ -1,8 +1,7 @@
 """Work shared out among processes that never outlive the one that started them.
 
-Ctrl-C and errors reach this process alone, which ends the others. They see at once when it dies, and it when
-one of them does: ``multiprocessing.Pool`` waits for ever for a process that was killed, and those of
-``ProcessPoolExecutor`` stay when the process that started them is.
+Ctrl-C and errors reach this process alone, which ends the others; each of them watches this one and ends when
+it dies, which those of ``ProcessPoolExecutor`` do not do by themselves.
 """
 
 from __future__ import annotations
@@ -11,23 +10,24 @@ import multiprocessing
 import os
 import signal
 import sys
-import traceback
-from collections import deque
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from v2hdm.errors import WorkerError
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PATIENCE_S = 5.0
-"""How long a process may take to end."""
 
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
+
+_failure: list[Exception] = []
+"""Of the start of this worker process, for its first job to raise."""
 
 
 def share_out(
@@ -40,32 +40,32 @@ def share_out(
 ) -> None:
     """Do jobs in several processes and take their results in the order of the jobs.
 
-    Processes are spawned: a fork would inherit the locks of other libraries' threads.
-
-    Args:
-        work: does one job; an exception of it is raised here, with the traceback of its process as a note.
-        jobs: what to do.
-        processes: how many to start at most.
-        start: called in each process first, with ``arguments``.
-        arguments: of ``start``.
-        take: called here with each result.
-
-    Raises:
-        WorkerError: a process died.
+    Processes are spawned: a fork would inherit the locks of other libraries' threads. Each calls ``start``
+    with ``arguments`` first; an exception of ``work`` is raised here, caused by one with the traceback there.
+    Raises WorkerError where a process died.
     """
-    workers: dict[Connection, BaseProcess] = {}
+    others, spawn = set(multiprocessing.active_children()), multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(max(1, min(processes, len(jobs))), spawn, _begin, (start, arguments))
+    ours: set[Any] = set()
     try:
         with undisturbed_starts():
-            context = multiprocessing.get_context("spawn")
-            for _ in range(min(processes, len(jobs))):
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_serve, args=(theirs, start, arguments, work), daemon=True)
-                process.start()
-                theirs.close()
-                workers[ours] = process
-        _hand_out(jobs, workers, take)
+            results = pool.map(partial(_do, work), jobs)
+            ours = set(multiprocessing.active_children()) - others
+        for result in results:
+            take(result)
+    except BrokenProcessPool:
+        pool.shutdown()
+        ends = [one.exitcode for one in ours if one.exitcode not in (0, -signal.SIGTERM)]
+        raise WorkerError(
+            f"a worker process died (exit code {ends[0] if ends else 'unknown'}), perhaps for want of "
+            "memory; set fewer workers="
+        ) from None
+    except BaseException:
+        for one in ours:
+            one.terminate()
+        raise
     finally:
-        _end(workers)
+        pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
@@ -89,78 +89,27 @@ def undisturbed_starts() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _hand_out(
-    jobs: Sequence[Any], workers: dict[Connection, BaseProcess], take: Callable[[Any], None]
-) -> None:
-    """Keep every process busy with one job after the other."""
-    left, idle = deque(enumerate(jobs)), list(workers)
-    doing: dict[Connection, int] = {}
-    done: dict[int, Any] = {}
-    taken = 0
-    while taken < len(jobs):
-        while idle and left:
-            line = idle.pop()
-            doing[line], job = left.popleft()
-            try:
-                line.send(job)
-            except OSError:
-                raise _death(workers[line]) from None
-        ready = set(wait(list(doing)))
-        for line in [line for line in doing if line in ready]:
-            try:
-                result, failure = line.recv()
-            except (EOFError, OSError):
-                raise _death(workers[line]) from None
-            if failure is not None:
-                raise failure
-            done[doing.pop(line)] = result
-            idle.append(line)
-        while taken in done:
-            take(done.pop(taken))
-            taken += 1
-
-
-def _death(process: BaseProcess) -> WorkerError:
-    process.join(_PATIENCE_S)
-    return WorkerError(
-        f"a worker process died (exit code {process.exitcode}), perhaps for want of memory; "
-        "set fewer workers="
-    )
-
-
-def _end(workers: dict[Connection, BaseProcess]) -> None:
-    for line, process in workers.items():
-        line.close()
-        process.terminate()
-    for process in workers.values():
-        process.join(_PATIENCE_S)
-        if process.is_alive():
-            process.kill()
-            process.join()
-
-
-def _serve(
-    line: Connection,
-    start: Callable[..., None],
-    arguments: tuple[object, ...],
-    work: Callable[[Any], Any],
-) -> None:
-    """Do what comes along ``line`` until it is closed, or the first failure has been reported."""
-    # Ended by an exception, it tidies away what is being written.
+def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
+    # Ended by an exception, a process tidies away what is being written.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         start(*arguments)
-        while (job := _next(line)) is not None:
-            line.send((work(job[0]), None))
-    except BrokenPipeError:
-        return  # no one is left to take the result
     except Exception as failure:
-        failure.add_note(f"in a worker process:\n{traceback.format_exc()}")
-        line.send((None, failure))
+        _failure.append(failure)
 
 
-def _next(line: Connection) -> tuple[Any] | None:
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _do(work: Callable[[_Job], _Result], job: _Job) -> _Result:
+    if _failure:
+        raise _failure[0]
     try:
-        return (line.recv(),)
-    except (EOFError, OSError):
-        return None
+        return work(job)
+    except SystemExit:  # the pool would take it for a failure of the job
+        os._exit(0)

@@ -1,7 +1,5 @@
 """A synthetic street: diamonds beside a route, seen by one or two cameras with known truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,6 +174,12 @@ def make_scene(
     return Scene(problem, truth, map_from_vehicle, corners)
 
 
+def rows_of(seen: Observations, rows: np.ndarray | slice) -> Observations:
+    """Some of the observations."""
+    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
+    return Observations(*(part[rows] for part in parts))
+
+
 def with_late_clocks(scene: Scene, offset_s: np.ndarray) -> Scene:
     """The scene, its poses exact, in images taken ``offset_s`` (C,) later than they say.
 
@@ -193,10 +197,7 @@ def with_late_clocks(scene: Scene, offset_s: np.ndarray) -> Scene:
     pixel = project(cam_from_map, scene.corners_map[seen.corner])
     pixel += np.random.default_rng(0).normal(0, PIXEL_SIGMA, pixel.shape)
     problem = replace(
-        scene.problem,
-        twist_vehicle=twist,
-        clock_sigma_s=0.05,
-        observations=replace(seen, pinhole_px=pixel),
+        scene.problem, twist_vehicle=twist, clock_sigma_s=0.05, observations=replace(seen, pinhole_px=pixel)
     )
     return replace(scene, problem=problem, map_from_vehicle=poses)
 

@@ -1,7 +1,5 @@
 """A synthetic site: a street of which each drive has a stretch, and shares its ends."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -41,16 +39,11 @@ def site(drives: int, frames: int, overlap: int, *, every_m: float = 2.0, seed: 
     often = np.bincount(seen.corner[rows], minlength=street.problem.corner_count) >= 2
     kept = often[seen.corner[rows]]
     rows, frame, pixel = rows[kept], frame[kept], pixel[kept]
+    corner = (np.cumsum(often) - 1)[seen.corner[rows]]
     return replace(
         street.problem,
         map_from_vehicle=np.concatenate([poses[n * stride : n * stride + frames] for n in range(drives)]),
-        observations=Observations(
-            seen.camera[rows],
-            frame,
-            (np.cumsum(often) - 1)[seen.corner[rows]],
-            pixel,
-            seen.covariance_px[rows],
-        ),
+        observations=Observations(seen.camera[rows], frame, corner, pixel, seen.covariance_px[rows]),
         corner_count=int(often.sum()),
         pose_sigma=tuple(sigmas),
         visit=np.repeat(np.arange(drives), frames),

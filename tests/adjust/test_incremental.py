@@ -5,17 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.adjust.scene import Scene, make_scene
-from v2hdm.adjust import (
-    ControlPoints,
-    Drift,
-    KnownLengths,
-    Observations,
-    PoseSigma,
-    Problem,
-    SolveOptions,
-    solve,
-)
+from tests.adjust.scene import make_scene, rows_of
+from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.errors import AdjustError
 
@@ -24,28 +15,22 @@ JITTER = PoseSigma(position_m=0.01, heading_rad=0.001, roll_pitch_rad=0.002, hei
 DRIFTING = replace(JITTER, position_m=0.012, position_drift=Drift(0.01, 20.0))
 
 
-def street(**changes) -> Scene:
+def street(**changes):
     return make_scene(3, **{"frames": 60, "start_error_deg": 1.0, "min_views": 4, **changes})
 
 
-def part(seen: Observations, rows: np.ndarray, first: int = 0) -> Observations:
-    return Observations(
-        seen.camera[rows],
-        seen.frame[rows],
-        seen.corner[rows] - first,
-        seen.pinhole_px[rows],
-        seen.covariance_px[rows],
-    )
+def part(seen, rows, first=0):
+    return replace(rows_of(seen, rows), corner=seen.corner[rows] - first)
 
 
-def whole_markings(problem: Problem) -> Problem:
+def whole_markings(problem):
     """Without the last corners that make no four."""
     count = problem.corner_count // 4 * 4
     rows = np.flatnonzero(problem.observations.corner < count)
     return replace(problem, corner_count=count, observations=part(problem.observations, rows))
 
 
-def known_beside(problem: Problem, truth: np.ndarray) -> Problem:
+def known_beside(problem, truth):
     """With a side of every marking and two surveyed corners of every third one."""
     first = np.arange(0, problem.corner_count, 4)
     surveyed = np.concatenate([first[::3], first[::3] + 2])
@@ -57,7 +42,7 @@ def known_beside(problem: Problem, truth: np.ndarray) -> Problem:
     )
 
 
-def by_marking(problem: Problem) -> list[Sighted]:
+def by_marking(problem):
     """Four corners each, in the order of their numbers, with what the problem knows of them."""
     seen, out = problem.observations, []
     for first in range(0, problem.corner_count - 3, 4):
@@ -65,12 +50,8 @@ def by_marking(problem: Problem) -> list[Sighted]:
         lengths, control = problem.lengths, problem.control
         if lengths is not None:
             one = lengths.first // 4 == first // 4
-            lengths = KnownLengths(
-                lengths.first[one] - first,
-                lengths.second[one] - first,
-                lengths.length_m[one],
-                lengths.sigma_m[one],
-            )
+            ends = lengths.first[one] - first, lengths.second[one] - first
+            lengths = KnownLengths(*ends, lengths.length_m[one], lengths.sigma_m[one])
         if control is not None:
             one = control.corner // 4 == first // 4
             control = ControlPoints(
@@ -80,14 +61,14 @@ def by_marking(problem: Problem) -> list[Sighted]:
     return out
 
 
-def grow(problem: Problem, options: SolveOptions = PAPER) -> IncrementalMap:
+def grow(problem, options=PAPER):
     grown = IncrementalMap(problem, options)
     for marking, sighted in enumerate(by_marking(problem)):
         grown.observe(marking, sighted)
     return grown
 
 
-def farthest(grown: IncrementalMap, problem: Problem, options: SolveOptions) -> float:
+def farthest(grown, problem, options):
     """Of all corners' coordinates, how far from the batch optimum at most, in standard deviations."""
     best = solve(problem, options)
     groups = np.arange(problem.corner_count).reshape(-1, 4)
@@ -118,9 +99,8 @@ def test_with_pose_errors_it_is_near_the_batch_and_the_batch_itself_once_adjuste
     options = SolveOptions(loss="none")
     grown = grow(problem, options)
     assert farthest(grown, problem, options) < 2.0
-    solution = grown.adjust()
+    grown.adjust()
     assert farthest(grown, problem, options) < 0.01
-    np.testing.assert_allclose(grown.map_from_vehicle, solution.map_from_vehicle, atol=1e-12)
 
 
 def test_a_clock_offset_is_found_along():
@@ -154,21 +134,6 @@ def test_a_marking_seen_again_is_re_estimated_from_all_it_was_ever_seen_in():
     for marking, sighted in later.items():
         grown.observe(marking, sighted)
     assert farthest(grown, problem, PAPER) < 0.01
-
-
-def test_a_forgotten_marking_leaves_no_trace():
-    problem = whole_markings(street().problem)
-    markings = by_marking(problem)
-    without, with_and_back = (IncrementalMap(problem, PAPER) for _ in range(2))
-    for marking, sighted in enumerate(markings[:9]):
-        without.observe(marking, sighted)
-        with_and_back.observe(marking, sighted)
-    with_and_back.observe(99, markings[9])
-    assert np.abs(with_and_back.cam_from_vehicle - without.cam_from_vehicle).max() > 1e-4
-    with_and_back.forget(99)
-    np.testing.assert_allclose(with_and_back.cam_from_vehicle, without.cam_from_vehicle, atol=2e-6)
-    with pytest.raises(AdjustError, match="marking 99 is not in the map"):
-        with_and_back.corners_map(99)
 
 
 def test_a_marking_that_cannot_be_re_estimated_stays_as_it_was():

@@ -1,64 +1,27 @@
-"""The solver's own tables: small, complete, and the same problem however they are cut."""
+"""The solver's own tables, its minimiser, and what a process pays for its first solve."""
 
 import dataclasses
-from collections.abc import Iterator
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from tests.adjust.scene import make_scene
-from v2hdm.adjust import KnownLengths, PoseSigma, Problem, SolveOptions, arrays, solve
-from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust import KnownLengths, PoseSigma, SolveOptions, arrays, solve
+from v2hdm.adjust.lbfgs import minimise
 from v2hdm.adjust.problem import POSE_STATES
 
 
-def street(**changes) -> Problem:
+def street(**changes):
     """Corners far apart on the route, joined by lengths: 0 to 5 to 40, and 7 to 9."""
     problem = make_scene(2, frames=40, jitter=PoseSigma(), **changes).problem
     lengths = KnownLengths(np.array([0, 5, 9]), np.array([5, 40, 7]), np.full(3, 2.0), np.full(3, 9.0))
     return dataclasses.replace(problem, lengths=lengths)
-
-
-def tensors(record: object) -> Iterator[torch.Tensor]:
-    """All tensors in a record of records, each once."""
-    if isinstance(record, torch.Tensor):
-        yield record
-    elif dataclasses.is_dataclass(record):
-        for field in dataclasses.fields(record):
-            yield from tensors(getattr(record, field.name))
-    elif isinstance(record, dict | tuple):
-        for value in record.values() if isinstance(record, dict) else record:
-            yield from tensors(value)
-
-
-@pytest.mark.parametrize("pose_states", [(), POSE_STATES])
-def test_an_observation_takes_52_bytes_and_the_factorised_hessian_none(pose_states):
-    problem = street()
-    count = len(problem.observations.corner)
-    whitening = solve(problem, SolveOptions(pose_states=pose_states)).covariance.whitening
-    own = [part for part in tensors(whitening.engine.arrays) if part.shape[-1:] == (count,)]
-    assert sum(part.element_size() * part.numel() for part in own) == 52 * count
-    outside = [vars(whitening.linearised), dataclasses.replace(whitening, engine=None)]
-    assert all(count not in part.shape for record in outside for part in tensors(record))
-
-
-def test_runs_hold_every_observation_once_in_order_and_part_no_corners_that_lengths_join(monkeypatch):
-    monkeypatch.setattr(arrays, "_RUN", 50)
-    laid_out = make_arrays(street(), (), "cpu")
-    runs = list(laid_out.runs())
-    assert len(runs) > 20
-    assert all(run.corner_count for run in runs)
-    assert [run.observations.start for run in runs[1:]] == [run.observations.stop for run in runs[:-1]]
-    assert [run.corners.start for run in runs[1:]] == [run.corners.stop for run in runs[:-1]]
-    assert runs[-1].observations.stop == len(laid_out.pair)
-    assert runs[-1].corners.stop == laid_out.corner_count
-    for run in runs:
-        assert torch.equal(run.corner + run.corners.start, laid_out.corner[run.observations].long())
-        assert not laid_out.joined[run.corners.start]
-    rank = torch.argsort(laid_out.corner_order)
-    assert sorted(torch.diff(rank[[0, 5, 40]].sort().values).tolist()) == [1, 1]
-    assert abs(int(rank[7] - rank[9])) == 1
 
 
 @pytest.mark.parametrize("pose_states", [(), POSE_STATES])
@@ -73,17 +36,6 @@ def test_the_optimum_is_the_same_in_short_runs_and_in_one(monkeypatch, pose_stat
     groups = np.array([[0, 40], [9, 12]])
     covariance = whole.corner_covariance(groups)
     np.testing.assert_allclose(parts.corner_covariance(groups), covariance, rtol=1e-6)
-
-
-def test_part_of_a_problem_keeps_the_lengths_whose_corners_it_keeps():
-    whole = make_arrays(street(), (), "cpu")
-    rank = torch.argsort(whole.corner_order)
-    part, corners = whole.take(~torch.isin(whole.corner.long(), rank[[5, 30]]))
-    assert part.corner_count == whole.corner_count - 2
-    assert torch.equal(part.corner_order, whole.corner_order[corners])
-    assert part.corner_order[part.lengths.first].tolist() == [9]
-    assert part.corner_order[part.lengths.second].tolist() == [7]
-    assert bool(part.joined[torch.maximum(part.lengths.first, part.lengths.second)].all())
 
 
 def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_they_are_grouped():
@@ -103,3 +55,108 @@ def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_t
         along = np.zeros(8)
         along[2 * k : 2 * k + 4] = np.concatenate([direction, -direction])
         assert np.sqrt(along @ joint @ along) < sigma_m
+
+
+CENTRE = torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64)
+CURVATURE = torch.tensor([1.0, 30.0, 900.0], dtype=torch.float64)
+
+
+def bowl(whitened):
+    off = whitened - CENTRE
+    return 0.5 * (CURVATURE * off * off).sum(), CURVATURE * off
+
+
+@pytest.mark.parametrize("wrong", ["cost", "gradient", "both"])
+@pytest.mark.parametrize("first_wrong", range(1, 12))
+def test_where_the_objective_is_no_number_the_point_before_it_stands(wrong, first_wrong):
+    calls = 0
+
+    def objective(whitened):
+        nonlocal calls
+        calls += 1
+        cost, gradient = bowl(whitened)
+        if calls >= first_wrong:
+            # A small gradient passes for the end of a line search, which then has no bracket to speak of.
+            cost = cost * math.nan if wrong != "gradient" else cost
+            gradient = gradient * (1e-3 if wrong == "cost" else math.nan)
+        return cost, gradient
+
+    start_cost, start_gradient = bowl(torch.zeros(3, dtype=torch.float64))
+    found = minimise(objective, start_cost, start_gradient, 1e-12, 30)
+    cost, gradient = bowl(found.whitened)
+    assert float(found.cost) <= float(start_cost)
+    torch.testing.assert_close(found.cost, cost)
+    torch.testing.assert_close(found.gradient, gradient)
+
+
+ROOT = Path(__file__).parents[2]
+
+SOLVE = """
+import sys
+import numpy as np
+{before}
+from tests.adjust.scene import make_scene
+from v2hdm.adjust import SolveOptions, solve
+solution = solve(make_scene(0, frames=30).problem, SolveOptions(pose_states=()))
+{after}
+print(repr(solution.cost))
+"""
+
+
+def cost_in_a_fresh_process(before="", after=""):
+    """That of a small problem; ``before`` and ``after`` are run around its solve."""
+    return float(said_by(SOLVE.format(before=before, after=after)))
+
+
+def said_by(program):
+    """What a program says on stdout, and that it says nothing else."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.strip()
+
+
+def test_torch_does_not_import_its_compiler_but_where_it_has_another_mark_than_we_know():
+    """The mark is private: one that cannot be set stands for what a later torch may have."""
+    before = """
+import torch
+from v2hdm.adjust import lbfgs
+class Shut:
+    __slots__ = ()
+    def __call__(self, *arguments): raise AssertionError
+torch.optim.Optimizer.shut = type("Wrapper", (), {"__wrapped__": Shut()})()
+"""
+    usual = cost_in_a_fresh_process(after="assert 'torch._dynamo' not in sys.modules")
+    assert cost_in_a_fresh_process(before) == usual
+
+
+KERNEL = """
+from pathlib import Path
+
+import pytest
+from v2hdm.adjust.engines.numba import build
+build.PLACES = (Path({place!r}),)
+import numpy as np
+from v2hdm.adjust.engines.numba.engine import _gather
+out = np.zeros((1, 1))
+_gather(np.zeros(1, dtype=np.int32), np.ones((1, 1)), out)
+print(out[0])
+"""
+
+
+@pytest.mark.slow
+def test_kernels_are_kept_and_where_they_cannot_be_they_are_compiled(tmp_path):
+    """In a folder that is a file, or from damaged files, a process compiles for itself and says nothing."""
+    blocked, kept = tmp_path / "file", tmp_path / "kept"
+    blocked.write_text("")
+    assert said_by(KERNEL.format(place=str(blocked))) == "[1.]"
+    program = KERNEL.format(place=str(kept))
+    assert said_by(program) == "[1.]"
+    stamps = {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")}
+    assert stamps
+    assert said_by(program) == "[1.]"
+    assert {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")} == stamps
+    for path in stamps:
+        path.write_bytes(b"damaged")
+    assert said_by(program) == "[1.]"

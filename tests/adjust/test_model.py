@@ -91,28 +91,6 @@ def test_gradcheck_of_the_observation_residual_holds_up_to_the_horizon(distance_
     assert torch.autograd.gradcheck(residual, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("size", [0.0, 0.05])
-def test_blocks_by_pair_and_corner_spread_to_the_full_derivative(size):
-    arrays, estimate = example(size=size, frames=6, clock=True)
-    engine = make_engine("torch", arrays)
-    poses = engine.poses(estimate).flatten(0, 1)
-    by_pair, by_corner = engine.linearise(arrays.whole(), poses, estimate.corners_map, Loss("none", 1.0))
-    spread = engine.spread(estimate)
-    by_state, by_clock = (part.flatten(0, 1) for part in (spread.state, spread.clock))
-    k = len(arrays.corner) // 2
-    steps = [torch.zeros(arrays.camera_count, 6), torch.zeros_like(estimate.frame_state)]
-    steps = [step.to(torch.float64) for step in [*steps, torch.zeros_like(estimate.corners_map)]]
-    steps += [torch.zeros_like(estimate.clock_s)]
-    full = torch.autograd.functional.jacobian(
-        lambda *s: residuals(arrays, moved(estimate, *s))[:, k], tuple(steps)
-    )
-    camera, frame = divmod(int(arrays.pair[k]), arrays.frame_count)
-    torch.testing.assert_close(by_pair[k], full[0][:, camera])
-    torch.testing.assert_close(by_pair[k] @ by_state[arrays.pair[k]], full[1][:, frame])
-    torch.testing.assert_close(by_corner[k], full[2][:, arrays.corner[k]])
-    torch.testing.assert_close(by_pair[k] @ by_clock[arrays.pair[k]], full[3][:, camera])
-
-
 def test_behind_the_camera_the_residual_grows_on_and_leads_back_to_the_front():
     depth = torch.linspace(0.3, -3.0, 34, dtype=torch.float64)
     points = torch.stack([torch.full_like(depth, 0.2), torch.full_like(depth, -0.1), depth], dim=1)

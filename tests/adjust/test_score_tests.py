@@ -1,20 +1,16 @@
 """Score tests of wrong inputs, against solving with the input freed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.adjust.scene import Scene, make_scene, with_late_clocks
+from tests.adjust.scene import FOCAL, HEIGHT, PIXEL_SIGMA, WIDTH, Scene, exp, make_scene, with_late_clocks
 from v2hdm.adjust import (
     ControlPoints,
     Fault,
     KnownLengths,
     PoseSigma,
-    Problem,
-    ScoreTest,
     SolveOptions,
     pose_innovations,
     score_faults,
@@ -25,48 +21,48 @@ OPTIONS = SolveOptions(coarse=False, loss="none")
 POSES = PoseSigma(0.01, 0.001, 0.002, 0.005)
 
 
-def scene(seed: int = 3) -> Scene:
+def scene(seed=3):
     return make_scene(seed, frames=60, every_m=3.0, jitter=POSES, start_error_deg=0.5)
 
 
-def found_of(problem: Problem, fault: Fault, camera: int, axis: int = 0) -> ScoreTest:
+def found_of(problem, fault, camera, axis=0):
     found = score_faults(problem, solve(problem, OPTIONS))
     (one,) = [s for s in found if (s.fault, s.camera, s.axis) == (fault, camera, axis)]
     return one
 
 
-def with_focal(problem: Problem, factor: float) -> Problem:
+def with_focal(problem, factor):
     intrinsic = problem.intrinsic.copy()
     intrinsic[:, :2] *= factor
     return replace(problem, intrinsic=intrinsic)
 
 
-def test_a_right_problem_contradicts_nothing() -> None:
+def test_a_right_problem_contradicts_nothing():
     problem = scene().problem
     assert all(one.sigmas < 4 for one in score_faults(problem, solve(problem, OPTIONS)))
 
 
-def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() -> None:
+def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
     problem = with_focal(scene().problem, 1.002)
     step = 5e-4
     low, middle, high = (2 * solve(with_focal(problem, 1 + p), OPTIONS).cost for p in (-step, 0.0, step))
     curvature, slope = (high - 2 * middle + low) / step**2, (high - low) / (2 * step)
     one = found_of(problem, Fault.FOCAL, -1)
     assert one.value == pytest.approx(-slope / curvature, rel=0.05)
-    assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.05)
-    assert one.gain == pytest.approx(slope**2 / (2 * curvature), rel=0.1)
+    assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.3), "by what the stretches disagree"
+    assert 0 < one.gain < slope**2 / (4 * curvature), "stretches that the others predict gain less"
     assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
 
 
-def test_a_late_clock_is_found_and_named_first() -> None:
+def test_a_late_clock_is_found_and_named_first():
     late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
     found = score_faults(late, solve(late, OPTIONS))
     assert (found[0].fault, found[0].camera) == (Fault.CLOCK, 0)
     assert found[0].value == pytest.approx(0.06, abs=0.01)
-    assert found[0].sigmas > 10
+    assert found[0].sigmas > 7
 
 
-def test_a_survey_is_held_against_what_the_drive_says_without_it() -> None:
+def test_a_survey_is_held_against_what_the_drive_says_without_it():
     problem = scene().problem
     assert problem.centre_vehicle is not None
     centre = problem.centre_vehicle + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
@@ -81,7 +77,7 @@ def test_a_survey_is_held_against_what_the_drive_says_without_it() -> None:
     assert one.sigmas > 5
 
 
-def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses() -> None:
+def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses():
     problem = scene().problem
     assert problem.centre_vehicle is not None
     off = replace(problem, centre_vehicle=problem.centre_vehicle + np.array([1.2, 0.0, 0.0]))
@@ -90,7 +86,7 @@ def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses() -> 
     assert first.value == pytest.approx(-1.2, abs=0.1)
 
 
-def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_has() -> None:
+def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_has():
     street = scene()
     side_m = 0.35 * 2**0.5
     corners = street.corners_map
@@ -102,7 +98,7 @@ def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_ha
     assert one.value == pytest.approx(0.05, abs=0.005)
 
 
-def test_one_surveyed_point_off_is_told_from_all_off() -> None:
+def test_one_surveyed_point_off_is_told_from_all_off():
     street = scene()
     chosen = np.arange(0, len(street.corners_map), 12)
     points = street.corners_map[chosen].copy()
@@ -113,7 +109,7 @@ def test_one_surveyed_point_off_is_told_from_all_off() -> None:
     assert one.value == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_less() -> None:
+def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_less():
     problem = scene().problem
     vague = replace(
         problem,
@@ -129,7 +125,7 @@ def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_
     assert (np.median(seen, axis=0) < 0.7 * stated).all()
 
 
-def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not() -> None:
+def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not():
     problem = scene().problem
     right = pose_innovations(solve(problem, OPTIONS)).rms()
     assert max(right.values()) < 1.2
@@ -137,7 +133,7 @@ def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_mor
     assert pose_innovations(solve(small, OPTIONS)).rms()["heading"] > 1.4
 
 
-def test_observations_that_the_loss_has_switched_off_do_not_vote() -> None:
+def test_observations_that_the_loss_has_switched_off_do_not_vote():
     """Wrong associations put corners into the camera's plane, where residuals and derivatives are huge."""
     street = scene()
     problem, seen = street.problem, street.problem.observations
@@ -156,3 +152,104 @@ def test_observations_that_the_loss_has_switched_off_do_not_vote() -> None:
     )
     wrong, robust = replace(problem, observations=more), replace(OPTIONS, loss="cauchy")
     assert all(one.sigmas < 5 for one in score_faults(wrong, solve(wrong, robust)))
+
+
+def seen_again(scene, cam_from_vehicle, map_from_vehicle, z_m=0.0):
+    """The scene's observations (K,) by cameras (K, 4, 4) at poses (K, 4, 4), their corners at heights."""
+    seen = scene.problem.observations
+    points = np.column_stack(
+        [scene.corners_map[seen.corner], np.broadcast_to(z_m, len(seen.corner)), np.ones(len(seen.corner))]
+    )
+    points = (cam_from_vehicle @ np.linalg.inv(map_from_vehicle) @ points[..., None])[:, :3, 0]
+    pixel = FOCAL * points[:, :2] / points[:, 2:] + np.array([WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
+    pixel += np.random.default_rng(0).normal(0, PIXEL_SIGMA, pixel.shape)
+    return replace(scene.problem, observations=replace(seen, pinhole_px=pixel))
+
+
+def turned(deg: float, axis: int):
+    return exp(np.eye(6)[3 + axis] * np.deg2rad(deg))
+
+
+def knocked(scene: Scene):
+    """The first camera is turned by .6 deg in yaw, about its centre, halfway."""
+    seen = scene.problem.observations
+    cameras = scene.cam_from_vehicle[seen.camera].copy()
+    own = cameras[0]
+    turn = own @ turned(0.6, 2) @ np.linalg.inv(own)
+    turn[:3, 3] = 0.0
+    later = (seen.camera == 0) & (seen.frame >= len(scene.map_from_vehicle) // 2)
+    cameras[later] = turn @ cameras[later]
+    return seen_again(scene, cameras, scene.map_from_vehicle[seen.frame])
+
+
+def loaded(scene: Scene):
+    """The vehicle, and all cameras with it, pitches by .6 deg halfway."""
+    seen = scene.problem.observations
+    poses = scene.map_from_vehicle.copy()
+    poses[len(poses) // 2 :] = poses[len(poses) // 2 :] @ turned(0.6, 1)
+    return seen_again(scene, scene.cam_from_vehicle[seen.camera], poses[seen.frame])
+
+
+def stepped(scene: Scene):
+    """Recorded positions step by 30 cm halfway."""
+    poses = scene.problem.map_from_vehicle.copy()
+    poses[len(poses) // 2 :, 0, 3] -= 0.3
+    return replace(scene.problem, map_from_vehicle=poses)
+
+
+def crowned(scene: Scene):
+    """The ground falls by 3 % to both sides of the route."""
+    seen = scene.problem.observations
+    poses = scene.map_from_vehicle
+    away = scene.corners_map[:, None] - poses[None, :, :2, 3]
+    nearest = np.linalg.norm(away, axis=2).argmin(axis=1)
+    aside = np.abs(np.einsum("na,na->n", away[np.arange(len(away)), nearest], poses[nearest, :2, 1]))
+    return seen_again(
+        scene, scene.cam_from_vehicle[seen.camera], poses[seen.frame], -0.03 * aside[seen.corner]
+    )
+
+
+def drifting(scene: Scene):
+    """Clocks of both cameras go wrong by .1 s from the first image to the last."""
+    late = with_late_clocks(scene, np.zeros(2))
+    seen, twist = late.problem.observations, late.problem.twist_vehicle
+    assert twist is not None
+    share = seen.frame / (len(scene.map_from_vehicle) - 1) - 0.5
+    then = late.problem.map_from_vehicle[seen.frame] @ exp(twist[seen.frame] * 0.1 * share[:, None])
+    again = seen_again(scene, scene.cam_from_vehicle[seen.camera], then)
+    return replace(late.problem, observations=again.observations)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault", "value"),
+    [
+        (knocked, Fault.KNOCK, 0.0105),
+        (loaded, Fault.KNOCK, 0.0105),
+        (stepped, Fault.STEP, 0.3),
+        (crowned, Fault.CROWN, 0.03),
+        (drifting, Fault.CLOCK_DRIFT, 0.1),
+    ],
+)
+def test_a_fault_that_begins_or_grows_on_the_way_is_the_likeliest(change, fault: Fault, value: float):
+    street = make_scene(3, frames=80, every_m=3.0, jitter=None, start_error_deg=0.3)
+    problem = change(street)
+    first = score_faults(problem, solve(problem, OPTIONS))[0]
+    assert first.fault is fault
+    assert abs(first.value) == pytest.approx(value, rel=0.25)
+    assert first.sigmas > 5
+
+
+def test_noise_that_goes_together_along_the_route_contradicts_nothing():
+    """Attitudes wander smoothly, three times as far as stated: sigmas of the tests grow with them."""
+    worst = []
+    for seed in range(4):
+        street = make_scene(seed, frames=80, every_m=3.0, jitter=None, start_error_deg=0.3)
+        rng, seen = np.random.default_rng(seed), street.problem.observations
+        smooth = np.array([np.convolve(row, np.hanning(9), "same") for row in rng.normal(size=(2, 80))])
+        smooth *= 0.006 / smooth.std()
+        tangent = np.zeros((80, 6))
+        tangent[:, 3:5] = smooth.T
+        poses = street.map_from_vehicle @ exp(tangent)
+        problem = seen_again(street, street.cam_from_vehicle[seen.camera], poses[seen.frame])
+        worst.append(max(one.sigmas for one in score_faults(problem, solve(problem, OPTIONS))))
+    assert max(worst) < 5

@@ -1,12 +1,12 @@
-"""The drive itself says which model of its poses' errors is right."""
+"""Which model of pose errors a drive asks for, what it leaves open, and what a solve leaves out."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.adjust.scene import make_scene, with_late_clocks
-from v2hdm.adjust import MODELS, PoseSigma, SolveOptions, select_model, solve
+from tests.adjust.scene import make_scene, rows_of, with_late_clocks
+from v2hdm.adjust import MODELS, PoseSigma, SolveOptions, Verdict, observability, select_model, solve
 from v2hdm.adjust.selection import restrict
 from v2hdm.errors import AdjustError
 
@@ -69,3 +69,69 @@ def test_a_part_of_a_problem_has_the_residuals_of_the_whole():
     assert part.corner_count == len(corners)
     np.testing.assert_array_equal(corners[part.observations.corner], seen.corner[keep])
     assert solve(part, SolveOptions(pose_states=(), loss="none")).chi2_per_dof == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_a_straight_drive_leaves_forward_and_left_to_the_survey(cameras):
+    scene = make_scene(1, frames=40, turn_deg_per_m=0.0, cameras=cameras, jitter=PoseSigma())
+    for camera in observability(scene.problem, solve(scene.problem)):
+        assert camera.unobserved == ("forward", "left")
+        # The direction is common to both cameras, so two surveys halve its variance.
+        assert camera.sigma[0] == pytest.approx(0.03 / np.sqrt(cameras), rel=0.1)
+        assert "turn" in camera.sentence("front")
+
+
+def test_turns_fix_all_offsets():
+    scene = make_scene(1, frames=90, turn_deg_per_m=8.0)
+    for camera in observability(scene.problem, solve(scene.problem)):
+        assert camera.unobserved == ()
+        assert camera.sigma[:3].max() < 0.015
+        assert "the drive fixes both" in camera.sentence("rear")
+
+
+def test_what_is_said_of_the_centre_holds():
+    scene = make_scene(2, frames=60, turn_deg_per_m=0.0, cameras=1)
+    solution = solve(scene.problem)
+    (camera,) = observability(scene.problem, solution)
+    truth, found = (
+        -m[0, :3, :3].T @ m[0, :3, 3] for m in (scene.cam_from_vehicle, solution.cam_from_vehicle)
+    )
+    assert np.all(np.abs(found - truth) < 4 * camera.sigma[:3])
+
+
+def test_wrong_associations_are_listed_with_a_reason_and_few_others_are():
+    clean = make_scene(7, frames=50, jitter=PoseSigma()).problem
+    soiled = make_scene(7, frames=50, jitter=PoseSigma(), outliers=0.03).problem
+    off = np.linalg.norm(soiled.observations.pinhole_px - clean.observations.pinhole_px, axis=1)
+    solution = solve(soiled)
+    out = solution.excluded(soiled.observations)
+    assert [one.observation for one in out] == sorted(
+        np.flatnonzero(~solution.accepted), key=lambda k: -solution.mahalanobis2[k]
+    )
+    assert not solution.accepted[off > 10].any()
+    assert np.mean(~solution.accepted[off == 0]) < 2e-3
+    assert out[0].verdict is Verdict.CONTRADICTS
+    assert out[0].sentence.startswith(f"observation {out[0].observation} (corner {out[0].corner}, camera")
+    assert out[0].distance_sigma == np.sqrt(solution.mahalanobis2[out[0].observation])
+
+
+def test_of_two_observations_that_disagree_neither_is_believed():
+    problem = make_scene(8, frames=40, jitter=PoseSigma()).problem
+    seen = problem.observations
+    mine = np.flatnonzero(seen.corner == 20)
+    keep = np.ones(len(seen.corner), dtype=bool)
+    keep[mine[1:-1]] = False
+    pair = replace(problem, observations=rows_of(seen, keep))
+    assert solve(pair).accepted[pair.observations.corner == 20].all()
+    moved = pair.observations.pinhole_px.copy()
+    first, second = np.flatnonzero(pair.observations.corner == 20)
+    moved[first] += [60.0, -40.0]
+    verdict = solve(replace(pair, observations=replace(pair.observations, pinhole_px=moved))).verdict
+    assert Verdict.ACCEPTED not in verdict[[first, second]]
+    assert Verdict.CONTRADICTS in verdict[[first, second]]
+
+
+def test_the_gate_loses_the_share_of_sound_observations_that_it_is_told():
+    problem = make_scene(9, frames=60).problem
+    solution = solve(problem, SolveOptions(pose_states=(), gate_probability=0.05))
+    assert abs(np.mean(~solution.accepted) - 0.05) < 0.015

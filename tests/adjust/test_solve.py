@@ -1,20 +1,20 @@
 """Recovery of known streets, and the optimum against an independent solver."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.adjust.scene import Scene, make_scene, with_late_clocks
+from tests.adjust.scene import make_scene, rows_of, with_late_clocks
 from v2hdm.adjust import (
     ControlPoints,
     Drift,
     KnownLengths,
     Observations,
     PoseSigma,
-    Problem,
     SolveOptions,
     Status,
     solve,
@@ -25,7 +25,7 @@ POSES = PoseSigma()
 REAL = PoseSigma(position_m=0.02, heading_rad=0.0017, roll_pitch_rad=0.005, height_m=0.01)
 
 
-def reference_residuals(problem: Problem, x: np.ndarray) -> np.ndarray:
+def reference_residuals(problem, x):
     """The model of the problem's docstring, written anew in plain numpy: all residuals, flat."""
     cameras, frames, count = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
     extrinsic, state, corners = np.split(x, [6 * cameras, len(x) - 2 * count])
@@ -56,26 +56,18 @@ def reference_residuals(problem: Problem, x: np.ndarray) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def reference_optimum(scene: Scene) -> float:
+def reference_optimum(scene):
     """The least cost that scipy finds from the truth."""
     problem = scene.problem
     turn = scene.cam_from_vehicle[:, :3, :3] @ problem.cam_from_vehicle[:, :3, :3].transpose(0, 2, 1)
     extrinsic = np.column_stack([problem.centre_vehicle, Rotation.from_matrix(turn).as_rotvec()])
     states = np.zeros(6 * len(problem.map_from_vehicle))
     start = np.concatenate([extrinsic.ravel(), states, scene.corners_map.ravel()])
-    found = least_squares(
-        lambda x: reference_residuals(problem, x),
-        start,
-        jac="3-point",
-        x_scale="jac",
-        ftol=1e-15,
-        xtol=1e-15,
-        gtol=1e-15,
-    )
-    return float(found.cost)
+    exact = {"jac": "3-point", "x_scale": "jac", "ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
+    return float(least_squares(partial(reference_residuals, problem), start, **exact).cost)
 
 
-def sides(scene: Scene, sigma_m: float, error_m: float = 0.0) -> KnownLengths:
+def sides(scene, sigma_m, error_m=0.0):
     """Two sides and a diagonal of every other diamond of which all corners are seen, off by ``error_m``."""
     corners = scene.corners_map
     whole = [k for k in range(len(corners) - 3) if np.ptp(corners[k : k + 4], axis=0).max() < 0.75][::2]
@@ -104,15 +96,8 @@ def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(
 @pytest.mark.parametrize("turn_deg_per_m", [0.0, 4.0])
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_the_papers_model_recovers_a_street_with_perfect_poses(start_error_deg, turn_deg_per_m, cameras):
-    scene = make_scene(
-        5,
-        frames=70,
-        start_error_deg=start_error_deg,
-        turn_deg_per_m=turn_deg_per_m,
-        cameras=cameras,
-        prior_sigma_m=0.005,
-        start_error_m=0.3,
-    )
+    given = {"start_error_deg": start_error_deg, "turn_deg_per_m": turn_deg_per_m, "cameras": cameras}
+    scene = make_scene(5, frames=70, prior_sigma_m=0.005, start_error_m=0.3, **given)
     solution = solve(scene.problem, PAPER)
     assert solution.status is Status.CONVERGED
     assert scene.corner_rmse_m(solution.corners_map) < 0.02
@@ -187,16 +172,9 @@ def test_the_same_problem_gives_the_same_bits_and_another_order_the_same_optimum
     first, second = solve(problem), solve(problem)
     assert np.array_equal(first.corners_map, second.corners_map)
     assert np.array_equal(first.cam_from_vehicle, second.cam_from_vehicle)
-    order = np.random.default_rng(0).permutation(len(problem.observations.corner))
     seen = problem.observations
-    shuffled = Observations(
-        seen.camera[order],
-        seen.frame[order],
-        seen.corner[order],
-        seen.pinhole_px[order],
-        seen.covariance_px[order],
-    )
-    third = solve(replace(problem, observations=shuffled))
+    order = np.random.default_rng(0).permutation(len(seen.corner))
+    third = solve(replace(problem, observations=rows_of(seen, order)))
     np.testing.assert_allclose(third.corners_map, first.corners_map, atol=1e-9)
     np.testing.assert_allclose(third.mahalanobis2, first.mahalanobis2[order], atol=1e-6)
     np.testing.assert_allclose(third.residual_px, first.residual_px[order], atol=1e-6)
@@ -222,14 +200,8 @@ def test_the_corners_may_be_given_a_start():
 
 def test_the_cost_is_the_sum_of_its_named_terms():
     solution = solve(make_scene(13, frames=40, jitter=POSES).problem)
-    assert set(solution.cost_terms) == {
-        "observations",
-        "camera_centre",
-        "frame_states",
-        "clock_offsets",
-        "control_points",
-        "known_lengths",
-    }
+    names = "observations camera_centre frame_states clock_offsets control_points known_lengths"
+    assert set(solution.cost_terms) == set(names.split())
     assert solution.cost == pytest.approx(sum(solution.cost_terms.values()))
     assert solution.gap <= 1e-11
 
@@ -264,7 +236,7 @@ def test_two_control_points_undo_the_drift_of_the_receiver():
     assert tied.chi2_per_dof == pytest.approx(1, abs=0.07)
 
 
-def far_marking(seed: int) -> tuple[Scene, np.ndarray]:
+def far_marking(seed):
     """A street on which one diamond, the corners that are returned, is only seen from beyond 18 m."""
     scene = make_scene(seed, frames=60, max_range_m=30.0, cameras=1, prior_sigma_m=0.005, start_error_deg=1.0)
     seen, corners = scene.problem.observations, scene.corners_map
@@ -272,9 +244,7 @@ def far_marking(seed: int) -> tuple[Scene, np.ndarray]:
     whole = [k for k in range(40, len(corners) - 3) if np.ptp(corners[k : k + 4], axis=0).max() < 0.75]
     mine = np.arange(whole[0], whole[0] + 4)
     keep = ~np.isin(seen.corner, mine) | (apart > 18)
-    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
-    problem = replace(scene.problem, observations=Observations(*(part[keep] for part in parts)))
-    return replace(scene, problem=problem), mine
+    return replace(scene, problem=replace(scene.problem, observations=rows_of(seen, keep))), mine
 
 
 def test_known_sizes_make_a_far_marking_better_and_its_covariance_says_how_much():

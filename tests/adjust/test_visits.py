@@ -1,54 +1,38 @@
 """Two visits of one street in one problem: drifts and clocks are their own, cameras and corners common."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.adjust.scene import Scene, exp, make_scene, pose_errors, project, with_late_clocks
+from tests.adjust.scene import exp, make_scene, pose_errors, project, with_late_clocks
 from tests.adjust.site import DRIFTING, SCATTERING, site
-from v2hdm.adjust import (
-    ControlPoints,
-    KnownLengths,
-    Observations,
-    PoseSigma,
-    Problem,
-    SolveOptions,
-    Status,
-    score_faults,
-    solve,
-)
+from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, Status, score_faults, solve
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.errors import AdjustError
 
 
-def joined(first: Problem, second: Problem) -> Problem:
+def joined(first, second):
     """Two problems of the same cameras and corners as two visits of one problem."""
     frames = [len(one.map_from_vehicle) for one in (first, second)]
-    parts = [first.observations, second.observations]
-    seen = Observations(
-        camera=np.concatenate([one.camera for one in parts]),
-        frame=np.concatenate([parts[0].frame, parts[1].frame + frames[0]]),
-        corner=np.concatenate([one.corner for one in parts]),
-        pinhole_px=np.concatenate([one.pinhole_px for one in parts]),
-        covariance_px=np.concatenate([one.covariance_px for one in parts]),
-    )
+    one, other = first.observations, second.observations
+    other = replace(other, frame=other.frame + frames[0])
+    names = ("camera", "frame", "corner", "pinhole_px", "covariance_px")
+    seen = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in names}
     twists = [one.twist_vehicle for one in (first, second)]
     return replace(
         first,
         map_from_vehicle=np.concatenate([first.map_from_vehicle, second.map_from_vehicle]),
-        observations=seen,
+        observations=replace(one, **seen),
         pose_sigma=(first.pose_sigma, second.pose_sigma),
         twist_vehicle=None if twists[0] is None else np.concatenate(twists),
         visit=np.repeat([0, 1], frames),
     )
 
 
-def visited_again(scene: Scene, sigma: PoseSigma, seed: int) -> Scene:
+def visited_again(scene, sigma, seed):
     """The same street with poses that are off by ``sigma``, and new noise of the pixels."""
     rng, problem = np.random.default_rng(seed), scene.problem
     poses = problem.map_from_vehicle @ exp(pose_errors(problem.map_from_vehicle, sigma, 0.5, rng))
@@ -62,11 +46,11 @@ def visited_again(scene: Scene, sigma: PoseSigma, seed: int) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def street() -> Scene:
+def street():
     return make_scene(3, frames=60)
 
 
-def test_two_visits_together_are_better_than_one_and_say_by_how_much() -> None:
+def test_two_visits_together_are_better_than_one_and_say_by_how_much():
     street, errors, sigmas = make_scene(3, frames=40, prior_sigma_m=0.002), [], []
     for seed in range(10):
         visits = [visited_again(street, DRIFTING, 10 * seed + k) for k in (1, 2)]
@@ -83,7 +67,7 @@ def test_two_visits_together_are_better_than_one_and_say_by_how_much() -> None:
     assert np.sqrt(both) == pytest.approx(stated[2], rel=0.35)
 
 
-def test_the_order_of_the_visits_changes_nothing(street: Scene) -> None:
+def test_the_order_of_the_visits_changes_nothing(street):
     first = visited_again(street, DRIFTING, 1).problem
     second = visited_again(street, SCATTERING, 2).problem
     one, other = solve(joined(first, second)), solve(joined(second, first))
@@ -91,25 +75,21 @@ def test_the_order_of_the_visits_changes_nothing(street: Scene) -> None:
     assert one.cost == pytest.approx(other.cost, rel=1e-9)
 
 
-def test_a_visit_without_drift_beside_one_with_it_is_as_by_itself(street: Scene) -> None:
+def test_a_visit_without_drift_beside_one_with_it_is_as_by_itself(street):
     """Far apart, and with cameras that are known, two visits have nothing to say of each other."""
     known = replace(street.problem, centre_sigma_m=np.full((2, 3), 1e-5))
     scene = replace(street, problem=known)
     first, second = visited_again(scene, DRIFTING, 3).problem, visited_again(scene, SCATTERING, 4).problem
     corners = first.corner_count
-    apart = replace(
-        joined(first, replace(second, observations=replace(
-            second.observations, corner=second.observations.corner + corners
-        ))),
-        corner_count=2 * corners,
-    )  # fmt: skip
+    moved = replace(second.observations, corner=second.observations.corner + corners)
+    apart = replace(joined(first, replace(second, observations=moved)), corner_count=2 * corners)
     cost = solve(apart).cost_terms["frame_states"]
     alone = [solve(one).cost_terms["frame_states"] for one in (first, second)]
     assert cost == pytest.approx(sum(alone), rel=0.1)
 
 
 @pytest.mark.parametrize("states", [(), ("roll", "pitch", "heading")])
-def test_every_visit_has_clocks_of_its_own(states: tuple[str, ...]) -> None:
+def test_every_visit_has_clocks_of_its_own(states):
     offsets_s = np.array([[0.03, -0.02], [-0.01, 0.04]])
     street = make_scene(14, frames=60, turn_deg_per_m=8.0, prior_sigma_m=0.01)
     problems = [with_late_clocks(street, offsets_s[:, visit]).problem for visit in (0, 1)]
@@ -123,16 +103,15 @@ def test_every_visit_has_clocks_of_its_own(states: tuple[str, ...]) -> None:
     assert plain.clock_offset_s == pytest.approx(found.clock_offset_s, abs=1e-6)
 
 
-def test_visits_that_are_not_numbered_in_order_are_refused(street: Scene) -> None:
+def test_visits_that_are_not_numbered_in_order_are_refused(street):
     problem = joined(street.problem, street.problem)
-    assert problem.visit is not None
     with pytest.raises(AdjustError, match="rising along the frames"):
         solve(replace(problem, visit=problem.visit[::-1]))
     with pytest.raises(AdjustError, match="visit 1 has no pose_sigma"):
         solve(replace(problem, pose_sigma=(PoseSigma(),)))
 
 
-def with_knowledge(problem: Problem) -> Problem:
+def with_knowledge(problem):
     """A survey and known lengths, some of them between corners of several drives and of one, and clocks."""
     start = solve(problem, SolveOptions(coarse=False)).corners_map
     first, second = np.array([0, 8, 9, 30]), np.array([1, 9, 10, problem.corner_count - 1])
@@ -150,8 +129,8 @@ def with_knowledge(problem: Problem) -> Problem:
 
 @pytest.mark.parametrize(("overlap", "known", "loss"), [(40, False, "cauchy"), (12, True, "huber")])
 def test_drives_whose_shared_corners_are_kept_are_adjusted_as_with_all_corners_eliminated(
-    overlap: int, known: bool, loss: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    overlap, known, loss, monkeypatch
+):
     problem = site(3, 40, overlap)
     options = SolveOptions(coarse=False, loss=loss, clock_offset=known)
     if known:
@@ -180,7 +159,7 @@ def test_drives_whose_shared_corners_are_kept_are_adjusted_as_with_all_corners_e
         assert one.gain == pytest.approx(other.gain, rel=1e-5, abs=1e-6)
 
 
-def test_many_drives_of_one_way_take_less_with_their_corners_kept() -> None:
+def test_many_drives_of_one_way_take_less_with_their_corners_kept():
     crowd = make_engine("numba", make_arrays(site(6, 100, 100), POSE_STATES, "cpu"))
     plan = crowd.plan()
     eliminated = make_engine("torch", crowd.arrays).plan()

@@ -30,8 +30,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.fleet.cluster import LOCAL, cluster
-from v2hdm.fleet.executor import RayExecutor
-from v2hdm.fleet.workers import DetectorActor, detect_by
+from v2hdm.fleet.workers import DetectorActor, RayExecutor, detect_by
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.context import Context

@@ -104,6 +104,7 @@ def map_drive(
         output=str(output),
         cache=str(cache),
         workers=1,
+        accuracy_goal_cm=1e4,  # a coarse map is no word on its input
     )
     try:
         result = run(settings)

@@ -1,13 +1,11 @@
 """Ten surveyed points before a camera whose mounting is known, projected by OpenCV."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.geometry.rigid import rotation_from_euler
+from tests.cameras import mounted
 from v2hdm.records import CameraInfo, FloatArray
 
 MATRIX = np.array([[900.0, 0.0, 645.5], [0.0, 900.0, 355.5], [0.0, 0.0, 1.0]])
@@ -25,12 +23,8 @@ ANGLES_DEG = (0.3, 16.0, 0.6)
 
 def mounting(angles_deg: tuple[float, float, float] = ANGLES_DEG, centre: FloatArray = CENTRE) -> FloatArray:
     """``cam_from_vehicle`` of roll, pitch (down), yaw (left) and the camera's place."""
-    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    turn = rotation_from_euler(*(np.radians([angle]) for angle in angles_deg))[0] @ level
-    out = np.eye(4)
-    out[:3, :3] = turn.T
-    out[:3, 3] = -turn.T @ centre
-    return out
+    roll_deg, pitch_deg, yaw_deg = angles_deg
+    return mounted(centre, pitch_deg, yaw_deg, roll_deg)
 
 
 def project(cam_from_vehicle: FloatArray, places: FloatArray, matrix: FloatArray = MATRIX) -> FloatArray:

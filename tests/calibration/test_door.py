@@ -1,12 +1,11 @@
-"""``v2hdm calibrate points``: other commands take what it writes, and every mistake is one line."""
-
-from __future__ import annotations
+"""``v2hdm calibrate points`` and ``compare``: what they write and say, and every mistake in one line."""
 
 import csv
 import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,32 +14,37 @@ import pytest
 import yaml
 
 from tests.calibration.site import CENTRE, INFO, MATRIX, PLACES, clicked, mounting, project, write_table
+from tests.cameras import mounted
 from tests.docs.blocks import blocks, document
 from tests.drive.example import make_drive
+from v2hdm.calibration.compare import FALSE_ALARM, movement
+from v2hdm.calibration.from_points import calibrate_from_points
+from v2hdm.calibration.points import check_points, read_points
 from v2hdm.cli.main import run as run_command
 from v2hdm.detection.camera import camera_from_calibration
+from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.io.calibration import read_calibration, read_provenance, write_camera_info
+from v2hdm.geometry.rigid import exp
+from v2hdm.io.calibration import read_calibration, read_provenance, write_calibration, write_camera_info
 from v2hdm.io.drive import read_drive
-from v2hdm.records import FloatArray
+from v2hdm.records import Calibration, CameraInfo
+from v2hdm.verdict import Status
 
 
 @pytest.fixture
-def intrinsics(tmp_path: Path) -> Path:
+def intrinsics(tmp_path):
     write_camera_info(INFO, tmp_path / "camera_info.yaml")
     return tmp_path / "camera_info.yaml"
 
 
-def run(folder: Path, table: tuple[FloatArray, FloatArray], *arguments: object) -> int:
+def run(folder, table, *arguments):
     path = write_table(folder, *table)
     output = [] if "--output" in arguments else ["--output", str(folder / "out")]
     return run_command(["calibrate", "points", str(path), *map(str, arguments), *output])
 
 
-def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(
-    tmp_path: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(tmp_path, intrinsics, capsys):
     image = np.full((720, 1280, 3), 90, np.uint8)
     cv2.imwrite(str(tmp_path / "yard.png"), image)
     given = ("--intrinsics", intrinsics, "--image", tmp_path / "yard.png")
@@ -49,7 +53,6 @@ def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(
     angles = re.match(
         r"front: roll (\S+) \+- (\S+) deg, pitch (\S+) \+- (\S+) deg, yaw (\S+) \+- (\S+) deg", shown
     )
-    assert angles is not None
     values = np.array(angles.groups(), dtype=float).reshape(3, 2)
     assert (np.abs(values[:, 0] - (0.3, 16.0, 0.6)) < 4 * values[:, 1]).all()
     assert "10 of 10 points agree" in shown
@@ -70,7 +73,7 @@ def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(
     assert (np.abs(picture.astype(int) - 90).max(axis=2) < 3).mean() > 0.2  # the image is in it
 
 
-def test_the_ipm_takes_recorded_pixels_to_the_surveyed_places(tmp_path: Path, intrinsics: Path) -> None:
+def test_the_ipm_takes_recorded_pixels_to_the_surveyed_places(tmp_path, intrinsics):
     assert run(tmp_path, clicked(seed=1), "--intrinsics", intrinsics) == 0
     entry = yaml.safe_load((tmp_path / "out/drive_camera.yaml").read_text())["cameras"]["front"]
     pinhole_px = undistort_points(INFO, project(mounting(), PLACES))
@@ -84,7 +87,7 @@ def test_the_ipm_takes_recorded_pixels_to_the_surveyed_places(tmp_path: Path, in
     assert entry["centre_prior"]["sigma_m"][2] < 0.02
 
 
-def test_a_drive_takes_the_entry_and_the_detector_the_calibration(tmp_path: Path, intrinsics: Path) -> None:
+def test_a_drive_takes_the_entry_and_the_detector_the_calibration(tmp_path, intrinsics):
     assert run(tmp_path, clicked(seed=1), "--intrinsics", intrinsics) == 0
     drive = tmp_path / "drive"
     drive.mkdir()
@@ -102,9 +105,7 @@ def test_a_drive_takes_the_entry_and_the_detector_the_calibration(tmp_path: Path
     np.testing.assert_allclose(detector.ipm["calibrated"], camera.ipm["calibrated"], atol=1e-12)
 
 
-def test_two_calibrations_of_one_camera_say_that_it_has_not_moved(
-    tmp_path: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_calibrations_of_one_camera_say_that_it_has_not_moved(tmp_path, intrinsics, capsys):
     tilted = mounting((0.3, 17.0, 0.6))
     for name, seed, truth in (("monday", 1, None), ("friday", 2, None), ("knocked", 3, tilted)):
         table = clicked(seed, cam_from_vehicle=truth)
@@ -114,9 +115,7 @@ def test_two_calibrations_of_one_camera_say_that_it_has_not_moved(
     assert re.search(r"front: MOVED .* pitch \+(0\.9|1\.0)", capsys.readouterr().out)
 
 
-def test_intrinsics_of_a_chain_need_the_camera_s_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_intrinsics_of_a_chain_need_the_camera_s_name(tmp_path, capsys):
     entry = {
         "camera_model": "pinhole",
         "distortion_coeffs": list(INFO.distortion[:4]),
@@ -136,9 +135,7 @@ def test_intrinsics_of_a_chain_need_the_camera_s_name(
     assert (tmp_path / "out/calibration_front.yaml").is_file()
 
 
-def test_a_wrong_point_is_a_warning_that_names_it(
-    tmp_path: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_point_is_a_warning_that_names_it(tmp_path, intrinsics, capsys):
     px, places = clicked(seed=1)
     places[6, 0] += 1.0
     assert run(tmp_path, (px, places), "--intrinsics", intrinsics) == 0
@@ -157,16 +154,14 @@ def test_a_wrong_point_is_a_warning_that_names_it(
         (lambda px, places: places.__setitem__(4, (-6.0, 1.0)), "P5 .*its place is behind the camera"),
     ],
 )
-def test_what_cannot_be_seen_on_the_ground_is_named(tmp_path, intrinsics, capsys, change, words) -> None:
+def test_what_cannot_be_seen_on_the_ground_is_named(tmp_path, intrinsics, capsys, change, words):
     px, places = clicked(seed=1)
     change(px, places)
     assert run(tmp_path, (px, places), "--intrinsics", intrinsics) == 0
     assert re.search(words, capsys.readouterr().out)
 
 
-def test_points_about_on_a_line_fail_and_the_files_say_so(
-    tmp_path: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_points_about_on_a_line_fail_and_the_files_say_so(tmp_path, intrinsics, capsys):
     places = np.column_stack([np.linspace(8, 16, 8), [0.3, 0.45, 0.3, 0.4, 0.3, 0.45, 0.35, 0.3]])
     px = project(mounting(), places) + np.random.default_rng(0).normal(0, 0.5, (8, 2))
     code = run(tmp_path, (px, places), "--intrinsics", intrinsics)
@@ -176,9 +171,7 @@ def test_points_about_on_a_line_fail_and_the_files_say_so(
     assert read_provenance(tmp_path / "out/calibration_front.yaml").verdict == "FAIL"
 
 
-def test_intrinsics_of_another_lens_fail(
-    tmp_path: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_intrinsics_of_another_lens_fail(tmp_path, intrinsics, capsys):
     px = project(mounting(), PLACES, MATRIX * [[1.12, 1, 1], [1, 1.12, 1], [1, 1, 1]])
     assert run(tmp_path, (px, PLACES), "--intrinsics", intrinsics) == 3
     assert re.search(r"want the focal length \+1[0-4]\.\d \+- \S+ % longer", capsys.readouterr().out)
@@ -187,10 +180,7 @@ def test_intrinsics_of_another_lens_fail(
 MISTAKES = {
     "left and right": (lambda px, places: (px, places * [1, -1]), "y is counted to the right"),
     "x and y": (lambda px, places: (px, places[:, ::-1]), "x and y are exchanged"),
-    "upward": (
-        lambda px, places: (np.column_stack([px[:, 0], 719 - px[:, 1]]), places),
-        "v is counted upward",
-    ),
+    "upward": (lambda px, places: (np.column_stack([px[:, 0], 719 - px[:, 1]]), places), "v is counted"),
     "half the size": (lambda px, places: (px / 2, places), "an image 0.5 times as large"),
     "millimetres": (lambda px, places: (px, 1e3 * places), "x and y look like millimetres; .* that is 2.4"),
     "centimetres": (lambda px, places: (px, 1e2 * places), "x and y look like centimetres"),
@@ -205,7 +195,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line_that_names_the_cause(tmp_path, intrinsics, capsys, mistake) -> None:
+def test_a_mistake_is_one_line_that_names_the_cause(tmp_path, intrinsics, capsys, mistake):
     change, expected = MISTAKES[mistake]
     assert run(tmp_path, change(*clicked(seed=4)), "--intrinsics", intrinsics) == 2
     error = capsys.readouterr().err
@@ -214,7 +204,7 @@ def test_a_mistake_is_one_line_that_names_the_cause(tmp_path, intrinsics, capsys
     assert not (tmp_path / "out").exists()
 
 
-def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys) -> None:
+def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys):
     square = type(INFO)("front", 1280, 1280, MATRIX, INFO.distortion_model, INFO.distortion)
     write_camera_info(square, tmp_path / "square.yaml")
     px, places = clicked(seed=4)
@@ -232,9 +222,7 @@ def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys) -> No
         (["--image", "none.png"], "none.png: image listed but missing"),
     ],
 )
-def test_options_that_cannot_be_are_one_line(
-    tmp_path, intrinsics, capsys, monkeypatch, arguments, words
-) -> None:
+def test_options_that_cannot_be_are_one_line(tmp_path, intrinsics, capsys, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("half.png", np.zeros((360, 640, 3), np.uint8))
     assert run(tmp_path, clicked(seed=1), "--intrinsics", intrinsics, *arguments) == 2
@@ -243,7 +231,7 @@ def test_options_that_cannot_be_are_one_line(
     assert error.count("\n") == 1
 
 
-def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, capsys, monkeypatch) -> None:
+def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, capsys, monkeypatch):
     text = document("docs/calibrate.md")
     command, table = blocks("docs/calibrate.md", "sh", "csv")
     monkeypatch.chdir(tmp_path)
@@ -258,3 +246,184 @@ def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, ca
     for name in re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE):
         place = Path("outputs/front-calibrate") / name.replace("<camera>", "front")
         assert place.exists() or name not in text.split("## What it writes")[1].split("##")[0], name
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_columns_come_in_any_order_and_with_any_separator(tmp_path, separator):
+    rows = [
+        ("x_m", "U", "name", "y_m", "v"),
+        *((x, u, f"P{n}", y, v) for n, (u, v, x, y) in enumerate(TABLE)),
+    ]
+    path = tmp_path / "points.csv"
+    path.write_text("\ufeff" + "\n".join(separator.join(map(str, row)) for row in rows) + "\n\n# the end\n")
+    points = read_points(path)
+    np.testing.assert_array_equal(np.column_stack([points.points_px, points.points_vehicle]), TABLE)
+    assert points.names[1] == "point P1 (line 3)"
+    assert points.labels[:2] == ("P0", "P1")
+
+
+TABLE = [(10.5, 20.0, 5.0, 1.0), (30.0, 20.5, 5.0, -1.0), (12.0, 12.0, 9.0, 1.5), (28.0, 12.25, 9.0, -1.5)]
+TEXT = "u,v,x,y\n" + "".join(",".join(map(str, row)) + "\n" for row in TABLE)
+
+WRONG_TABLES = {
+    "empty": ("", "is empty; expected the columns u, v, x, y"),
+    "three": ("\n".join(TEXT.splitlines()[:4]), "3 points; 4 barely fix a camera"),
+    "no header": (TEXT.split("\n", 1)[1], "no column 'u'; the first line must name u, v, x, y"),
+    "millimetres by name": (TEXT.replace("x,y", "x_mm,y_mm"), "no column 'x'; .* it says: u, v, x_mm, y_mm"),
+    "twice": (TEXT.replace("u,v", "u,u"), "more than one column 'u'"),
+    "height": (
+        TEXT.replace("x,y", "x,y,z").replace("0\n", "0,0\n").replace("5\n", "5,0\n"),
+        "column 'z' is not",
+    ),
+    "nan": (TEXT.replace("30.0", "nan"), "line 3: u: 'nan' is not a finite number; drop or mend"),
+    "words": (TEXT.replace("30.0", "left"), "line 3: u: 'left' is not a number; mend that line"),
+    "decimal comma": (
+        TEXT.replace(",", ";").replace("10.5", "10,5"),
+        "line 2: u: '10,5' is not a number; write a decimal point",
+    ),
+    "short line": (TEXT.replace("30.0,", ""), "line 3: 3 cells under 4 columns"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG_TABLES)
+def test_a_wrong_table_is_one_line_with_the_place(tmp_path, mistake):
+    text, expected = WRONG_TABLES[mistake]
+    (tmp_path / "points.csv").write_text(text)
+    with pytest.raises(DriveError, match=expected) as caught:
+        read_points(tmp_path / "points.csv")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda px, places: px.__setitem__(3, (1300.0, 400.0)), r"point P4 .* \(1300, 400\) lies outside"),
+        (lambda px, places: px.__setitem__(3, (-1.0, 400.0)), "lies outside the image of 1280 x 720; mend"),
+        (lambda px, places: px.__setitem__(3, px[6]), "P4 .* and point P7 .* have the same pixel"),
+        (lambda px, places: places.__setitem__(3, places[6]), "P4 .* have the same place on the ground"),
+        (lambda px, places: px.__setitem__(slice(None), px[:, ::-1].copy()), "u and v look exchanged"),
+    ],
+)
+def test_points_outside_the_image_and_repeated_ones_are_named(tmp_path, change, expected):
+    px, places = clicked(seed=3)
+    change(px, places)
+    points = read_points(write_table(tmp_path, px, places))
+    with pytest.raises(DriveError, match=expected) as caught:
+        check_points(points, INFO)
+    assert "\n" not in str(caught.value)
+
+
+def test_good_points_pass(tmp_path):
+    check_points(read_points(write_table(tmp_path, *clicked(seed=3))), INFO)
+    assert len(PLACES) == 10
+
+
+def test_a_calibration_from_points_is_data_and_writes_nothing(tmp_path):
+    found = calibrate_from_points(write_table(tmp_path, *clicked(seed=3)), INFO)
+    assert found.verdict.status is Status.PASS
+    assert found.calibration.covariance is not None
+    assert len(found.roi_vehicle) >= 3
+    assert [path.name for path in tmp_path.iterdir()] == ["points.csv"]
+
+
+AHEAD = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))
+SIGMA = np.array([0.006, 0.002, 0.007, 0.0003, 0.0006, 0.0003])
+
+
+def looking_ahead(info=AHEAD):
+    """2.5 m above the ground, 1.8 m ahead of the axle, 12 degrees down."""
+    return Calibration(info, mounted([1.8, 0.1, 2.5], pitch_deg=12), np.diag(SIGMA**2))
+
+
+def measured(true, rng):
+    """The same with an error of its covariance."""
+    return replace(true, cam_from_vehicle=exp(SIGMA * rng.standard_normal(6)) @ true.cam_from_vehicle)
+
+
+def turned(true, pitch_deg, yaw_deg, up_m=0.0):
+    """The camera pitched down, turned left about its own centre, and raised."""
+    p, y = np.deg2rad([pitch_deg, yaw_deg])
+    down = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
+    left = np.array([[np.cos(y), -np.sin(y), 0], [np.sin(y), np.cos(y), 0], [0, 0, 1]])
+    rotation = true.cam_from_vehicle[:3, :3]
+    centre = -rotation.T @ true.cam_from_vehicle[:3, 3] + [0, 0, up_m]
+    out = np.eye(4)
+    out[:3, :3] = rotation @ (left @ down).T
+    out[:3, 3] = -out[:3, :3] @ centre
+    return replace(true, cam_from_vehicle=out)
+
+
+def test_a_camera_that_stays_is_said_to_have_moved_as_seldom_as_stated():
+    rng = np.random.default_rng(0)
+    true = looking_ahead()
+    found = [movement(measured(true, rng), measured(true, rng)).probability for _ in range(2000)]
+    assert np.mean(np.array(found) < 0.05) == pytest.approx(0.05, abs=0.015)
+    assert np.mean(np.array(found) < FALSE_ALARM) < 0.004
+
+
+def test_a_movement_is_told_along_and_about_the_vehicles_axes():
+    true = looking_ahead()
+    found = movement(true, turned(true, 0.4, -0.3, 0.02))
+    assert found.moved
+    assert np.degrees(found.turn_rad) == pytest.approx([0, 0.4, -0.3], abs=0.005)
+    assert found.shift_m == pytest.approx([0, 0, 0.02], abs=1e-9)
+
+
+def test_the_stated_errors_of_a_movement_hold():
+    rng = np.random.default_rng(1)
+    true, after = looking_ahead(), turned(looking_ahead(), 2.0, 1.0)
+    off = []
+    for _ in range(400):
+        found = movement(measured(true, rng), measured(after, rng))
+        error = np.concatenate([found.shift_m, found.turn_rad - movement(true, after).turn_rad])
+        off.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(off) == pytest.approx(6.0, abs=0.6)
+
+
+def test_a_detectable_turn_is_hardly_ever_missed():
+    rng = np.random.default_rng(2)
+    true = looking_ahead()
+    pitch_deg = float(np.degrees(movement(true, true).detectable[4]))
+    moved = [
+        movement(measured(true, rng), measured(turned(true, pitch_deg, 0), rng)).moved for _ in range(300)
+    ]
+    assert np.mean(moved) == pytest.approx(0.95, abs=0.04)
+
+
+def test_calibrations_of_other_lenses_are_not_compared():
+    other = replace(AHEAD, intrinsic=AHEAD.intrinsic * [[1.01], [1.01], [1.0]])
+    with pytest.raises(MapFileError, match="intrinsics differ"):
+        movement(looking_ahead(), looking_ahead(other))
+    with pytest.raises(MapFileError, match="no covariance"):
+        movement(looking_ahead(), replace(looking_ahead(), covariance=None))
+
+
+def test_the_door_tells_which_camera_has_moved(tmp_path, capsys):
+    rear = replace(AHEAD, name="rear")
+    for folder, pitch_deg in (("before", 0.0), ("after", 0.5)):
+        (tmp_path / folder).mkdir()
+        write_calibration(looking_ahead(), tmp_path / folder / "calibration_front.yaml")
+        moved = turned(looking_ahead(rear), pitch_deg, 0)
+        write_calibration(moved, tmp_path / folder / "calibration_rear.yaml")
+    assert run_command(["calibrate", "compare", str(tmp_path / "before"), str(tmp_path / "after")]) == 3
+    front, rear_line = capsys.readouterr().out.splitlines()
+    assert front.startswith("front: not moved")
+    assert rear_line.startswith("rear: MOVED")
+    assert "pitch +0.50 +- " in rear_line
+
+
+def test_cameras_that_turn_alike_blame_the_heading(tmp_path, capsys):
+    for folder, yaw_deg in (("before", 0.0), ("after", 2.0)):
+        (tmp_path / folder).mkdir()
+        for name in ("front", "rear"):
+            one = turned(looking_ahead(replace(AHEAD, name=name)), 0, yaw_deg)
+            write_calibration(one, tmp_path / folder / f"calibration_{name}.yaml")
+    assert run_command(["calibrate", "compare", str(tmp_path / "before"), str(tmp_path / "after")]) == 3
+    assert "all cameras have turned alike" in capsys.readouterr().out
+
+
+def test_a_failed_drive_is_not_compared(tmp_path, capsys):
+    path = tmp_path / "calibration_front.yaml"
+    write_calibration(looking_ahead(), path, verdict={"status": "FAIL"})
+    assert run_command(["calibrate", "compare", str(path), str(path)]) == 2
+    assert "verdict on its drive is FAIL" in capsys.readouterr().err

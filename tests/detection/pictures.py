@@ -4,8 +4,6 @@
 lens, a Gaussian point spread, noise, sRGB coding. It shares no code with the package's renderer or fits.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from functools import lru_cache
@@ -16,6 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from tests.cameras import mounted
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.evidence import rectified_views
@@ -29,7 +28,6 @@ from v2hdm.geometry.quadrilateral import Quad, order_corners
 from v2hdm.records import DIAMOND, LANE_DASH, Camera, CameraInfo, LaneDetection
 
 HEIGHT, WIDTH = 360, 640
-OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 LENSES = {
     "pinhole": ("plumb_bob", (0.0, 0.0, 0.0, 0.0, 0.0)),
     "plumb_bob": ("plumb_bob", (-0.12, 0.03, 0.0005, -0.0004, 0.0)),
@@ -40,12 +38,7 @@ LENSES = {
 
 def extrinsic(height_m: float = 2.2, pitch_deg: float = 14.0, forward_m: float = 1.0) -> np.ndarray:
     """``cam_from_vehicle`` of a camera that looks ahead and down."""
-    c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
-    rotation = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ OPTICAL_FROM_LEVEL
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = rotation
-    cam_from_vehicle[:3, 3] = -rotation @ [forward_m, 0.0, height_m]
-    return cam_from_vehicle
+    return mounted([forward_m, 0.0, height_m], pitch_deg)
 
 
 def make_camera(lens: str = "plumb_bob", name: str = "front", **mounting: float) -> Camera:

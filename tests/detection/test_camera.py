@@ -1,15 +1,24 @@
-"""The camera as the detector sees it: the lens, its fast table, and the ground in view."""
+"""The camera as the detector sees it: lens, ground, covariances, and the pitch that lines show."""
 
+from dataclasses import replace
+from functools import cache
+
+import cv2
 import numpy as np
 import pytest
+import torch
 
-from tests.detection.pictures import LENSES, extrinsic, make_camera
-from v2hdm.detection.camera import FARTHEST_M, RoadCamera
-from v2hdm.geometry.ipm import (
-    apply_homography,
-    ipm_from_extrinsic,
-)
+from tests.detection.pictures import LENSES, extrinsic, make_camera, to_image
+from train.examples import example
+from v2hdm.cli.main import run
+from v2hdm.detection.camera import FARTHEST_M, RoadCamera, camera_from_calibration, rough_calibration
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.pitch import PitchVote, estimate_pitch, guessed_pitch_rad
+from v2hdm.errors import MapFileError
+from v2hdm.geometry.ipm import apply_homography, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.tensors import exp
+from v2hdm.records import LANE_BOUNDARY, LANE_LINE, Calibration, Camera, CameraInfo, LaneDetection
 
 GRID_PX = np.stack(np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 359, 11)), axis=-1).reshape(-1, 2)
 
@@ -71,3 +80,220 @@ def test_the_lens_jacobian_is_near_identity_for_a_mild_lens():
     view = RoadCamera(make_camera("plumb_bob"))
     jacobian = view.distort_jacobian(np.array([[320.0, 200.0], [500.0, 300.0]]))
     np.testing.assert_allclose(jacobian, np.broadcast_to(np.eye(2), (2, 2, 2)), atol=0.08)
+
+
+CORNERS = np.array([[6.0, 1.0], [7.0, 1.5], [6.5, 2.0], [5.5, 1.5]])
+
+
+def calibrated(lens="plumb_bob", covariance=None):
+    return Calibration(make_camera(lens).info, extrinsic(), covariance)
+
+
+def footprint(calibration, points_px):
+    return RoadCamera(camera_from_calibration(calibration)).footprint(points_px, calibration)
+
+
+def moved(calibration, tangent):
+    """The calibration perturbed on the left, as its covariance means it."""
+    step = exp(torch.as_tensor(tangent)).numpy()
+    return Calibration(calibration.info, step @ calibration.cam_from_vehicle)
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "equidistant"])
+def test_corners_land_where_they_are_on_the_ground(lens):
+    points_px = to_image(make_camera(lens), CORNERS)
+    found = footprint(calibrated(lens), points_px)
+    np.testing.assert_allclose(found.points_vehicle, CORNERS, atol=2e-3)
+    np.testing.assert_array_equal(found.joint_covariance(np.zeros((8, 8))), np.zeros((8, 8)))
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "equidistant"])
+def test_the_share_of_the_pixels_is_that_of_differences(lens):
+    calibration = calibrated(lens)
+    points_px = to_image(make_camera(lens), CORNERS)
+    spread = np.random.default_rng(0).normal(0, 0.1, (8, 8))
+    covariance_px = spread @ spread.T
+    covariance = footprint(calibration, points_px).joint_covariance(covariance_px)
+    jacobian = np.zeros((8, 8))
+    view = RoadCamera(camera_from_calibration(calibration))
+    for column in range(8):
+        step = np.zeros(8)
+        step[column] = 0.5
+        ends = [
+            view.ground(view.undistort(points_px + sign * step.reshape(4, 2))).ravel() for sign in (1, -1)
+        ]
+        jacobian[:, column] = ends[0] - ends[1]
+    np.testing.assert_allclose(covariance, jacobian @ covariance_px @ jacobian.T, rtol=0.03, atol=1e-7)
+
+
+def test_the_share_of_the_calibration_is_that_of_differences():
+    sigma = np.array([0.02, 0.01, 0.03, 0.002, 0.003, 0.001])
+    calibration = calibrated("pinhole", np.diag(sigma**2))
+    points_px = to_image(make_camera("pinhole"), CORNERS)
+    covariance = footprint(calibration, points_px).joint_covariance(np.zeros((8, 8)))
+    jacobian = np.zeros((8, 6))
+    for column, step in enumerate(1e-5 * np.eye(6)):
+        ends = [
+            footprint(moved(calibration, sign * step), points_px).points_vehicle.ravel() for sign in (1, -1)
+        ]
+        jacobian[:, column] = (ends[0] - ends[1]) / 2e-5
+    np.testing.assert_allclose(covariance, jacobian @ np.diag(sigma**2) @ jacobian.T, rtol=1e-4, atol=1e-9)
+
+
+def test_points_of_a_line_have_the_covariance_of_single_corners():
+    calibration = calibrated(covariance=np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6]))
+    points_px = to_image(make_camera(), CORNERS)
+    found = footprint(calibration, points_px)
+    single, together = found.single_covariances(0.5), found.joint_covariance(0.25 * np.eye(8))
+    for n in range(4):
+        np.testing.assert_allclose(single[n], together[2 * n : 2 * n + 2, 2 * n : 2 * n + 2], rtol=1e-9)
+
+
+def test_a_point_above_the_horizon_spoils_no_other():
+    points_px = to_image(make_camera(), CORNERS)
+    points_px[2] = [320.0, 5.0]
+    found = footprint(calibrated(), points_px)
+    covariance = found.joint_covariance(np.eye(8))
+    assert np.isnan(found.points_vehicle[2]).all()
+    others = [0, 1, 2, 3, 6, 7]
+    assert np.isfinite(covariance[np.ix_(others, others)]).all()
+    assert np.isnan(covariance[4:6]).all()
+
+
+def test_a_rough_description_gives_the_camera_that_it_says():
+    calibration = rough_calibration("c", 1280, 720, height_m=1.5, pitch_deg=10.0, fov_deg=90.0)
+    assert calibration.info.intrinsic[0, 0] == pytest.approx(640.0)
+    ipm = ipm_from_extrinsic(calibration.info, calibration.cam_from_vehicle)
+    ahead = ipm @ [639.5, 359.5, 1.0]
+    np.testing.assert_allclose(ahead[:2] / ahead[2], [1.5 / np.tan(np.deg2rad(10.0)), 0.0], atol=1e-9)
+    left = ipm @ [300.0, 500.0, 1.0]
+    assert left[1] / left[2] > 0
+    assert isinstance(camera_from_calibration(calibration), Camera)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"distortion_model": "fisheye"}, "unknown distortion_model 'fisheye'"),
+        ({"distortion": (0.1,)}, "plumb_bob has 5 coefficients, not 1"),
+        ({"width": 0}, "must be positive"),
+        ({"rotation": 1.1 * np.eye(3)}, "no rotation"),
+        ({"height_m": -0.5}, "under the ground"),
+        ({"pitch_deg": -60.0}, "above the horizon"),
+    ],
+)
+def test_a_calibration_that_cannot_be_right_is_refused(change, words):
+    info = vars(calibrated().info) | {key: change[key] for key in change if key in CameraInfo.__annotations__}
+    mounting = {key: change[key] for key in ("height_m", "pitch_deg") if key in change}
+    cam_from_vehicle = extrinsic(**mounting)
+    cam_from_vehicle[:3, :3] = change.get("rotation", cam_from_vehicle[:3, :3])
+    with pytest.raises(MapFileError, match=words):
+        camera_from_calibration(Calibration(CameraInfo(**info), cam_from_vehicle))
+
+
+HEIGHT_M, FOV_DEG = 1.5, 60.0
+LEFT_M = (-5.0, -1.7, 1.8, 5.0)
+RENDERED = (9, 12)
+"""Streets of the renders to fit to, seen nearly level."""
+
+
+def view_of(pitch_deg):
+    calibration = rough_calibration("camera", 1280, 720, HEIGHT_M, pitch_deg, FOV_DEG)
+    return RoadCamera(camera_from_calibration(calibration))
+
+
+def line(view, left_m, turned_rad=0.0, sway_px=0.0):
+    """A straight line on the ground, so far left of the camera, as it is seen."""
+    along = np.linspace(4.0, 25.0, 60)
+    ground = np.column_stack([along, left_m + np.tan(turned_rad) * along, np.ones_like(along)])
+    seen = ground @ view.pinhole_px_from_vehicle.T
+    px = seen[:, :2] / seen[:, 2:]
+    px = px[view.inside(px, 0)]
+    return LaneDetection(LANE_LINE, 0.9, px + [[sway_px, 0.0]] * np.sin(np.arange(len(px)))[:, None])
+
+
+@pytest.mark.parametrize("off_deg", [-4.0, 0.0, 4.0])
+@pytest.mark.parametrize("turned_rad", [0.0, 0.1])
+def test_the_lines_of_a_road_tell_the_pitch_whatever_the_guess(off_deg, turned_rad):
+    true = view_of(6.0)
+    lines = [line(true, left_m, turned_rad, sway_px=1.0) for left_m in LEFT_M]
+    told = estimate_pitch(lines, view_of(6.0 + off_deg))
+    assert np.rad2deg(told.pitch_rad) == pytest.approx(6.0, abs=0.4)
+    assert told.sigma_rad < np.deg2rad(0.6)
+
+
+def test_a_single_line_and_lines_of_one_slope_tell_nothing():
+    true = view_of(6.0)
+    assert estimate_pitch([], true) is None
+    assert estimate_pitch([line(true, 1.8)], true) is None
+    assert estimate_pitch([line(true, 1.8), line(true, 1.9)], true) is None
+
+
+def test_one_line_that_runs_another_way_does_not_move_the_horizon():
+    true = view_of(6.0)
+    lines = [line(true, left_m) for left_m in LEFT_M]
+    stray = line(true, 3.0, turned_rad=-0.35)
+    told = estimate_pitch([*lines, stray], view_of(2.0))
+    assert np.rad2deg(told.pitch_rad) == pytest.approx(6.0, abs=0.6)
+
+
+def test_a_stream_has_the_pitch_on_which_three_images_agree():
+    views = [view_of(pitch) for pitch in (6.0, 9.0, 6.1, 6.2, 6.0)]
+    vote = PitchVote()
+    told = [vote.add([line(view, left_m) for left_m in LEFT_M], view_of(3.0)) for view in views]
+    assert told[:4] == [None] * 4
+    assert told[4] is not None
+    assert np.rad2deg(told[4]) == pytest.approx(6.1, abs=0.3)
+    assert vote.add([line(views[0], left_m) for left_m in (-5.0, 1.8)], view_of(3.0)) is None, (
+        "once is enough"
+    )
+
+
+@cache
+def rendered(index):
+    return example(index, 0.2, seed=917)
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return Detector.load()
+
+
+@pytest.mark.parametrize("off_deg", [-4.0, 4.0])
+def test_rendered_views_are_corrected_to_within_a_degree_or_left_alone(detector, off_deg):
+    corrected = 0
+    for index in RENDERED:
+        shown = rendered(index)
+        true = extrinsic_from_ipm(shown.camera.info, shown.camera.ipm[shown.camera.initial_ipm])
+        pitch_rad = guessed_pitch_rad(RoadCamera(shown.camera))
+        height_m = float(-(true[:3, :3].T @ true[:3, 3])[2])
+        guess = rough_calibration("c", 1280, 720, height_m, np.rad2deg(pitch_rad) + off_deg, FOV_DEG)
+        info = replace(shown.camera.info, name=f"{index} {off_deg}")
+        camera = camera_from_calibration(replace(guess, info=info))
+        _, lanes = detector.detect(shown.image, camera)
+        assert any(lane.kind == LANE_BOUNDARY for lane in lanes)
+        told = estimate_pitch(lanes, detector.road_camera(camera))
+        if told is not None:
+            corrected += 1
+            assert abs(told.pitch_rad - pitch_rad) < np.deg2rad(1.0)
+    assert corrected
+
+
+def test_a_stream_without_a_calibration_takes_the_pitch_that_its_lines_show(tmp_path, capsys):
+    """Said once, and from then on the horizon of the detector is the one of the images."""
+    shown = rendered(RENDERED[0])
+    for n in range(5):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), shown.image)
+    (focal_px, _, _), (_, _, centre_px), _ = shown.camera.info.intrinsic
+    horizon_px = centre_px - focal_px * np.tan(guessed_pitch_rad(RoadCamera(shown.camera)))
+    # A rough camera has its principal point in the middle of the image.
+    pitch_deg = np.rad2deg(np.arctan((359.5 - horizon_px) / focal_px))
+    fov_deg = np.rad2deg(2 * np.arctan(640 / focal_px))
+    mounting = [f"{value:.2f}" for value in (HEIGHT_M, pitch_deg + 4, fov_deg)]
+    assert (
+        run(["detect", str(tmp_path), "--mounting", *mounting, "--output", str(tmp_path / "out.jsonl")]) == 0
+    )
+    said = [text for text in capsys.readouterr().err.splitlines() if "meet on a horizon" in text]
+    assert len(said) == 1
+    assert "the lines of 2 " in said[0]
+    assert float(said[0].split("look ")[1].split()[0]) == pytest.approx(pitch_deg, abs=1.0)

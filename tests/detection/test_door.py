@@ -16,7 +16,6 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.cli import detect_files as watch
 from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
@@ -37,7 +36,7 @@ class Bench:
     calibration: Path
     model: Path
 
-    def run(self, source: object, *arguments: object, calibrated: bool = True) -> int:
+    def run(self, source, *arguments, calibrated=True):
         camera = ["--camera", str(self.calibration)] if calibrated else []
         return run(["detect", str(source), "--model", str(self.model), *camera, *map(str, arguments)])
 
@@ -53,11 +52,11 @@ def bench(tmp_path_factory):
     return Bench(folder, root / "front.yaml", brightness_model(root))
 
 
-def lines(output: str) -> list[dict]:
+def lines(output):
     return [json.loads(line, parse_constant=lambda name: pytest.fail(name)) for line in output.splitlines()]
 
 
-def near(record: dict) -> dict:
+def near(record):
     """The marking at 8 m."""
     return min(record["markings"], key=lambda marking: marking["corners_vehicle"][0][0])
 
@@ -158,22 +157,22 @@ class FakeCapture:
 
     end: type[BaseException] | None = None
 
-    def __init__(self, source: int) -> None:
+    def __init__(self, source):
         self.left = 3
 
-    def isOpened(self) -> bool:
+    def isOpened(self):
         return True
 
-    def read(self) -> tuple[bool, np.ndarray | None]:
+    def read(self):
         self.left -= 1
         if self.left < 0 and self.end:
             raise self.end
         return self.left >= 0, picture(make_camera(), DIAMONDS)
 
-    def set(self, key: int, value: float) -> None:
+    def set(self, key, value):
         assert value in (WIDTH, HEIGHT)
 
-    def release(self) -> None: ...
+    def release(self): ...
 
 
 def test_a_live_camera_runs_until_it_is_interrupted(bench, tmp_path, monkeypatch):
@@ -192,7 +191,7 @@ def test_what_an_unplugged_camera_saw_is_kept(bench, tmp_path, monkeypatch, caps
     assert len(lines(output.read_text())) == 3
 
 
-def not_finite(model: Path, path: Path) -> Path:
+def not_finite(model, path):
     """A copy of the model with one weight that is not a number."""
     content = onnx.load(model)
     weight = next(w for w in content.graph.initializer if w.name == "slope")
@@ -201,7 +200,7 @@ def not_finite(model: Path, path: Path) -> Path:
     return path
 
 
-def bad_source(name: str, bench: Bench, folder: Path) -> list[object]:
+def bad_source(name, bench, folder):
     """The arguments of one mistake."""
     image = cv2.imread(str(bench.folder / "0.png"))
     path = folder / f"{name}.png"
@@ -286,13 +285,12 @@ def test_what_cannot_be_written_is_one_line_that_names_the_option(bench, tmp_pat
 
 
 class FullDevice(io.StringIO):
-    def write(self, text: str) -> int:
+    def write(self, text):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_a_full_standard_output_is_one_line(bench, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdout", FullDevice())
-    monkeypatch.setattr(watch, "forget_stdout", lambda: None)
     assert bench.run(bench.folder) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: standard output: cannot be written (No space left")
@@ -305,7 +303,7 @@ def test_an_interruption_before_the_last_image_is_one_line_and_no_half_a_file(
 ):
     calls = []
 
-    def interrupted(*arguments: object, **keywords: object) -> object:
+    def interrupted(*arguments, **keywords):
         calls.append(None)
         if when == "load" or len(calls) == 2:
             raise KeyboardInterrupt
@@ -367,7 +365,7 @@ def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, mon
     assert not image.any()
 
 
-def test_a_process_that_runs_for_days_keeps_the_times_of_its_last_images_only(monkeypatch) -> None:
+def test_a_process_that_runs_for_days_keeps_the_times_of_its_last_images_only(monkeypatch):
     monkeypatch.setattr("v2hdm.detection.stopwatch.KEPT", 3)
     stopwatch = Stopwatch()
     for number in range(5):

@@ -1,4 +1,6 @@
-"""Row anchors and paint: lines come out whole, apart, in order, and numbered from the vehicle outwards."""
+"""Row anchors and paint become lines of lanes: whole, apart, in order, scored and numbered outwards."""
+
+import json
 
 import numpy as np
 import pytest
@@ -6,21 +8,32 @@ import pytest
 from tests.detection.pictures import (
     STRIDES,
     anchors_of,
+    bar,
     boundaries_of,
+    brightness_model,
+    diamond,
     make_camera,
     off_px,
     painted,
     painted_on,
+    picture,
     straight,
     to_image,
 )
+from v2hdm.catalogue import LANE_CLASSES
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.lanes import boundaries as score
+from v2hdm.detection.lanes.curves import LaneImage
+from v2hdm.detection.lanes.lines import propose
 from v2hdm.detection.network import AnchorRow
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.weights import LANE_SCORE_FILE
 from v2hdm.records import LANE_DASH, LaneDetection
 
 
 @pytest.fixture
-def view() -> RoadCamera:
+def view():
     return RoadCamera(make_camera())
 
 
@@ -147,3 +160,153 @@ def test_what_a_point_errs_by_is_within_its_stated_sigma(view):
         on = (lane.points_px[:, 1] >= line[:, 1].min()) & (lane.points_px[:, 1] <= line[:, 1].max())
         normalised.append(np.abs(off_px(lane, line) / lane.sigma_px[on]))
     assert 0.2 < np.quantile(np.concatenate(normalised), 0.95) < 2
+
+
+def score_of(view, rows, paint=()):
+    (lane,) = boundaries_of(rows, view, paint)
+    return lane.score
+
+
+def test_the_file_holds_a_weight_for_each_feature_and_no_other():
+    content = json.loads(LANE_SCORE_FILE.read_text(encoding="utf-8"))
+    assert tuple(content) == ("alone", "among")
+    for part, names in (("alone", score.ALONE), ("among", score.AMONG)):
+        assert tuple(content[part]["weights"]) == names
+        assert np.isfinite([content[part]["bias"], *content[part]["weights"].values()]).all()
+
+
+def test_paint_speaks_for_a_line(view):
+    line = straight(view, 1.6)
+    rows = anchors_of(view, [line])
+    assert score_of(view, rows, [painted(line, view, 5, 20)]) > score_of(view, rows) + 0.1
+
+
+def test_doubtful_crossings_make_a_doubtful_line(view):
+    rows = anchors_of(view, [straight(view, 1.6)])
+    doubtful = [AnchorRow(row.v_px, row.u_px, row.odds - 2.0) for row in rows]
+    assert score_of(view, doubtful) < score_of(view, rows) - 0.1
+
+
+def cluttered(view, rows, seed, odds):
+    """The rows with eight crossings of such log odds on each, anywhere."""
+    rng, width = np.random.default_rng(seed), view.info.width
+    more = ((np.append(row.u_px, rng.uniform(0, width, 8)), np.append(row.odds, [odds] * 8)) for row in rows)
+    return [AnchorRow(row.v_px, *given) for row, given in zip(rows, more, strict=True)]
+
+
+def scores(view, rows):
+    return [lane.score for lane in boundaries_of(rows, view)]
+
+
+def test_crossings_all_over_the_ground_make_lines_less_sure(view):
+    rows = anchors_of(view, [straight(view, 1.6)])
+    alone = score_of(view, rows)
+    surest = [[max(scores(view, cluttered(view, rows, seed, odds)), default=0.0) for seed in range(8)]
+              for odds in (0.1, 1.0)]  # fmt: skip
+    assert np.mean(surest, axis=1).max() < alone - 0.05
+    assert np.max(surest) < alone + 0.15, "by chance some are on the line and make it longer"
+
+
+def test_a_line_a_lane_away_makes_one_surer_and_one_too_near_does_not(view):
+    line = straight(view, 1.6)
+    alone = score_of(view, anchors_of(view, [line]))
+    near, away = (min(scores(view, anchors_of(view, [line, straight(view, y)]))) for y in (0.6, -1.7))
+    assert away > alone + 0.05
+    assert near < alone - 0.05
+
+
+def test_a_line_a_lane_away_that_runs_another_way_tells_nothing(view):
+    line = straight(view, 1.6)
+    other = to_image(view.camera, np.linspace((6.0, -1.0), (30.0, -9.0), 100))
+    found = boundaries_of(anchors_of(view, [line, other]), view)
+    mine = min(found, key=lambda lane: np.abs(off_px(lane, line)).max())
+    assert mine.score == pytest.approx(score_of(view, anchors_of(view, [line])), abs=0.05)
+
+
+def test_half_the_row_anchors_make_a_line_as_sure(view):
+    rows = anchors_of(view, [straight(view, 1.6)])
+    assert score_of(view, rows[::2]) == pytest.approx(score_of(view, rows), abs=0.05)
+
+
+def test_paint_that_the_network_sees_along_it_makes_a_line_surer(view):
+    line = straight(view, 1.6)
+    rows, paint = anchors_of(view, [line]), [painted(line, view, 5, 8)]
+    whole, piece = (
+        boundaries_of(rows, view, paint, output=painted_on(view, [part]))[0].score
+        for part in (line, paint[0].points_px)
+    )
+    assert whole > piece + 0.01
+
+
+def test_the_paint_along_a_line_is_the_mean_of_where_it_is_seen(view):
+    line = straight(view, 1.6)
+    rows = anchors_of(view, [line])
+    near = line[line[:, 1] > np.mean([rows[0].v_px, rows[-1].v_px])]
+    points, lines = propose(LaneImage(view, rows), -np.inf)
+    column = score.ALONE.index("paint_along")
+    whole, half, none = (
+        score.features_alone(lines, points, LaneImage(view, rows, (), painted_on(view, parts)))[0, column]
+        for parts in ([line], [near], [])
+    )
+    assert whole == pytest.approx(5, abs=0.5)
+    assert half == pytest.approx(0, abs=1.5)
+    assert none == -5
+
+
+def lanes_of(tmp_path, shapes, kind="lane_line", lens="plumb_bob", **options):
+    """Kind and points on the ground of the pieces of lane paint found."""
+    camera = make_camera(lens)
+    detector = Detector.load(brightness_model(tmp_path, kind), DetectorOptions(**options))
+    _, lanes = detector.detect(picture(camera, shapes), camera)
+    view = RoadCamera(camera)
+    pieces = [lane for lane in lanes if lane.kind in LANE_CLASSES]
+    return [(lane.kind, view.ground(view.undistort(lane.points_px))) for lane in pieces]
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "equidistant"])
+@pytest.mark.parametrize("y", [-2.0, 0.0, 1.5])
+def test_points_lie_on_the_centre_line(tmp_path, lens, y):
+    ((kind, points),) = lanes_of(tmp_path, [bar(9.0, y, 14.0, 0.15)], lens=lens)
+    assert kind == "lane_line"
+    assert len(points) > 15
+    assert np.abs(points[:, 1] - y).max() < 0.03
+
+
+def test_points_run_from_near_to_far_at_the_chosen_step(tmp_path):
+    ((_, points),) = lanes_of(tmp_path, [bar(8.0, 1.0, 9.0, 0.15)], lane_step_m=1.0)
+    gaps = np.diff(points[:, 0])
+    assert (gaps > 0).all()
+    assert np.median(gaps) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_line_across_the_view_is_traced_too(tmp_path):
+    lanes = lanes_of(tmp_path, [bar(7.0, 0.0, 5.0, 0.2, yaw_deg=88.0)])
+    points = np.concatenate([points for _, points in lanes])
+    assert np.ptp(points[:, 1]) > 4.0
+    assert np.abs(points[:, 0] - 7.0 - np.tan(np.deg2rad(2.0)) * points[:, 1]).max() < 0.06
+
+
+def test_two_lines_give_two_rows_of_points(tmp_path):
+    lanes = lanes_of(tmp_path, [bar(9.0, y, 12.0, 0.12) for y in (-0.5, 0.5)])
+    assert sorted(round(float(np.median(points[:, 1])), 1) for _, points in lanes) == [-0.5, 0.5]
+
+
+def test_a_dash_is_a_marking_and_a_piece_of_lane(tmp_path):
+    camera = make_camera()
+    detector = Detector.load(brightness_model(tmp_path, "lane_dash"))
+    markings, lanes = detector.detect(picture(camera, [bar(6.0, 0.5, 3.0, 0.2)]), camera)
+    assert [m.kind for m in markings] == ["lane_dash"]
+    assert [lane.kind for lane in lanes if lane.kind in LANE_CLASSES] == ["lane_dash"]
+
+
+def test_paint_too_long_for_a_dash_is_a_line(tmp_path):
+    ((kind, _),) = lanes_of(tmp_path, [bar(10.5, 0.5, 15.0, 0.15)], kind="lane_dash")
+    assert kind == "lane_line"
+
+
+def test_a_compact_marking_is_never_lane_paint_whatever_the_network_says(tmp_path):
+    camera = make_camera()
+    detector = Detector.load(brightness_model(tmp_path, "lane_dash"), DetectorOptions(min_confidence=0.1))
+    markings, lanes = detector.detect(picture(camera, [diamond(8.0, 0.5), diamond(10.0, -1.0)]), camera)
+    assert {m.kind for m in markings} == {"diamond"}
+    assert lanes == ()

@@ -1,24 +1,38 @@
-"""Quadrilaterals, their blurred coverage, and blobs of logits: what the corner fits stand on."""
+"""Quadrilaterals, their coverage, blobs, patches and views: what fits and judge stand on."""
 
 import cv2
 import numpy as np
 import pytest
 
+from tests.detection.pictures import (
+    LENSES,
+    bar,
+    brightness_model,
+    diamond,
+    make_camera,
+    output_of,
+    picture,
+    to_image,
+    view_of,
+)
 from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.detection import patch
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.coverage import blurred_coverage, normal_cdf, normal_pdf
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, SIZE
 from v2hdm.detection.network import NetworkOutput
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.patch import ImageQuads, LensFrames
 from v2hdm.detection.propose import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import (
-    Quad,
-    order_corners,
-    side_frames,
-)
+from v2hdm.geometry.quadrilateral import Quad, order_corners, side_frames
+from v2hdm.records import DIAMOND, LANE_DASH
 
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
 
 
-def output_of(labels: np.ndarray, top: int = 0) -> NetworkOutput:
+def output_of_labels(labels, top=0):
     """What a confident network says of a label picture (h, w) at the resolution of its paint."""
     paint = np.where(labels > 0, 5.0, -5.0).astype(np.float32)
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
@@ -34,7 +48,7 @@ def test_the_normal_distribution_is_right_to_four_digits():
     np.testing.assert_allclose(pdf[2:4], [0.3989423, 0.2419707], atol=1e-6)
 
 
-def lattice(columns: int, rows: int) -> np.ndarray:
+def lattice(columns, rows):
     """Pixel centres (1, 3, N) as the coverage takes them."""
     u, v = np.meshgrid(np.arange(columns), np.arange(rows))
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])[None].astype(np.float32)
@@ -75,7 +89,7 @@ def test_zero_crossings_are_interpolated_between_neighbours():
 def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:24] = labels[10:16, 14:30] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, _ = find_blobs(output_of(labels, 50))
+    blobs, _ = find_blobs(output_of_labels(labels, 50))
     (arrow,) = blobs
     assert arrow.kind == "arrow"
     polygon = outline_polygon(arrow)
@@ -96,7 +110,7 @@ def test_a_diamond_that_touches_a_line_is_split_from_it():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
     labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, owner = find_blobs(output_of(labels))
+    blobs, owner = find_blobs(output_of_labels(labels))
     assert blobs[0].parts == 2
     assert sorted(blob.kind for blob in blobs[1:]) == ["diamond", "lane_line"]
     square = next(blob for blob in blobs[1:] if blob.kind == "diamond")
@@ -108,7 +122,7 @@ def test_a_dash_that_looks_like_a_line_here_and_there_stays_one_blob():
     labels = np.zeros((40, 60), dtype=int)
     labels[5:35, 20:24] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[5:14, 20:24] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, _ = find_blobs(output_of(labels))
+    blobs, _ = find_blobs(output_of_labels(labels))
     assert [blob.kind for blob in blobs] == ["lane_dash"]
 
 
@@ -116,13 +130,13 @@ def test_worn_holes_do_not_add_to_the_outline():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1
     labels[18:22, 28:32] = 0
-    blobs, _ = find_blobs(output_of(labels, 100))
+    blobs, _ = find_blobs(output_of_labels(labels, 100))
     inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
     assert inner.min() > 15
 
 
 def test_an_empty_picture_has_no_blobs():
-    blobs, owner = find_blobs(output_of(np.zeros((8, 8), dtype=int)))
+    blobs, owner = find_blobs(output_of_labels(np.zeros((8, 8), dtype=int)))
     assert blobs == []
     assert not owner.any()
 
@@ -131,7 +145,7 @@ def test_a_piece_of_two_classes_comes_whole_and_in_its_parts():
     labels = np.zeros((60, 60), dtype=int)
     labels[20:50, 28:32] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[8:20, 20:40] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, owner = find_blobs(output_of(labels))
+    blobs, owner = find_blobs(output_of_labels(labels))
     assert [blob.parts for blob in blobs] == [2, 0, 0]
     assert sorted(blob.kind for blob in blobs[1:]) == ["arrow", "lane_dash"]
     assert all(blob.touches_symbol for blob in blobs[1:])
@@ -143,7 +157,7 @@ def test_blobs_in_each_others_boxes_keep_to_themselves():
     for k in range(10, 50):
         labels[k, k : k + 4] = 1
     labels[15:20, 40:46] = labels[40:45, 12:18] = 1
-    blobs, owner = find_blobs(output_of(labels))
+    blobs, owner = find_blobs(output_of_labels(labels))
     assert len(blobs) == 3
     for index, blob in enumerate(blobs):
         mine = np.argwhere(owner == index + 1)
@@ -151,3 +165,161 @@ def test_blobs_in_each_others_boxes_keep_to_themselves():
         assert np.count_nonzero(blob.level > 0) == len(mine)
         np.testing.assert_allclose(outline.min(axis=0), mine[:, ::-1].min(axis=0) - 0.5, atol=0.01)
         np.testing.assert_allclose(outline.max(axis=0), mine[:, ::-1].max(axis=0) + 0.5, atol=0.01)
+
+
+SHAPES = [bar(5.0, 0.3, 0.15, 4.0), bar(9.0, -2.0, 3.0, 0.15), diamond(7.0, 1.0)]
+SHARES = np.linspace(0.0, 1.0, 9)[:, None]
+
+
+def seen(lens):
+    """A view, recorded corners (3, 4, 2) of shapes, and points (3, 9, 2) along one side of each."""
+    camera = make_camera(lens)
+    ground = np.stack(SHAPES)
+    corners_px = np.stack([order_corners(to_image(camera, shape)) for shape in ground])
+    along = ground[:, [0]] + SHARES * (ground[:, [1]] - ground[:, [0]])
+    return RoadCamera(camera, 16), corners_px, np.stack([to_image(camera, line) for line in along])
+
+
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_what_is_straight_on_the_ground_is_straight_in_the_frames_and_as_large_as_in_the_image(lens):
+    view, corners_px, lines_px = seen(lens)
+    frames = LensFrames.about(view, corners_px)
+    lines = frames.from_image(lines_px)
+    np.testing.assert_allclose(frames.to_px(lines), lines_px, atol=0.02)
+    for line, line_px in zip(lines, lines_px, strict=True):
+        bent = np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]
+        assert bent < 0.05
+        assert np.linalg.norm(line[-1] - line[0]) == pytest.approx(
+            np.linalg.norm(line_px[-1] - line_px[0]), rel=0.12
+        )
+
+
+@pytest.mark.parametrize("lens", ["plumb_bob", "equidistant"])
+def test_covariances_in_the_image_are_those_of_scattered_corners(lens):
+    view, corners_px, _ = seen(lens)
+    frames = LensFrames.about(view, corners_px)
+    corners = frames.from_image(corners_px)
+    root = np.tril(np.random.default_rng(0).normal(0, 0.05, (3, 8, 8))) + 0.1 * np.eye(8)
+    np.testing.assert_allclose(frames.to_px(corners), corners_px, atol=0.02)
+    moves = frames.jacobian(corners) @ root
+    covariance = moves @ moves.swapaxes(1, 2)
+    noise = np.random.default_rng(1).normal(size=(4000, 3, 8, 1))
+    moved = corners + (root @ noise).reshape(4000, 3, 4, 2)
+    scattered = np.stack([frames.to_px(sample) for sample in moved]).reshape(4000, 3, 8)
+    for m in range(3):
+        drawn = np.cov(scattered[:, m].T)
+        np.testing.assert_allclose(covariance[m], drawn, atol=0.06 * np.diag(drawn).max())
+
+
+def test_only_what_the_lens_bows_notably_is_looked_at_along_the_bow():
+    assert not ImageQuads.of(*seen("pinhole")[:2]).bowed.any()
+    view, corners_px, lines_px = seen("equidistant")
+    quads = ImageQuads.of(view, corners_px)
+    assert quads.bowed.tolist() == [True, True, False]
+    middles = (quads.corners + np.roll(quads.corners, -1, axis=1)) / 2
+    sides_px = quads.px(middles)
+    nearest = np.linalg.norm(sides_px[0][:, None] - lines_px[0], axis=2).min()
+    assert nearest < 0.3, "the middle of one of its sides lies on the side as the lens shows it"
+    some = quads.take(np.array([2, 1, 0, 0]))
+    assert some.bowed.tolist() == [False, True, True, True]
+    np.testing.assert_allclose(some.px(middles[[2, 1, 0, 0]]), sides_px[[2, 1, 0, 0]])
+    np.testing.assert_array_equal(quads.px(middles)[2], middles[2])
+
+
+class Image(np.ndarray):
+    """An image that counts how often it is looked into."""
+
+    looks = 0
+
+    def __getitem__(self, index):
+        type(self).looks += 1
+        return np.asarray(self)[index]
+
+
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_an_image_is_sampled_once_per_marking(tmp_path, monkeypatch, lens):
+    camera = make_camera(lens)
+    shapes = [diamond(x, y, 1.2, 0.7) for x in (6.0, 9.0) for y in (-1.2, 0.6)] + [bar(8.0, 2.4, 2.0, 0.2)]
+    image = picture(camera, shapes)
+    detector = Detector.load(brightness_model(tmp_path), DetectorOptions(min_confidence=0.0))
+    found = detector.propose(detector.run_network(image, camera), camera)
+    cut, once = [], patch._cut
+    monkeypatch.setattr(patch, "_cut", lambda *given: cut.append(given[1]) or once(*given))
+    monkeypatch.setattr(Image, "looks", 0)
+    detector.read(image.view(Image), found)
+    assert len(cut) == len(shapes) == Image.looks
+
+
+CAMERA = make_camera("plumb_bob")
+VIEW = RoadCamera(CAMERA, 16)
+GREY, OUTSIDE = CHANNELS.index("log_grey"), CHANNELS.index("outside")
+
+
+def seen_in_frame(image, corners_px, kind):
+    """The view (C, 20, 20) of a quadrilateral in an image of which the network says nothing."""
+    blank = output_of(np.zeros((CAMERA.info.height // 2, CAMERA.info.width // 2), np.float32))
+    return view_of(image, VIEW, blank, corners_px, kind)
+
+
+def corners_of(shape):
+    return order_corners(to_image(CAMERA, shape))
+
+
+def inside(kind):
+    """Elements (20, 20) well within the marking, as the module's margins put it."""
+    step = (np.arange(SIZE) + 0.5) / SIZE
+    along, across = (
+        np.abs((1 + 2 * margin) * (step - 0.5)) < 0.4
+        for margin in ((0.6, 0.6) if kind == DIAMOND else (0.3, 1.0))
+    )
+    return across[:, None] & along
+
+
+def outside(kind):
+    step = (np.arange(SIZE) + 0.5) / SIZE
+    along, across = (
+        np.abs((1 + 2 * margin) * (step - 0.5)) > 0.65
+        for margin in ((0.6, 0.6) if kind == DIAMOND else (0.3, 1.0))
+    )
+    return across[:, None] | along
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        (diamond(6.0, 0.4, 1.4, 0.9), DIAMOND),
+        (diamond(8.0, -1.0, 1.4, 0.9, 20.0), DIAMOND),
+        (bar(7.5, 0.5, 2.5, 0.4), LANE_DASH),
+        (bar(7.5, 0.5, 2.5, 0.4, 90.0), LANE_DASH),
+    ],
+)
+def test_paint_fills_the_middle_wherever_a_marking_lies(shape, kind):
+    corners = corners_of(shape)
+    for first in range(4):
+        view = seen_in_frame(
+            picture(CAMERA, [shape], ground=0.1, paint=0.5), np.roll(corners, first, axis=0), kind
+        )
+        grey = view[GREY]
+        bright, dark = grey[inside(kind)], grey[outside(kind)]
+        assert bright.min() > dark.max() + np.log(2)
+        assert not view[OUTSIDE].any()
+
+
+def test_light_changes_nothing():
+    shape = diamond(6.0, 0.0, 1.4, 0.9)
+    bright, dim = (
+        seen_in_frame(
+            picture(CAMERA, [shape], ground=0.3 * light, paint=0.9 * light), corners_of(shape), DIAMOND
+        )
+        for light in (1.0, 0.5)
+    )
+    assert np.abs(bright[GREY] - dim[GREY]).mean() < 0.1
+
+
+def test_what_lies_beyond_the_image_is_told_and_all_is_finite():
+    shape = diamond(5.0, 3.2, 1.6, 1.2)
+    corners = corners_of(shape)
+    image = picture(CAMERA, [shape])
+    assert seen_in_frame(image, corners, DIAMOND)[OUTSIDE].any()
+    above = np.array([[300.0, 2.0], [310.0, 1.0], [312.0, 9.0], [301.0, 10.0]])
+    assert np.isfinite(seen_in_frame(image, order_corners(above), DIAMOND)).all()

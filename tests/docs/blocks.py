@@ -1,7 +1,5 @@
 """The fenced blocks of the documents, for all tests of what the documents say."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from dataclasses import dataclass

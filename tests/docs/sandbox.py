@@ -1,7 +1,5 @@
 """A folder in which the documents' commands find what they name, all of it from one small rendered drive."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

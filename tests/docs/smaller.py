@@ -1,7 +1,5 @@
 """What is added to a documented command so that it ends in seconds on one core."""
 
-from __future__ import annotations
-
 SMALL_PORT = (
     "simulate.seed=11", "simulate.route.pieces=[[20.0,0.0],[16.0,70.0],[10.0,0.0]]",
     "simulate.route.image_spacing_m=2.0", "~simulate.cameras.rear", "simulate.cameras.front.width=640",

@@ -4,20 +4,17 @@ The blocks of a document run in their order, in a folder of that document's own.
 so to its readers, with the reason; then the command that it names must exist and take its arguments.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import shlex
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.docs.blocks import ROOT, Block, blocks, document, documents
+from tests.docs.blocks import ROOT, blocks, document, documents
 from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
@@ -44,17 +41,17 @@ FOREIGN = ("export", "pip", "ray", "rerun", "scontrol", "srun")
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
 
-def named(block: Block) -> str:
+def named(block):
     return f"{block.document}:{block.line}"
 
 
 class Shell:
     """Runs blocks of shell, with ``python`` at hand quickly and runs of ports small."""
 
-    def __init__(self, programs: Path) -> None:
+    def __init__(self, programs):
         self.programs = programs
 
-    def __call__(self, text: str, folder: Path) -> str:
+    def __call__(self, text, folder):
         """What the commands print."""
         ran = subprocess.run(
             ["bash", "-c", f"set -eo pipefail\n{text}"],
@@ -74,7 +71,7 @@ if [ "$1" = map ]; then eval "python ${{told##*bin/python }}"; fi
 
 
 @pytest.fixture(scope="module")
-def shell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shell]:
+def shell(tmp_path_factory):
     make = shutil.which("make")
     if make is None:
         pytest.skip("no make: install it")
@@ -87,7 +84,7 @@ def shell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shell]:
 
 
 @pytest.fixture(scope="module")
-def furnished(shell: Shell, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def furnished(shell, tmp_path_factory):
     """The README's first block makes the drive and the result that all other commands work on."""
     folder = tmp_path_factory.mktemp("furnished")
     shell(RUN[0].text, folder)
@@ -96,11 +93,11 @@ def furnished(shell: Shell, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder_of(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def folder_of(furnished, tmp_path_factory):
     """The folder of a document, furnished when it is first asked for."""
     folders: dict[str, Path] = {}
 
-    def folder(name: str) -> Path:
+    def folder(name):
         if name not in folders:
             folders[name] = tmp_path_factory.mktemp(Path(name).stem) / "here"
             shutil.copytree(furnished, folders[name])
@@ -115,14 +112,14 @@ def folder_of(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Call
 
 
 @pytest.mark.slow
-def test_the_first_block_of_the_readme_makes_a_map_and_a_report(furnished: Path) -> None:
+def test_the_first_block_of_the_readme_makes_a_map_and_a_report(furnished):
     assert "make map" in RUN[0].text
     assert (furnished / "outputs/port2/report.html").stat().st_size > 100_000
     assert len(read_geojson(furnished / "outputs/port2/map.geojson").markings) > 5
 
 
 @pytest.mark.parametrize("block", RUN[1:], ids=named)
-def test_a_documented_block_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
+def test_a_documented_block_runs(block, shell, folder_of):
     folder = folder_of(block.document)
     for line in shell(block.text, folder).splitlines():
         if re.fullmatch(r"[\w./-]+/[\w.-]+", line):  # a command that reports what it has written
@@ -130,21 +127,19 @@ def test_a_documented_block_runs(block: Block, shell: Shell, folder_of: Callable
 
 
 @pytest.mark.parametrize("block", PYTHON, ids=named)
-def test_a_documented_program_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
+def test_a_documented_program_runs(block, shell, folder_of):
     folder = folder_of(block.document)
     (folder / "program.py").write_text(block.text)
     shell("python program.py", folder)
 
 
 @pytest.mark.parametrize("name", RUN_BY)
-def test_the_commands_that_other_tests_run_are_taken_from_the_document(name: str) -> None:
+def test_the_commands_that_other_tests_run_are_taken_from_the_document(name):
     assert f'blocks("{name}", "sh"' in (ROOT / RUN_BY[name]).read_text()
 
 
 @pytest.mark.parametrize("block", NOT_RUN, ids=named)
-def test_what_is_not_run_names_commands_and_settings_that_are_there(
-    block: Block, shell: Shell, tmp_path: Path
-) -> None:
+def test_what_is_not_run_names_commands_and_settings_that_are_there(block, shell, tmp_path):
     for line in block.lines:
         called = re.search(r"(?:(?:python|torchrun\b.*?) -m |\b(?=v2hdm ))(.*)", line)
         if called is None:
@@ -170,18 +165,18 @@ def test_what_is_not_run_names_commands_and_settings_that_are_there(
             assert all(f'"{one}"' in source for one in options), line
 
 
-def program_of(module: str) -> list[str]:
+def program_of(module):
     own = module.startswith("v2hdm.")
     return ["v2hdm", module.rpartition(".")[2]] if own else ["python", "-m", module]
 
 
-def _sources(module: str) -> list[Path]:
+def _sources(module):
     path = ROOT / module.replace(".", "/")
     return [path.with_suffix(".py")] if path.with_suffix(".py").is_file() else list(path.glob("*.py"))
 
 
 @pytest.mark.parametrize("name", documents())
-def test_a_document_names_only_modules_extras_and_targets_that_are_there(name: str) -> None:
+def test_a_document_names_only_modules_extras_and_targets_that_are_there(name):
     text = document(name)
     for module in re.findall(r"python -m ([a-z][a-z_0-9.]*[a-z_0-9])\b", text):
         assert importlib.util.find_spec(module) is not None, module

@@ -1,12 +1,9 @@
 """The notebook runs from its first cell to its last, and is kept without outputs."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -15,14 +12,14 @@ from tests.docs.blocks import ROOT
 CELLS = json.loads((ROOT / "docs" / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
 
 
-def test_the_notebook_is_kept_without_outputs() -> None:
+def test_the_notebook_is_kept_without_outputs():
     code = [cell for cell in CELLS if cell["cell_type"] == "code"]
     assert len(code) >= 5
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code)
 
 
 @pytest.mark.slow
-def test_the_notebook_walks_from_a_drive_to_a_map_and_its_report(tmp_path: Path) -> None:
+def test_the_notebook_walks_from_a_drive_to_a_map_and_its_report(tmp_path):
     program = "\n\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code")
     (tmp_path / "notebook.py").write_text(program)
     done = subprocess.run(

@@ -1,12 +1,9 @@
 """The documentation's site builds without a warning, and asks no other machine for anything."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -19,7 +16,7 @@ _IMPORTED = re.compile(r"""(?:url\(|@import)\s*["']?(?:https?:|//)""")
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     pytest.importorskip("material", reason="no mkdocs-material: pip install 'v2hdm[docs]'")
     folder = tmp_path_factory.mktemp("site")
     built = subprocess.run(
@@ -31,7 +28,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
+def test_every_page_is_built_and_in_the_navigation(site):
     listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text()))
     pages = {path.name for path in (ROOT / "docs").glob("*.md")}
     assert pages <= listed
@@ -39,7 +36,7 @@ def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
         assert (site / page).with_suffix(".html").stat().st_size > 5000, page
 
 
-def test_no_page_loads_anything_from_another_machine(site: Path) -> None:
+def test_no_page_loads_anything_from_another_machine(site):
     for path in [*site.rglob("*.html"), *site.rglob("*.css"), *site.rglob("*.svg")]:
         text = path.read_text(encoding="utf-8")
         assert not _LOADED.search(text), path
@@ -51,13 +48,13 @@ def test_no_page_loads_anything_from_another_machine(site: Path) -> None:
     assert not {"repo_url", "extra_javascript", "extra_css"} & set(settings)
 
 
-def test_pages_of_the_repository_lead_to_each_other(site: Path) -> None:
+def test_pages_of_the_repository_lead_to_each_other(site):
     assert 'href="contributing.html"' in (site / "design.html").read_text()
     assert 'href="your-drive.html"' in (site / "index.html").read_text()
     assert not list(site.rglob("*.py"))
 
 
-def test_a_browser_draws_the_site_and_asks_for_nothing_outside(site: Path) -> None:
+def test_a_browser_draws_the_site_and_asks_for_nothing_outside(site):
     path = browser_path()
     from playwright.sync_api import sync_playwright
 
@@ -71,11 +68,11 @@ def test_a_browser_draws_the_site_and_asks_for_nothing_outside(site: Path) -> No
 
 
 @pytest.fixture(scope="module")
-def floors() -> ModuleType:
+def floors():
     return module_at(ROOT / "docs" / "tools" / "floors.py")
 
 
-def test_the_drawn_floors_are_those_of_the_contracts(floors: ModuleType) -> None:
+def test_the_drawn_floors_are_those_of_the_contracts(floors):
     assert (ROOT / "docs" / "floors.svg").read_text() == floors.draw(), (
         "the contracts have changed: python docs/tools/floors.py"
     )
@@ -84,7 +81,7 @@ def test_the_drawn_floors_are_those_of_the_contracts(floors: ModuleType) -> None
     assert parts - {"__init__", "__pycache__", "conf"} <= {name.split(".")[0] for name in drawn}
 
 
-def test_a_link_to_nowhere_stops_the_build() -> None:
+def test_a_link_to_nowhere_stops_the_build():
     pytest.importorskip("mkdocs", reason="no mkdocs-material: pip install 'v2hdm[docs]'")
     from mkdocs.exceptions import PluginError
     from mkdocs.structure.files import File, Files

@@ -1,7 +1,5 @@
 """Bags of a drive folder, written with rosbags' own writers, for the tests of reading them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from tests.drive.example import looking_forward
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
 from v2hdm.io.drive import read_drive
 from v2hdm.records import Drive, FloatArray
@@ -182,8 +181,6 @@ def messages_of(
 
 
 def mountings() -> dict[str, FloatArray]:
-    from tests.drive.example import looking_forward
-
     return {"front": looking_forward(2.0), "rear": looking_forward(3.0)}
 
 
@@ -221,9 +218,8 @@ def _write(writer: Any, made: Messages, serialize: Callable[..., Any], store: An
 
 def assert_same_drive(got: Drive, expected: Drive) -> None:
     """Poses to a micrometre, pixels and times to the last bit."""
+    assert_same_poses(got, expected)
     for one, other in zip(got.images, expected.images, strict=True):
-        assert (one.camera, one.stamp_s) == (other.camera, other.stamp_s)
-        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
         np.testing.assert_array_equal(cv2.imread(str(one.path)), cv2.imread(str(other.path)))
     for name, camera in expected.cameras.items():
         info = got.cameras[name].info
@@ -231,6 +227,19 @@ def assert_same_drive(got: Drive, expected: Drive) -> None:
         for key in ("width", "height", "distortion_model", "distortion"):
             assert getattr(info, key) == getattr(camera.info, key)
         np.testing.assert_array_equal(info.intrinsic, camera.info.intrinsic)
-        np.testing.assert_allclose(
-            got.cameras[name].ipm[camera.initial_ipm], camera.ipm[camera.initial_ipm], rtol=1e-12
-        )
+        expected_ipm = camera.ipm[camera.initial_ipm]
+        np.testing.assert_allclose(got.cameras[name].ipm[camera.initial_ipm], expected_ipm, rtol=1e-12)
+
+
+def assert_same_poses(got: Drive, expected: Drive) -> None:
+    for one, other in zip(got.images, expected.images, strict=True):
+        assert (one.camera, one.stamp_s) == (other.camera, other.stamp_s)
+        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
+
+
+def assert_mounted(got: Drive) -> None:
+    """Of the extrinsic the IPM keeps the two columns of the ground's axes and the translation."""
+    for name, cam_from_vehicle in mountings().items():
+        ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
+        product = got.cameras[name].ipm["estimated"] @ ground
+        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)

@@ -1,7 +1,5 @@
 """A small but complete drive with two cameras, for the tests of reading and writing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +9,7 @@ import cv2
 import numpy as np
 import yaml
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.drive import Trajectory
@@ -40,13 +39,7 @@ def camera_info(name: str = "front", width: int = 64, height: int = 48) -> Camer
 
 def looking_forward(height_m: float = 2.0, pitch_rad: float = 0.3) -> FloatArray:
     """``cam_from_vehicle`` of a camera above the vehicle's origin, tilted down by ``pitch_rad``."""
-    level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    c, s = np.cos(pitch_rad), np.sin(pitch_rad)
-    rotation = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]) @ level
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = rotation
-    cam_from_vehicle[:3, 3] = -rotation @ [0.0, 0.0, height_m]
-    return cam_from_vehicle
+    return mounted([0.0, 0.0, height_m], np.degrees(pitch_rad))
 
 
 def straight_trajectory(end_s: float = 2.0, rate_hz: float = 10.0) -> Trajectory:

@@ -1,7 +1,5 @@
 """Intrinsics as Kalibr, OpenCV, ROS and COLMAP write them, judged by the projection of cv2."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -30,25 +28,25 @@ FISHEYE = [0.012, -0.004, 0.0011, -0.0003]
 RAYS = np.array([[x, y, 1.0] for x in np.linspace(-0.6, 0.6, 7) for y in np.linspace(-0.35, 0.35, 5)])
 
 
-def seen(info: CameraInfo) -> FloatArray:
+def seen(info):
     """Where a camera of ours sees :data:`RAYS`, recorded px."""
     return distort_points(info, (RAYS @ info.intrinsic.T)[:, :2])
 
 
-def as_opencv(coefficients: list[float], matrix: FloatArray = MATRIX) -> FloatArray:
+def as_opencv(coefficients, matrix=MATRIX):
     """Where OpenCV says they are."""
     points, _ = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))
     return np.asarray(points.reshape(-1, 2))
 
 
-def as_fisheye(coefficients: list[float]) -> FloatArray:
+def as_fisheye(coefficients):
     points, _ = cv2.fisheye.projectPoints(
         RAYS[:, None], np.zeros(3), np.zeros(3), MATRIX, np.array(coefficients)
     )
     return np.asarray(points.reshape(-1, 2))
 
 
-def write_opencv(path: Path, coefficients: list[float], **more: object) -> Path:
+def write_opencv(path, coefficients, **more):
     """What OpenCV's calibration programs write, by OpenCV itself."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Mon Nov 23 10:01:02 2026")
@@ -66,19 +64,19 @@ def write_opencv(path: Path, coefficients: list[float], **more: object) -> Path:
 
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
 @pytest.mark.parametrize("count", LENSES)
-def test_what_opencv_writes_projects_as_in_opencv(tmp_path: Path, suffix: str, count: int) -> None:
+def test_what_opencv_writes_projects_as_in_opencv(tmp_path, suffix, count):
     info = read_intrinsics(write_opencv(tmp_path / f"left{suffix}", LENSES[count]))
     assert (info.name, info.width, info.height) == ("left", *SIZE)
     np.testing.assert_allclose(seen(info), as_opencv(LENSES[count]), atol=1e-9)
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
-def test_opencv_s_fisheye_is_told_by_its_mark(tmp_path: Path, suffix: str) -> None:
+def test_opencv_s_fisheye_is_told_by_its_mark(tmp_path, suffix):
     info = read_intrinsics(write_opencv(tmp_path / f"left{suffix}", FISHEYE, fisheye_model=1))
     np.testing.assert_allclose(seen(info), as_fisheye(FISHEYE), atol=1e-9)
 
 
-def test_the_directive_of_opencv_4_and_the_names_of_opencv_2_are_read(tmp_path: Path) -> None:
+def test_the_directive_of_opencv_4_and_the_names_of_opencv_2_are_read(tmp_path):
     text = write_opencv(tmp_path / "a.yml", LENSES[5]).read_text()
     body = text.split("---\n", 1)[1]
     for old, new in (("camera_matrix", "Camera_Matrix"), ("image_w", "image_W"), ("image_h", "image_H"),
@@ -88,7 +86,7 @@ def test_the_directive_of_opencv_4_and_the_names_of_opencv_2_are_read(tmp_path: 
     np.testing.assert_allclose(seen(read_intrinsics(tmp_path / "a.yml")), as_opencv(LENSES[5]), atol=1e-9)
 
 
-def test_twelve_coefficients_are_eight_where_the_prism_is_none(tmp_path: Path) -> None:
+def test_twelve_coefficients_are_eight_where_the_prism_is_none(tmp_path):
     info = read_intrinsics(write_opencv(tmp_path / "a.yml", [*LENSES[8], 0, 0, 0, 0]))
     assert info.distortion_model == "rational_polynomial"
     np.testing.assert_allclose(seen(info), as_opencv(LENSES[8]), atol=1e-9)
@@ -121,7 +119,7 @@ cam1:
 """As Kalibr writes it: PyYAML's keys in the order of the alphabet, flow lists."""
 
 
-def write_chain(folder: Path, *changes: tuple[str, str]) -> Path:
+def write_chain(folder, *changes):
     text = CAMCHAIN
     for old, new in changes:
         assert old in text
@@ -131,13 +129,13 @@ def write_chain(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
-def test_a_camchain_of_kalibr_projects_as_opencv_s_models_do(tmp_path: Path) -> None:
+def test_a_camchain_of_kalibr_projects_as_opencv_s_models_do(tmp_path):
     path = write_chain(tmp_path)
     np.testing.assert_allclose(seen(read_intrinsics(path, "cam0")), as_opencv(LENSES[4]), atol=1e-9)
     np.testing.assert_allclose(seen(read_intrinsics(path, "cam1")), as_fisheye(FISHEYE), atol=1e-9)
 
 
-def test_a_single_camera_need_not_be_named(tmp_path: Path) -> None:
+def test_a_single_camera_need_not_be_named(tmp_path):
     content = {"cam0": yaml.safe_load(CAMCHAIN)["cam0"]}
     (tmp_path / "one.yaml").write_text("%YAML:1.0\n---\n" + yaml.safe_dump(content))
     info = read_intrinsics(tmp_path / "one.yaml")
@@ -158,13 +156,13 @@ COLMAP_LENSES: dict[str, tuple[list[float], Callable[[], FloatArray]]] = {
 """Focal lengths and coefficients of each model, and where it sees the rays, in OpenCV's pixels."""
 
 
-def one_focal() -> FloatArray:
+def one_focal():
     matrix = MATRIX.copy()
     matrix[1, 1] = matrix[0, 0]
     return matrix
 
 
-def theta_polynomial(coefficients: list[float]) -> FloatArray:
+def theta_polynomial(coefficients):
     """COLMAP's fisheyes by hand: theta (1 + k1 theta^2 + k2 theta^4) along the ray's direction."""
     radius = np.hypot(*RAYS[:, :2].T)
     theta = np.arctan(radius)
@@ -173,7 +171,7 @@ def theta_polynomial(coefficients: list[float]) -> FloatArray:
     return np.asarray(903.25 * scale[:, None] * direction + MATRIX[:2, 2])
 
 
-def write_colmap(path: Path, *lines: str) -> Path:
+def write_colmap(path, *lines):
     path.write_text(
         "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
         f"# Number of cameras: {len(lines)}\n" + "".join(f"{line}\n" for line in lines)
@@ -182,7 +180,7 @@ def write_colmap(path: Path, *lines: str) -> Path:
 
 
 @pytest.mark.parametrize("model", COLMAP_MODELS)
-def test_colmap_s_pixels_begin_at_the_corner_of_the_first(tmp_path: Path, model: str) -> None:
+def test_colmap_s_pixels_begin_at_the_corner_of_the_first(tmp_path, model):
     values, expected = COLMAP_LENSES[model]
     focals = 2 if model == "PINHOLE" or "OPENCV" in model else 1
     # In COLMAP the centre of the first pixel is (0.5, 0.5).
@@ -205,16 +203,7 @@ height: 720
 width: 1280
 distortion_model: {model}
 d: {d}
-k:
-- 905.5
-- 0.0
-- 641.25
-- 0.0
-- 903.25
-- 352.75
-- 0.0
-- 0.0
-- 1.0
+k: {k}
 r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 p: [905.5, 0.0, 641.25, 0.0, 0.0, 903.25, 352.75, 0.0, 0.0, 0.0, 1.0, 0.0]
 binning_x: 0
@@ -237,30 +226,23 @@ roi:
         ("equidistant", FISHEYE, lambda: as_fisheye(FISHEYE)),
     ],
 )
-def test_an_echoed_message_and_a_camera_info_file_of_ros_are_read(
-    tmp_path: Path, model: str, lens: list[float], expected: Callable[[], FloatArray]
-) -> None:
+def test_an_echoed_message_and_a_camera_info_file_of_ros_are_read(tmp_path, model, lens, expected):
     echo = tmp_path / "echo.yaml"
-    echo.write_text(ECHO.format(model=model, d=lens))
+    echo.write_text(ECHO.format(model=model, d=lens, k=MATRIX.ravel().tolist()))
     assert read_intrinsics(echo).name == "front_optical"
     np.testing.assert_allclose(seen(read_intrinsics(echo)), expected(), atol=1e-9)
-    content = {
-        "image_width": 1280,
-        "image_height": 720,
-        "camera_name": "front",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": MATRIX.ravel().tolist()},
-        "distortion_model": model,
-        "distortion_coefficients": {"rows": 1, "cols": len(lens), "data": lens},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": np.eye(3, 4).ravel().tolist()},
-    }
+    matrices = {"camera_matrix": MATRIX, "distortion_coefficients": np.array([lens])}
+    matrices |= {"rectification_matrix": np.eye(3), "projection_matrix": np.eye(3, 4)}
+    content = {"image_width": 1280, "image_height": 720, "camera_name": "front", "distortion_model": model}
+    for name, of in matrices.items():
+        content[name] = {"rows": of.shape[0], "cols": of.shape[1], "data": of.ravel().tolist()}
     file = tmp_path / "front.yaml"
     file.write_text(yaml.safe_dump(content))
     np.testing.assert_allclose(seen(read_intrinsics(file)), expected(), atol=1e-9)
 
 
 @pytest.mark.parametrize("form", ["camera_info", "kalibr", "opencv", "own"])
-def test_what_we_write_for_other_tools_is_read_back(tmp_path: Path, form: str) -> None:
+def test_what_we_write_for_other_tools_is_read_back(tmp_path, form):
     info = CameraInfo("front", *SIZE, MATRIX, "plumb_bob", (*LENSES[4], 0.0))
     cam_from_vehicle = np.eye(4)
     cam_from_vehicle[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
@@ -276,16 +258,16 @@ def test_what_we_write_for_other_tools_is_read_back(tmp_path: Path, form: str) -
     assert (got.width, got.height) == SIZE
 
 
-def kalibr_mistake(*changes: tuple[str, str]) -> Callable[[Path], Path]:
+def kalibr_mistake(*changes):
     return lambda folder: write_chain(folder, *changes)
 
 
-def colmap_mistake(line: str) -> Callable[[Path], Path]:
+def colmap_mistake(line):
     return lambda folder: write_colmap(folder / "cameras.txt", line)
 
 
-def opencv_mistake(old: str, new: str) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
+def opencv_mistake(old, new):
+    def write(folder):
         path = write_opencv(folder / "a.yml", LENSES[5])
         text = path.read_text()
         assert re.search(old, text, re.DOTALL)
@@ -295,8 +277,8 @@ def opencv_mistake(old: str, new: str) -> Callable[[Path], Path]:
     return write
 
 
-def text_mistake(name: str, text: str) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
+def text_mistake(name, text):
+    def write(folder):
         (folder / name).write_text(text)
         return folder / name
 
@@ -331,7 +313,7 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "opencv omnidir": (
         lambda folder: write_opencv(folder / "a.yml", LENSES[4], xi=0.9),
-        r"omnidirectional \(xi\)",
+        r"omnidirectional",
     ),
     "no size": (opencv_mistake("image_width: 1280\n", ""), "missing key 'image_width'; add the size"),
     "six": (lambda folder: write_opencv(folder / "a.yml", [0.0] * 6), "6 distortion coefficients; expected"),
@@ -349,15 +331,14 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "missing": (lambda folder: folder / "none.yaml", "no such file"),
     "folder": (lambda folder: folder, "is a folder"),
     "uncalibrated message": (
-        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[]).replace("- 905.5", "- 0").replace(
-            "- 641.25", "- 0").replace("- 903.25", "- 0").replace("- 352.75", "- 0").replace("- 1.0", "- 0")),
+        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[], k=[0] * 9)),
         "not calibrated",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_lens_beyond_ours_or_a_damaged_file_is_one_line(tmp_path: Path, mistake: str) -> None:
+def test_a_lens_beyond_ours_or_a_damaged_file_is_one_line(tmp_path, mistake):
     write, expected = MISTAKES[mistake]
     path = write(tmp_path)
     with pytest.raises(DriveError, match=expected) as caught:
@@ -366,7 +347,7 @@ def test_a_lens_beyond_ours_or_a_damaged_file_is_one_line(tmp_path: Path, mistak
     assert str(path) in str(caught.value)
 
 
-def test_a_file_with_several_cameras_asks_for_the_name(tmp_path: Path) -> None:
+def test_a_file_with_several_cameras_asks_for_the_name(tmp_path):
     path = write_chain(tmp_path)
     with pytest.raises(DriveError, match="holds the cameras cam0, cam1; name one by --camera-name"):
         read_intrinsics(path, name_by="--camera-name")
@@ -374,7 +355,7 @@ def test_a_file_with_several_cameras_asks_for_the_name(tmp_path: Path) -> None:
         read_intrinsics(path, "cam7")
 
 
-def drive_with(folder: Path, described: object) -> Path:
+def drive_with(folder, described):
     """The example drive, its front camera's intrinsics described otherwise."""
     make_drive(folder)
     with description(folder) as content:
@@ -382,7 +363,7 @@ def drive_with(folder: Path, described: object) -> Path:
     return folder
 
 
-def test_a_drive_takes_intrinsics_of_any_format_by_file_and_camera(tmp_path: Path) -> None:
+def test_a_drive_takes_intrinsics_of_any_format_by_file_and_camera(tmp_path):
     own = camera_info("front")
     (fx, _, cx), (_, fy, cy), _ = own.intrinsic.tolist()
     chain = {
@@ -401,7 +382,7 @@ def test_a_drive_takes_intrinsics_of_any_format_by_file_and_camera(tmp_path: Pat
     assert (info.name, info.intrinsic[0, 0], info.distortion) == ("front", fx + 1, own.distortion)
 
 
-def test_a_drive_asks_which_camera_of_a_chain_and_names_the_key(tmp_path: Path) -> None:
+def test_a_drive_asks_which_camera_of_a_chain_and_names_the_key(tmp_path):
     drive_with(tmp_path, "site-camchain.yaml")
     write_chain(tmp_path)
     with pytest.raises(
@@ -410,7 +391,7 @@ def test_a_drive_asks_which_camera_of_a_chain_and_names_the_key(tmp_path: Path) 
         read_drive(tmp_path)
 
 
-def test_a_drive_whose_images_are_of_another_size_than_the_intrinsics_is_refused(tmp_path: Path) -> None:
+def test_a_drive_whose_images_are_of_another_size_than_the_intrinsics_is_refused(tmp_path):
     drive_with(tmp_path, {"file": "cameras.txt", "camera": 1})
     write_colmap(tmp_path / "cameras.txt", "1 PINHOLE 128 96 120 122 64 48", "2 PINHOLE 64 48 60 61 32 24")
     with pytest.raises(DriveError, match="image is 64 x 48, but camera_info of 'front' says 128 x 96"):

@@ -1,10 +1,6 @@
 """Poses as people have them, against formulas and libraries that the readers do not use."""
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +12,9 @@ from tests.drive.bags import Messages, write_ros2
 from tests.drive.example import ORIGIN, description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.importers.poses import Recorded, read_poses
+from v2hdm.io.importers.poses import read_poses
 from v2hdm.io.importers.tables import read_table
-from v2hdm.records import FloatArray, GeodeticOrigin
+from v2hdm.records import GeodeticOrigin
 from v2hdm.verdict import input_findings
 
 START_S = 1715934630.0
@@ -29,7 +25,7 @@ LEVEL_M = 3e-4
 """Level where it is, 820 m off, a vehicle has its antenna 0.2 mm elsewhere than level with the map, m."""
 
 
-def curve(count: int = 41) -> tuple[FloatArray, FloatArray, FloatArray]:
+def curve(count=41):
     """Times, positions in the map and headings (to the left of east) of a vehicle on a bend of 30 m."""
     stamp_s = START_S + 0.25 * np.arange(count)
     yaw = 0.4 + 5.0 * (stamp_s - START_S) / 30.0
@@ -37,7 +33,7 @@ def curve(count: int = 41) -> tuple[FloatArray, FloatArray, FloatArray]:
     return stamp_s, points + np.array([700.0, -400.0, 2.0]), yaw
 
 
-def antenna(points: FloatArray, yaw: FloatArray) -> FloatArray:
+def antenna(points, yaw):
     """Where the antenna of a level vehicle is, written out."""
     x, y, z = LEVER_M
     offset = np.column_stack([
@@ -46,7 +42,7 @@ def antenna(points: FloatArray, yaw: FloatArray) -> FloatArray:
     return points + offset
 
 
-def place(points_map: FloatArray, origin: GeodeticOrigin = ORIGIN) -> FloatArray:
+def place(points_map, origin=ORIGIN):
     """Latitude, longitude, height of map points, by PROJ's own topocentric frame."""
     pipeline = (
         f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={origin.latitude_deg!r} "
@@ -57,7 +53,7 @@ def place(points_map: FloatArray, origin: GeodeticOrigin = ORIGIN) -> FloatArray
     return np.column_stack([lat, lon, height])
 
 
-def true_azimuth_deg(points_map: FloatArray, yaw: FloatArray) -> FloatArray:
+def true_azimuth_deg(points_map, yaw):
     """Compass headings at the places themselves, from two points a metre apart on the ellipsoid."""
     ahead = points_map + np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
     here, there = place(points_map), place(ahead)
@@ -65,14 +61,11 @@ def true_azimuth_deg(points_map: FloatArray, yaw: FloatArray) -> FloatArray:
     return np.asarray(azimuth) % 360
 
 
-def read(content: object, root: Path, origin: GeodeticOrigin | None = ORIGIN) -> Recorded:
-    def no_topic(*_: object) -> Any:
-        raise AssertionError
-
-    return read_poses(content, root, origin, 0.5, "drive.yaml: poses", no_topic)
+def read(content, root, origin=ORIGIN):
+    return read_poses(content, root, origin, 0.5, "drive.yaml: poses", None)
 
 
-def check(got: Recorded, rows: slice = slice(None), metres: float = 1e-6, radians: float = 1e-7) -> None:
+def check(got, rows=slice(None), metres=1e-6, radians=1e-7):
     stamp_s, points, yaw = (values[rows] for values in curve())
     np.testing.assert_allclose(got.trajectory.stamp_s, stamp_s, rtol=0, atol=1e-6)
     poses = got.trajectory.map_from_vehicle
@@ -81,22 +74,20 @@ def check(got: Recorded, rows: slice = slice(None), metres: float = 1e-6, radian
     np.testing.assert_allclose((off + np.pi) % (2 * np.pi) - np.pi, 0, atol=radians)
 
 
-def checksum(body: str) -> str:
+def checksum(body):
     value = 0
     for letter in body:
         value ^= ord(letter)
     return f"${body}*{value:02X}"
 
 
-def nmea_angle(degrees: float, digits: int, sides: str) -> str:
+def nmea_angle(degrees, digits, sides):
     whole = int(abs(degrees))
     minutes = 60 * (abs(degrees) - whole)
     return f"{whole:0{digits}d}{minutes:012.9f},{sides[0 if degrees >= 0 else 1]}"
 
 
-def nmea_log(
-    qualities: Sequence[int] | None = None, heading: str = "HDT", start_day_s: float = 30630.0
-) -> str:
+def nmea_log(qualities=None, heading="HDT", start_day_s=30630.0):
     stamp_s, points, yaw = curve()
     places = place(antenna(points, yaw))
     headings = true_azimuth_deg(points, yaw)
@@ -119,7 +110,7 @@ def nmea_log(
 
 
 @pytest.mark.parametrize("heading", ["HDT", "THS", "PASHR"])
-def test_an_nmea_log_gives_the_vehicle_and_not_the_antenna(heading: str, tmp_path: Path) -> None:
+def test_an_nmea_log_gives_the_vehicle_and_not_the_antenna(heading, tmp_path):
     (tmp_path / "log.nmea").write_text(nmea_log(heading=heading))
     got = read({"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}, tmp_path)
     check(got, metres=LEVEL_M, radians=1e-6)
@@ -127,9 +118,7 @@ def test_an_nmea_log_gives_the_vehicle_and_not_the_antenna(heading: str, tmp_pat
     assert got.origin == ORIGIN
 
 
-def test_positions_without_an_rtk_fix_are_left_out_and_counted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_positions_without_an_rtk_fix_are_left_out_and_counted(tmp_path, caplog):
     qualities = [4] * 20 + [5] * 15 + [1] * 4 + [0] * 2
     (tmp_path / "log.nmea").write_text(nmea_log(qualities))
     content: dict[str, Any] = {"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}
@@ -144,13 +133,13 @@ def test_positions_without_an_rtk_fix_are_left_out_and_counted(
         read(content, tmp_path)
 
 
-def test_a_log_past_midnight_goes_on(tmp_path: Path) -> None:
+def test_a_log_past_midnight_goes_on(tmp_path):
     (tmp_path / "log.nmea").write_text(nmea_log(start_day_s=86395.0))
     stamps = read({"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}, tmp_path).trajectory.stamp_s
     np.testing.assert_allclose(np.diff(stamps), 0.25, atol=1e-6)
 
 
-def test_an_nmea_log_is_refused_for_what_it_lacks(tmp_path: Path) -> None:
+def test_an_nmea_log_is_refused_for_what_it_lacks(tmp_path):
     log = tmp_path / "log.nmea"
     content: dict[str, Any] = {"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}
     whole = nmea_log().splitlines()
@@ -169,7 +158,7 @@ def test_an_nmea_log_is_refused_for_what_it_lacks(tmp_path: Path) -> None:
         read(content, tmp_path)
 
 
-def grid(points: FloatArray, crs: str) -> FloatArray:
+def grid(points, crs):
     places = place(points)
     easting, northing = pyproj.Transformer.from_crs("EPSG:4258", crs, always_xy=True).transform(
         places[:, 1], places[:, 0]
@@ -182,9 +171,7 @@ ETRS = GeodeticOrigin(53.5, 9.9, 45.0, "ETRS89")
 
 @pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:25833", "EPSG:4647"])
 @pytest.mark.parametrize("heading", ["true", "grid"])
-def test_projected_coordinates_and_either_north_give_the_same_poses(
-    crs: str, heading: str, tmp_path: Path
-) -> None:
+def test_projected_coordinates_and_either_north_give_the_same_poses(crs, heading, tmp_path):
     stamp_s, points, yaw = curve()
     table = grid(points, crs)
     azimuth_deg = true_azimuth_deg(points, yaw)
@@ -201,13 +188,12 @@ def test_projected_coordinates_and_either_north_give_the_same_poses(
     columns = {"stamp_s": "t", "x_m": "E", "y_m": "N", "z_m": "h", "heading_deg": "hdg"}
     content = {"csv": "route.csv", "columns": columns, "crs": crs, "heading": heading}
     got = read(content, tmp_path, None)
-    assert got.origin is not None
     assert got.origin.datum.startswith("ETRS89")
     origin = GeodeticOrigin(53.5, 9.9, 45.0, got.origin.datum)
     check(read(content, tmp_path, origin), metres=1e-5, radians=1e-6)
 
 
-def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path: Path) -> None:
+def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path):
     (tmp_path / "route.csv").write_text(
         "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
     )
@@ -231,18 +217,17 @@ def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path: Path) -> Non
         read(content, tmp_path, ORIGIN)
 
 
-def test_heights_above_the_sea_are_raised_by_the_geoid(tmp_path: Path) -> None:
+def test_heights_above_the_sea_are_raised_by_the_geoid(tmp_path):
     (tmp_path / "route.csv").write_text(
         "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
     )
     content = {"csv": "route.csv", "crs": 5555, "heading": "grid", "geoid_m": 41.25, "epoch": 2024.5}
     got = read(content, tmp_path, None)
-    assert got.origin is not None
     assert got.origin.altitude_m == pytest.approx(44.25)
     assert got.origin.epoch == 2024.5
 
 
-def test_a_table_in_the_map_frame_with_angles(tmp_path: Path) -> None:
+def test_a_table_in_the_map_frame_with_angles(tmp_path):
     stamp_s, points, yaw = curve()
     roll, pitch = 0.03, -0.02
     rows = zip(stamp_s, points.tolist(), yaw.tolist(), strict=True)
@@ -276,21 +261,21 @@ def test_a_table_in_the_map_frame_with_angles(tmp_path: Path) -> None:
         ("utc,x_m,y_m,yaw_deg\nnow,2,0,0\n", "'now' is not a time such as"),
     ],
 )
-def test_a_damaged_table_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_a_damaged_table_is_refused_in_one_line(text, message, tmp_path):
     (tmp_path / "route.csv").write_text(text)
     with pytest.raises(DriveError, match=message) as caught:
         read({"csv": "route.csv"}, tmp_path)
     assert "\n" not in str(caught.value)
 
 
-def test_a_pose_whose_quality_is_left_blank_has_no_fix(tmp_path: Path) -> None:
+def test_a_pose_whose_quality_is_left_blank_has_no_fix(tmp_path):
     path = tmp_path / "route.csv"
     path.write_text("stamp_s,x_m,y_m,yaw_deg,quality\n1,2,3,0,4\n2,3,3,0,\n3,4,3,0,inf\n")
     assert read_table(path, {}, tmp_path, "here").sigma_m.tolist() == [0.02, np.inf, np.inf]
 
 
 @pytest.mark.parametrize("axes", ["vehicle", "camera"])
-def test_rows_of_kitti_have_their_times_beside_them(axes: str, tmp_path: Path) -> None:
+def test_rows_of_kitti_have_their_times_beside_them(axes, tmp_path):
     stamp_s, points, yaw = curve()
     matrices = np.zeros((41, 3, 4))
     matrices[:, :, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
@@ -309,7 +294,7 @@ def test_rows_of_kitti_have_their_times_beside_them(axes: str, tmp_path: Path) -
         read({"kitti": "poses.txt"}, tmp_path)
 
 
-def with_topic(root: Path, made: Messages, poses: dict[str, Any], **changes: Any) -> Any:
+def with_topic(root, made, poses, **changes):
     """A drive of a folder's images at times within the curve, with the poses of a bag."""
     make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))
     with description(root) as content:
@@ -319,7 +304,7 @@ def with_topic(root: Path, made: Messages, poses: dict[str, Any], **changes: Any
     return read_drive(root, ReadOptions(cache=str(root / "cache")))
 
 
-def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path: Path) -> None:
+def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path):
     stamp_s, points, yaw = curve()
     made = Messages()
     for k, where in enumerate(place(antenna(points, yaw))):
@@ -343,7 +328,7 @@ def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path
     assert drive.pose_noise.heading_rad == pytest.approx(0.002)
 
 
-def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path: Path) -> None:
+def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path):
     stamp_s, points, yaw = curve()
     covariance = np.diag([0.03**2, 0.03**2, 1.0, 0.1, 0.1, 0.004**2])
     made = Messages()
@@ -361,7 +346,7 @@ def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path: 
     assert (noise.position_m, noise.heading_rad) == (0.05, pytest.approx(0.004))
 
 
-def test_poses_of_transforms_over_a_moving_and_a_fixed_edge(tmp_path: Path) -> None:
+def test_poses_of_transforms_over_a_moving_and_a_fixed_edge(tmp_path):
     stamp_s, points, yaw = curve()
     map_from_odom, base_from_gnss = np.eye(4), np.eye(4)
     map_from_odom[:3, :3] = Rotation.from_euler("z", 0.7).as_matrix()
@@ -380,9 +365,7 @@ def test_poses_of_transforms_over_a_moving_and_a_fixed_edge(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("stated_m", "status"), [((1.2, 0.0, 1.8), "PASS"), ((0.0, 0.0, 0.0), "WARN")])
-def test_a_lever_arm_of_zero_that_should_not_be_is_named_by_the_check(
-    stated_m: tuple[float, ...], status: str, tmp_path: Path
-) -> None:
+def test_a_lever_arm_of_zero_that_should_not_be_is_named_by_the_check(stated_m, status, tmp_path):
     """A straight of 40 m, a bend of 15 m radius and a straight, driven with the axle on the line."""
     station_m = np.arange(0.0, 110.0, 0.25)
     yaw = np.clip((station_m - 40.0) / 15.0, 0.0, 3.5)

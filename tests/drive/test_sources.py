@@ -1,11 +1,7 @@
 """Image folders and videos are the same drive as a list of images."""
 
-from __future__ import annotations
-
 import shutil
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import av
 import cv2
@@ -16,13 +12,12 @@ from tests.drive.bags import assert_same_drive
 from tests.drive.example import description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.records import Drive, Image
 
 STAMPS = tuple(100.05 + 0.1 * n for n in range(6))
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """A drive with pictures without loss at 10 Hz."""
     root = tmp_path / "folder"
     root.mkdir()
@@ -37,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def write_video(folder: Path, path: Path, codec: str = "ffv1", keep: int | None = None) -> Path:
+def write_video(folder, path, codec="ffv1", keep=None):
     """The images of the front camera as a video without loss, its first frame not at zero."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=10)
@@ -51,17 +46,17 @@ def write_video(folder: Path, path: Path, codec: str = "ffv1", keep: int | None 
     return path
 
 
-def read(root: Path, images: Any) -> Drive:
+def read(root, images):
     with description(root) as content:
         content["cameras"]["front"]["images"] = images
     return read_drive(root, ReadOptions(cache=str(root / "cache")))
 
 
-def by_camera(drive: Drive) -> list[Image]:
+def by_camera(drive):
     return sorted(drive.images, key=lambda image: (image.camera, image.stamp_s))
 
 
-def test_a_video_with_poses_is_the_same_drive(folder: Path) -> None:
+def test_a_video_with_poses_is_the_same_drive(folder):
     expected = read_drive(folder)
     write_video(folder, folder / "front.mkv")
     got = read(folder, {"video": "front.mkv", "start_s": 100.05})
@@ -79,7 +74,7 @@ def test_a_video_with_poses_is_the_same_drive(folder: Path) -> None:
     assert_same_drive(read(folder, {"video": "front.mkv", "stamps": "times.txt"}), expected)
 
 
-def test_an_image_folder_with_a_file_of_times_or_named_by_them(folder: Path) -> None:
+def test_an_image_folder_with_a_file_of_times_or_named_by_them(folder):
     expected = read_drive(folder)
     np.savetxt(folder / "times.txt", STAMPS, fmt="%.9f")
     assert_same_drive(read(folder, {"folder": "front/images", "stamps": "times.txt"}), expected)
@@ -90,7 +85,7 @@ def test_an_image_folder_with_a_file_of_times_or_named_by_them(folder: Path) -> 
     assert_same_drive(read(folder, {"folder": "front/named", "unit": "ms"}), expected)
 
 
-def test_a_source_that_does_not_fit_is_named(folder: Path) -> None:
+def test_a_source_that_does_not_fit_is_named(folder):
     write_video(folder, folder / "front.mkv")
     (folder / "times.txt").write_text("1.0\n2.0\n")
     (folder / "text.mp4").write_text("no video")
@@ -118,9 +113,7 @@ def test_a_source_that_does_not_fit_is_named(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("module", ["rosbags", "av", "pyproj"])
-def test_a_library_that_is_not_installed_is_named_with_its_extra(
-    module: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_library_that_is_not_installed_is_named_with_its_extra(module, folder, monkeypatch):
     extra, images = {"rosbags": "ros", "av": "video", "pyproj": "map"}[module], "front/images.txt"
     with description(folder) as content:
         if module == "rosbags":

@@ -1,9 +1,6 @@
 """A survey's CSV: columns, systems of coordinates, and what is told of a file that means something else."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pyproj
@@ -11,8 +8,8 @@ import pytest
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import geodetic_from_enu
-from v2hdm.io.drive.survey import SurveyedPoint, in_map, misreadings, read_survey
-from v2hdm.records import FloatArray, GeodeticOrigin
+from v2hdm.io.drive.survey import in_map, misreadings, read_survey
+from v2hdm.records import GeodeticOrigin
 
 ORIGIN = GeodeticOrigin(53.54, 9.02, 45.0)
 """Nearly at the edge of its UTM zone: the convergence is 0.02 degrees there, 4.8 in the next one."""
@@ -20,16 +17,14 @@ ORIGIN = GeodeticOrigin(53.54, 9.02, 45.0)
 PLACES = np.array([[0.0, 0.0, 0.0], [812.4, -350.2, 3.1], [-15.75, 620.04, -1.4]])
 
 
-def points(
-    tmp_path: Path, text: str, origin: GeodeticOrigin | None = None, **how: object
-) -> tuple[SurveyedPoint, ...]:
+def points(tmp_path, text, origin=None, **how):
     path = tmp_path / "points.csv"
     path.write_text(text, encoding="utf-8")
     settings = {"crs": None, "geoid_m": None, "sigma_m": 0.01, **how}
     return in_map(read_survey(path, **settings), origin)  # type: ignore[arg-type]
 
 
-def stated_in(crs: str, geoid_m: float = 0.0) -> FloatArray:
+def stated_in(crs, geoid_m=0.0):
     """The places in a projected system, by pyproj alone."""
     geodetic = geodetic_from_enu(ORIGIN, PLACES)
     east, north = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(
@@ -38,12 +33,12 @@ def stated_in(crs: str, geoid_m: float = 0.0) -> FloatArray:
     return np.column_stack([east, north, geodetic[:, 2] - geoid_m])
 
 
-def written(columns: str, rows: FloatArray) -> str:
+def written(columns, rows):
     lines = [",".join([f"P{k}", *(f"{value:.9f}" for value in row)]) for k, row in enumerate(rows)]
     return "\n".join([f"id,{columns}", *lines])
 
 
-def test_local_points_keep_their_metres_names_roles_and_sigmas(tmp_path: Path) -> None:
+def test_local_points_keep_their_metres_names_roles_and_sigmas(tmp_path):
     text = (
         "\ufeffPoint;X;Y;Z;sigma_m;sigma_north_m;Role;Description;Executor\n"
         "A1;3.21;4.05;0.30;;;;corner of the stop line, north;Kim\n"
@@ -60,30 +55,26 @@ def test_local_points_keep_their_metres_names_roles_and_sigmas(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32631"])
-def test_grid_coordinates_of_any_zone_lie_where_they_are_whatever_its_convergence(
-    crs: str, tmp_path: Path
-) -> None:
+def test_grid_coordinates_of_any_zone_lie_where_they_are_whatever_its_convergence(crs, tmp_path):
     found = points(tmp_path, written("Easting,Northing,height", stated_in(crs)), ORIGIN, crs=crs)
     np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-4)
     np.testing.assert_allclose([one.height_m for one in found], PLACES[:, 2], atol=1e-4)
 
 
-def test_latitudes_and_longitudes_lie_where_they_are(tmp_path: Path) -> None:
+def test_latitudes_and_longitudes_lie_where_they_are(tmp_path):
     geodetic = geodetic_from_enu(ORIGIN, PLACES)
     found = points(tmp_path, written("lat,lon,altitude_m", geodetic), ORIGIN)
     np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-3)
     np.testing.assert_allclose([one.height_m for one in found], PLACES[:, 2], atol=1e-3)
 
 
-def test_a_point_without_a_height_is_at_that_of_the_origin(tmp_path: Path) -> None:
+def test_a_point_without_a_height_is_at_that_of_the_origin(tmp_path):
     found = points(tmp_path, written("east,north", stated_in("EPSG:32632")[:, :2]), ORIGIN, crs="EPSG:32632")
     np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-3)
     assert [one.height_m for one in found] == [None] * 3
 
 
-def test_heights_above_the_sea_need_the_geoid_and_are_not_used_without(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_heights_above_the_sea_need_the_geoid_and_are_not_used_without(tmp_path, caplog):
     crs = "EPSG:32632+5773"
     text = written("east,north,height_m", stated_in("EPSG:32632", geoid_m=39.6))
     assert [one.height_m for one in points(tmp_path, text, ORIGIN, crs=crs)] == [None] * 3
@@ -120,16 +111,14 @@ def test_heights_above_the_sea_need_the_geoid_and_are_not_used_without(
         ("id,east,north\nA,5e5,5.9e6\n", {"crs": "EPSG:25832"}, "in ETRS89.*the drive's origin in WGS84"),
     ],
 )  # fmt: skip
-def test_a_file_that_cannot_be_used_is_one_line_that_names_the_place(
-    text: str, how: dict[str, object], message: str, tmp_path: Path
-) -> None:
+def test_a_file_that_cannot_be_used_is_one_line_that_names_the_place(text, how, message, tmp_path):
     with pytest.raises(DriveError, match=message) as caught:
         points(tmp_path, text, ORIGIN, **how)
     assert "\n" not in str(caught.value)
     assert re.match(r".*points\.csv", str(caught.value))
 
 
-def test_places_on_the_earth_need_a_drive_with_an_origin(tmp_path: Path) -> None:
+def test_places_on_the_earth_need_a_drive_with_an_origin(tmp_path):
     with pytest.raises(DriveError, match="the drive's map has none; give the drive an origin"):
         points(tmp_path, "id,lat,lon\nA,53.5,9.0\n")
 
@@ -150,9 +139,7 @@ def test_places_on_the_earth_need_a_drive_with_an_origin(tmp_path: Path) -> None
         ("east,north", PLACES[:, :2], "EPSG:32632", "as local metres (columns x_m, y_m)"),
     ],
 )  # fmt: skip
-def test_what_a_file_in_the_wrong_frame_means_is_among_its_misreadings(
-    columns: str, rows: FloatArray, crs: str | None, meant: str, tmp_path: Path
-) -> None:
+def test_what_a_file_in_the_wrong_frame_means_is_among_its_misreadings(columns, rows, crs, meant, tmp_path):
     path = tmp_path / "points.csv"
     path.write_text(written(columns, rows))
     ways = misreadings(read_survey(path, crs, None, 0.01), ORIGIN)

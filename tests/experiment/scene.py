@@ -1,7 +1,5 @@
 """Records of made-up drives: five diamonds along a street, mapped with errors that are known."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

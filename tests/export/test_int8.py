@@ -1,7 +1,6 @@
 """The int8 file: nearly what its network says, on every CPU; a start for training; or not written at all."""
 
 import json
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +13,8 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from onnx import numpy_helper
 
-from export import onnx_file
+from export import int8, onnx_file
+from export.arrange import arrange
 from export.calibration import looks
 from export.config import BoundsConfig, ExportConfig, Int8Config, Precision
 from export.equalise import equalise
@@ -23,7 +23,7 @@ from export.int8 import HIGHEST_WEIGHT, to_int8
 from export.onnx_file import export_float, export_int8, to_onnx
 from export.parity import Parity, int8_parity
 from export.rounding import input_moments, round_weights
-from export.source import Source, of_checkpoint, read_source
+from export.source import of_checkpoint, read_source
 from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
 from train.config import TrainConfig
@@ -35,18 +35,15 @@ from v2hdm.errors import ConfigError, DetectorError
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2], separable=True)
 ANY = BoundsConfig(
-    paint_changed=9.0,
-    outline_px=9.0,
-    outline_bias_px=9.0,
+    **dict.fromkeys(("paint_changed", "outline_px", "outline_bias_px", "lane_offset_px"), 9.0),
     kinds_agree=0.0,
     lanes_agree=0.0,
-    lane_offset_px=9.0,
 )
 
 Images = list[np.ndarray]
 
 
-def some_images() -> Images:
+def some_images():
     """Blurred noise: neighbouring pixels are alike, as in images of the world."""
     generator = np.random.default_rng(3)
     out = []
@@ -57,7 +54,7 @@ def some_images() -> Images:
     return out
 
 
-def network(config: NetConfig, images: Images) -> MarkingNet:
+def network(config, images):
     """Whose normalisations have seen the images, and whose channels differ much in range."""
     torch.manual_seed(0)
     net = MarkingNet(config).train()
@@ -72,29 +69,29 @@ def network(config: NetConfig, images: Images) -> MarkingNet:
 
 
 @pytest.fixture(scope="module")
-def images() -> Images:
+def images():
     return some_images()
 
 
 @pytest.fixture(scope="module")
-def source(images: Images) -> Source:
+def source(images):
     net = network(SMALL, images)
     config = TrainConfig(net=SMALL)
     return of_checkpoint(Checkpoint(config=asdict(config), step=5, renders=7, averaged=net.state_dict()))
 
 
 @pytest.fixture(scope="module")
-def plain(source: Source) -> onnx.ModelProto:
+def plain(source):
     return to_onnx(deepcopy(source.net).fold(), 18)
 
 
 @pytest.fixture(scope="module")
-def model(plain: onnx.ModelProto, images: Images) -> onnx.ModelProto:
+def model(plain, images):
     return to_int8(plain, images)
 
 
 @pytest.fixture(scope="module")
-def quick(images: Images, plain: onnx.ModelProto) -> Iterator[None]:
+def quick(images, plain):
     """Nothing is rendered, and the float graph is not made again: that takes seconds each time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_file, "looks", lambda seed, frames: iter([images]))
@@ -103,13 +100,13 @@ def quick(images: Images, plain: onnx.ModelProto) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def file(source: Source, quick: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(source, quick, tmp_path_factory):
     path = tmp_path_factory.mktemp("int8") / "int8.onnx"
     export_int8(source, path, 18, Int8Config(bounds=ANY), lambda share, doing: None)
     return path
 
 
-def errors(net: MarkingNet, model: onnx.ModelProto, images: Images) -> dict[str, float]:
+def errors(net, model, images):
     """Root of the mean squared error of every output, as a share of its own spread."""
     session = open_session(model.SerializeToString())
     out = {}
@@ -121,22 +118,22 @@ def errors(net: MarkingNet, model: onnx.ModelProto, images: Images) -> dict[str,
     return out
 
 
-def _torch(net: MarkingNet, image: np.ndarray) -> dict[str, np.ndarray]:
+def _torch(net, image):
     with torch.inference_mode():
         return {name: value.numpy() for name, value in net(torch.from_numpy(image[None]))._asdict().items()}
 
 
-def test_it_says_nearly_what_the_network_says(source: Source, model: onnx.ModelProto, images: Images) -> None:
+def test_it_says_nearly_what_the_network_says(source, model, images):
     assert {o: e for o, e in errors(source.net, model, images).items() if not e < 0.1} == {}
 
 
-def test_so_does_a_network_of_another_make(images: Images) -> None:
+def test_so_does_a_network_of_another_make(images):
     net = network(replace(SMALL, separable=False, lanes=False, wide_kinds=False), images)
     made = to_int8(to_onnx(deepcopy(net).fold(), 18), images)
     assert {o: e for o, e in errors(net, made, images).items() if not e < 0.1} == {}
 
 
-def test_rounding_in_turn_keeps_what_the_first_layer_computes(plain: onnx.ModelProto, images: Images) -> None:
+def test_rounding_in_turn_keeps_what_the_first_layer_computes(plain, images):
     """Its inputs are 16 neighbouring pixels, alike: the errors of their weights are made to cancel."""
     graph = Graph(plain)
     stem = graph.convolutions[0]
@@ -150,9 +147,7 @@ def test_rounding_in_turn_keeps_what_the_first_layer_computes(plain: onnx.ModelP
     assert ours < 0.5 * plain
 
 
-def test_equalised_channels_leave_the_function_as_it_was(
-    source: Source, plain: onnx.ModelProto, images: Images
-) -> None:
+def test_equalised_channels_leave_the_function_as_it_was(source, plain, images):
     graph = Graph(plain)
     before = {name: weight.copy() for name, weight in graph.weights.items()}
     equalise(graph, images)
@@ -163,7 +158,7 @@ def test_equalised_channels_leave_the_function_as_it_was(
     assert "encode4.0.0.weight" in changed
 
 
-def test_products_cannot_saturate_where_a_cpu_adds_two_in_16_bits(model: onnx.ModelProto) -> None:
+def test_products_cannot_saturate_where_a_cpu_adds_two_in_16_bits(model):
     weights = [
         numpy_helper.to_array(tensor)
         for tensor in model.graph.initializer
@@ -174,52 +169,20 @@ def test_products_cannot_saturate_where_a_cpu_adds_two_in_16_bits(model: onnx.Mo
     assert 2 * 255 * HIGHEST_WEIGHT < 2**15
 
 
-def test_outputs_are_not_rounded(model: onnx.ModelProto, images: Images) -> None:
-    outputs = open_session(model.SerializeToString()).run(None, {"image": images[0][None]})
-    for output in outputs:
+def test_the_first_layer_reads_the_bytes_of_the_image_and_outputs_are_not_rounded(model, images):
+    assert not [node for node in model.graph.node if node.op_type == "Cast"]
+    for output in open_session(model.SerializeToString()).run(None, {"image": images[0][None]}):
         assert len(np.unique(output)) > 256
 
 
-def test_the_first_layer_reads_the_bytes_of_the_image(model: onnx.ModelProto) -> None:
-    assert not [node for node in model.graph.node if node.op_type == "Cast"]
-
-
-def test_moments_are_those_of_what_a_convolution_multiplies(plain: onnx.ModelProto, images: Images) -> None:
-    """Weights (1, K) times moments times weights is the sum of squares of what comes out, bias included."""
-    graph = Graph(plain)
-    for conv in graph.convolutions:
-        (seen,) = graph.run([conv.input, conv.output], images[:1])
-        moments = input_moments(conv, seen[conv.input])
-        weight = graph.weights[conv.weight]
-        rows = np.column_stack([weight.reshape(len(weight), -1), graph.weights[conv.bias]])
-        for channel, row in enumerate(rows):
-            moment = moments[channel if conv.depthwise else 0]
-            expected = (seen[conv.output][0, channel].astype(np.float64) ** 2).sum()
-            assert row @ moment @ row == pytest.approx(expected, rel=1e-3)
-
-
-def test_what_one_weight_loses_its_like_makes_up_for() -> None:
-    """Two inputs that are always the same: only the sum of their weights matters, and that is kept."""
-    moments = np.array([[[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
-    weight = np.array([1.0, 0.149]).reshape(1, 2, 1, 1)
-    whole, scale, _ = round_weights(weight, np.zeros(1), moments, highest=4)
-    assert (whole * scale).sum() == pytest.approx(1.25)
-    weight = np.array([0.124, 0.124, 0.124, 1.0]).reshape(1, 4, 1, 1)
-    alike = np.ones((1, 5, 5))
-    alike[0, 4], alike[0, :, 4] = 0, 0
-    alike[0, 4, 4] = 1
-    whole, scale, _ = round_weights(weight, np.zeros(1), alike, highest=4)
-    assert (whole * scale).sum() == pytest.approx(weight.sum(), abs=0.126)
-
-
-def test_the_detectors_network_runs_the_file_on_any_size(source: Source, file: Path) -> None:
+def test_the_detectors_network_runs_the_file_on_any_size(source, file):
     network = Network(file)
     for height, width in ((16, 16), (50, 130), (544, 960)):
         output = network.run(np.full((height, width, 3), 90, dtype=np.uint8))
         assert output.paint.shape == (-(-height // 2), -(-width // 2))
 
 
-def test_its_label_has_all_that_the_float_files_has_and_its_parity(source: Source, file: Path) -> None:
+def test_its_label_has_all_that_the_float_files_has_and_its_parity(source, file):
     assert [path.name for path in file.parent.iterdir()] == ["int8.onnx"]
     label = json.loads({p.key: p.value for p in onnx.load(file).metadata_props}[METADATA_KEY])
     assert label["precision"] == "int8"
@@ -227,16 +190,14 @@ def test_its_label_has_all_that_the_float_files_has_and_its_parity(source: Sourc
     assert {key: label[key] for key in source.label} == source.label
 
 
-def test_a_file_beyond_a_bound_is_not_written(source: Source, quick: None, tmp_path: Path) -> None:
+def test_a_file_beyond_a_bound_is_not_written(source, quick, tmp_path):
     bounds = replace(ANY, lane_offset_px=0.0)
     with pytest.raises(DetectorError, match=r"lane_offset_px 0\.\S+ \(int8\.bounds\.lane_offset_px=0\)"):
         export_int8(source, tmp_path / "int8.onnx", 18, Int8Config(bounds=bounds), lambda share, doing: None)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_parity_sees_what_was_done_to_an_output(
-    source: Source, plain: onnx.ModelProto, images: Images
-) -> None:
+def test_parity_sees_what_was_done_to_an_output(source, plain, images):
     """Log odds that are all larger by a bit make paint grow; another bias of the lanes' offset moves them."""
     same = int8_parity(source.net, plain.SerializeToString(), images)
     assert asdict(same) == pytest.approx(asdict(Parity(0.0, 0.0, 0.0, 1.0, 1.0, 0.0)), abs=1e-4)
@@ -251,14 +212,12 @@ def test_parity_sees_what_was_done_to_an_output(
     assert moved.lane_offset_px == pytest.approx(0.25 * 8, abs=1e-3)
 
 
-def test_what_is_not_a_number_is_beyond_every_bound() -> None:
+def test_what_is_not_a_number_is_beyond_every_bound():
     nothing = Parity(*[float("nan")] * 6)
     assert len(nothing.beyond(asdict(ANY))) == 6
 
 
-def test_a_float_file_becomes_int8_as_its_checkpoint_does(
-    source: Source, quick: None, tmp_path: Path
-) -> None:
+def test_a_float_file_becomes_int8_as_its_checkpoint_does(source, quick, tmp_path):
     export_float(source, tmp_path / "float.onnx", 18, 1e-3)
     again = read_source(tmp_path / "float.onnx")
     one, other = (
@@ -269,9 +228,7 @@ def test_a_float_file_becomes_int8_as_its_checkpoint_does(
     assert again.label["commit"] == source.label["commit"]
 
 
-def test_the_weights_of_an_int8_file_can_be_learnt_on_from(
-    source: Source, file: Path, images: Images
-) -> None:
+def test_the_weights_of_an_int8_file_can_be_learnt_on_from(source, file, images):
     exported = read_exported(file)
     assert exported.renders == 7
     net = MarkingNet(SMALL).fold()
@@ -281,12 +238,12 @@ def test_the_weights_of_an_int8_file_can_be_learnt_on_from(
         assert (value - expected).std() < 0.1 * expected.std()
 
 
-def test_an_int8_file_is_not_rounded_again(file: Path) -> None:
+def test_an_int8_file_is_not_rounded_again(file):
     with pytest.raises(ConfigError, match="rounded to int8 already"):
         read_source(file)
 
 
-def test_images_are_what_the_detector_looks_at() -> None:
+def test_images_are_what_the_detector_looks_at():
     seen = list(looks(11, 2, ((640, 352),)))
     again = list(looks(11, 2, ((640, 352),)))
     assert all(image.shape[0] % 16 == 0 and image.shape[1] in (640, 320) for part in seen for image in part)
@@ -296,12 +253,12 @@ def test_images_are_what_the_detector_looks_at() -> None:
     assert not np.array_equal(seen[0][0], seen[1][0])
 
 
-def test_int8_without_renders_says_what_to_set(source: Source, quick: None, tmp_path: Path) -> None:
+def test_int8_without_renders_says_what_to_set(source, quick, tmp_path):
     with pytest.raises(DetectorError, match=r"int8\.frames"):
         export_int8(source, tmp_path / "x.onnx", 18, Int8Config(frames=0), lambda share, doing: None)
 
 
-def test_the_door_knows_its_precisions() -> None:
+def test_the_door_knows_its_precisions():
     register("export", ExportConfig)
     with initialize_config_dir(CONF, version_base="1.3"):
         composed = compose("export", overrides=["checkpoint=a", "output=b", "precision=int8"])
@@ -309,3 +266,75 @@ def test_the_door_knows_its_precisions() -> None:
         with pytest.raises(HydraException) as caught:
             compose("export", overrides=["precision=int4"])
     assert "[float32, int8]" in str(explain(caught.value, ExportConfig, []))
+
+
+CONFIG = NetConfig(widths=[16, 32, 16, 16], dilations=[1, 2])
+SIZES = ((16, 16), (48, 112), (96, 32))
+
+
+def noise(height, width):
+    return np.random.default_rng(height).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def before(config):
+    """The graph with bytes inside, as it was thought out."""
+    torch.manual_seed(1)
+    net = MarkingNet(config).train()
+    with torch.no_grad():
+        for _ in range(20):  # normalisations that have seen nothing have no biases
+            net(torch.from_numpy(noise(64, 96)[None]))
+    plain = to_onnx(net.eval().fold(), 18)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(int8, "arrange", lambda graph: None)
+        return int8.to_int8(plain, [noise(64, 96)])
+
+
+def after(model):
+    graph = Graph(model)
+    arrange(graph)
+    arranged = graph.stored()
+    onnx.checker.check_model(arranged, full_check=True)
+    return arranged
+
+
+@pytest.fixture(scope="module")
+def thought_out():
+    return before(CONFIG)
+
+
+def check_same(one, other):
+    sessions = [open_session(model.SerializeToString()) for model in (one, other)]
+    for size in SIZES:
+        said = [session.run(list(Prediction._fields), {"image": noise(*size)[None]}) for session in sessions]
+        for name, a, b in zip(Prediction._fields, *said, strict=True):
+            np.testing.assert_allclose(a, b, atol=2e-5, err_msg=f"{name} of {size}")
+
+
+def test_it_says_the_same(thought_out):
+    check_same(thought_out, after(thought_out))
+
+
+@pytest.mark.parametrize("without", ["lanes", "wide_kinds"])
+def test_a_network_without_a_head_says_the_same(without):
+    model = before(replace(CONFIG, separable=True, **{without: False}))
+    check_same(model, after(model))
+
+
+def test_nothing_slow_is_left_nor_anything_unused(thought_out):
+    graph = after(thought_out).graph
+    assert "Resize" not in {node.op_type for node in graph.node}
+    read = {name for node in graph.node for name in node.input} | {value.name for value in graph.output}
+    assert {name for node in graph.node for name in node.output} <= read
+    assert {tensor.name for tensor in graph.initializer} <= read
+
+
+def test_it_is_arranged_once(thought_out):
+    once = after(thought_out)
+    assert after(once).SerializeToString() == once.SerializeToString()
+
+
+def test_weights_keep_their_names_and_values(thought_out):
+    kept = {t.name: numpy_helper.to_array(t) for t in after(thought_out).graph.initializer}
+    for tensor in thought_out.graph.initializer:
+        if tensor.name.endswith((".weight", ".weight.bytes", ".bias", ".bias.bytes")):
+            np.testing.assert_array_equal(kept[tensor.name], numpy_helper.to_array(tensor))

@@ -1,6 +1,7 @@
-"""The exported file: the network's function at any size, with a label, whole or not at all."""
+"""The exported file: the network's function, a label, whole or not at all; and its manifest."""
 
 import json
+import shutil
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 from export import __main__ as door
-from export import onnx_file
+from export import manifest, onnx_file
 from export.onnx_file import export_checkpoint
 from export.parity import PARITY_SIZES
 from models import MarkingNet, NetConfig, Prediction
@@ -21,6 +22,7 @@ from train.config import DataConfig, TrainConfig
 from train.scenes.scenes import training_sample
 from train.targets import IGNORE, paint_target
 from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.detection import weights
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import DetectorError
 
@@ -32,7 +34,7 @@ SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2])
 
 
 @pytest.fixture(scope="module")
-def checkpoint() -> Checkpoint:
+def checkpoint():
     torch.manual_seed(0)
     net = MarkingNet(SMALL)
     net.train()
@@ -42,16 +44,14 @@ def checkpoint() -> Checkpoint:
 
 
 @pytest.fixture(scope="module")
-def exported(checkpoint: Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(checkpoint, tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "net.onnx"
     assert export_checkpoint(checkpoint, path, opset=18, tolerance=1e-3) < 1e-3
     return path
 
 
 @pytest.mark.parametrize(("height", "width"), [*PARITY_SIZES, (720, 1280)])
-def test_the_file_computes_what_the_network_computes(
-    checkpoint: Checkpoint, exported: Path, height: int, width: int
-) -> None:
+def test_the_file_computes_what_the_network_computes(checkpoint, exported, height, width):
     image = np.random.default_rng(height).integers(0, 256, (1, height, width, 3)).astype(np.uint8)
     session = onnxruntime.InferenceSession(exported)
     with torch.inference_mode():
@@ -61,12 +61,12 @@ def test_the_file_computes_what_the_network_computes(
         np.testing.assert_allclose(output, expected.numpy(), atol=1e-4)
 
 
-def test_the_outputs_have_the_names_that_the_detector_asks_for(exported: Path) -> None:
+def test_the_outputs_have_the_names_that_the_detector_asks_for(exported):
     names = [node.name for node in onnxruntime.InferenceSession(exported).get_outputs()]
     assert names == list(Prediction._fields) == ["paint", "kinds", "lanes"]
 
 
-def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) -> None:
+def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported):
     properties = {p.key: p.value for p in onnx.load(exported).metadata_props}
     label = json.loads(properties[METADATA_KEY])
     assert label["classes"] == list(PAINT_CLASSES)
@@ -83,13 +83,11 @@ def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) ->
     assert label["training"]["data"]["own_labels"] == {"coco": True, "tusimple": False}
 
 
-def test_the_file_says_nothing_of_the_machine_that_it_was_made_on(exported: Path) -> None:
+def test_the_file_says_nothing_of_the_machine_that_it_was_made_on(exported):
     assert str(Path(__file__).parents[2]).encode() not in exported.read_bytes()
 
 
-def test_a_file_that_differs_from_its_network_is_not_written(
-    checkpoint: Checkpoint, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_differs_from_its_network_is_not_written(checkpoint, exported, tmp_path, monkeypatch):
     monkeypatch.setattr(onnx_file, "to_onnx", lambda net, opset: onnx.load(exported))
     other = replace(checkpoint, averaged={k: v + 0.1 for k, v in checkpoint.averaged.items()})
     with pytest.raises(DetectorError, match="was not written"):
@@ -97,7 +95,7 @@ def test_a_file_that_differs_from_its_network_is_not_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_weights_that_are_no_numbers_are_not_written(checkpoint: Checkpoint, tmp_path: Path) -> None:
+def test_weights_that_are_no_numbers_are_not_written(checkpoint, tmp_path):
     name = next(iter(checkpoint.averaged))
     broken = replace(checkpoint, averaged={**checkpoint.averaged, name: checkpoint.averaged[name] * np.nan})
     with pytest.raises(DetectorError, match="not finite"):
@@ -113,13 +111,7 @@ def test_weights_that_are_no_numbers_are_not_written(checkpoint: Checkpoint, tmp
         (["output=net.onnx"], "no value for checkpoint; `python -m export checkpoint=... output=...`"),
     ],
 )
-def test_what_is_missing_is_named_in_one_line(
-    overrides: list[str],
-    line: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_missing_is_named_in_one_line(overrides, line, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["export", *overrides])
     monkeypatch.chdir(tmp_path)
     assert door.main() == 2
@@ -130,7 +122,7 @@ def test_what_is_missing_is_named_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_shipped_detector_finds_fresh_paint_where_it_is() -> None:
+def test_the_shipped_detector_finds_fresh_paint_where_it_is():
     session = onnxruntime.InferenceSession(SHIPPED)
     recall, precision, overlap = [], [], np.zeros((3, 3))
     for index in range(12):
@@ -150,6 +142,59 @@ def test_the_shipped_detector_finds_fresh_paint_where_it_is() -> None:
         assert abs(shift) < 0.1, "masks are displaced by this many logits"
 
 
-def test_the_shipped_detector_knows_the_classes_of_this_code() -> None:
+def test_the_shipped_detector_knows_the_classes_of_this_code():
     properties = {p.key: p.value for p in onnx.load(SHIPPED).metadata_props}
     assert json.loads(properties[METADATA_KEY])["classes"] == list(PAINT_CLASSES)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    copy = tmp_path / "weights"
+    shutil.copytree(weights.FOLDER, copy, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+    return copy
+
+
+def check(folder):
+    weights._problem.cache_clear()
+    weights.check_weights(folder)
+
+
+def change(folder, name):
+    with (folder / name).open("ab") as file:
+        file.write(b"\n")
+
+
+def test_a_new_network_is_refused_until_judge_and_lane_score_were_fitted_to_it(folder):
+    change(folder, "default.onnx")
+    manifest.record(["default.onnx"], "python -m export", folder)
+    with pytest.raises(DetectorError, match=r"judge\.onnx: was fitted to another network .* train\.ship"):
+        check(folder)
+    change(folder, "judge.onnx")
+    change(folder, "confidence.json")
+    manifest.record(["judge.onnx", "confidence.json"], "python -m train.ship runs/gpu", folder)
+    with pytest.raises(DetectorError, match=r"lane_score\.json: .* train\.ship"):
+        check(folder)
+    manifest.record(["lane_score.json"], "kept", folder)
+    check(folder)
+    files = weights.read_manifest(folder)["files"]
+    assert files["lane_score.json"]["command"] == "kept"
+    assert len({entry["network"] for entry in files.values()}) == 1
+
+
+def test_the_manifest_names_the_commit_the_day_and_the_command(folder):
+    manifest.record(["judge.onnx"], "python -m train.ship runs/gpu", folder)
+    written = weights.read_manifest(folder)
+    entry = written["files"]["judge.onnx"]
+    assert written["commit"] is None or len(written["commit"].removesuffix("-dirty")) == 40
+    assert entry["command"] == "python -m train.ship runs/gpu"
+    assert entry["made"].count("-") == 2
+
+
+def test_an_export_elsewhere_leaves_the_manifest_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(manifest, "record", lambda *_: pytest.fail("the manifest was written"))
+    manifest.record_network(tmp_path / "mine.onnx", "python -m export")
+
+
+def test_what_is_no_fitted_file_is_refused(folder):
+    with pytest.raises(DetectorError, match=r"scores\.json: no fitted file .* give one of default\.onnx"):
+        manifest.record(["scores.json"], "by hand", folder)

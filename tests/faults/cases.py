@@ -1,7 +1,5 @@
 """All bad inputs and situations, as a table; `python -m tests.benchmarks.bad_inputs` runs it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -34,6 +32,20 @@ def drive(*changes: Callable[[Path], object]) -> Prepare:
             change(root / "drive")
 
     return prepare
+
+
+def checked(name: str, says: str, *changes: Callable[[Path], object], **more: object) -> Case:
+    """The check of the example drive, changed."""
+    return Case(name, CHECK, CHECKED, drive(*changes), says, **more)
+
+
+def detects(name: str, line: str, prepare: Prepare, says: str, **more: object) -> Case:
+    return Case(name, "v2hdm detect", tuple(line.split()), prepare, says, **more)
+
+
+def exported(name: str, prepare: Prepare, says: str) -> Case:
+    line = "map.geojson --format csv --output there"
+    return Case(name, "v2hdm export", tuple(line.split()), prepare, says)
 
 
 @lru_cache
@@ -267,26 +279,16 @@ def texts() -> Iterator[Case]:
         for file in ("drive.yaml", "front/camera_info.yaml"):
             # Of intrinsics any tool's file will do.
             either = f"{says}|no intrinsics of a known format" if file.startswith("front") else says
-            yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), either)
+            yield checked(f"{file}: {name}", either, write(file, text))
         both = ("a.yaml", "a.yaml")
         yield Case(f"calibration: {name}", "v2hdm calibrate compare", both, write("a.yaml", text), says)
     for name, (text, says) in JSON_TEXTS.items():
-        yield Case(
-            f"map: {name}",
-            "v2hdm export",
-            ("map.geojson", "--format", "csv", "--output", "there"),
-            write("map.geojson", text),
-            says,
-        )
+        yield exported(f"map: {name}", write("map.geojson", text), says)
     for file in ("drive.yaml", "poses.tum", "front/camera_info.yaml", "front/images.txt"):
-        yield Case(f"{file}: a pipe", CHECK, CHECKED, drive(pipe(file)), "pipe|not a drive")
-        yield Case(
-            f"{file}: a folder", CHECK, CHECKED, drive(folder_instead(file)), "folder|not a drive|no image"
-        )
-        yield Case(
-            f"{file}: all of utf-16", CHECK, CHECKED, drive(write(file, "a: b\n".encode("utf-16"))), "UTF-16"
-        )
-        yield Case(f"{file}: zeros", CHECK, CHECKED, drive(write(file, bytes(99))), "zero byte")
+        yield checked(f"{file}: a pipe", "pipe|not a drive", pipe(file))
+        yield checked(f"{file}: a folder", "folder|not a drive|no image", folder_instead(file))
+        yield checked(f"{file}: all of utf-16", "UTF-16", write(file, "a: b\n".encode("utf-16")))
+        yield checked(f"{file}: zeros", "zero byte", write(file, bytes(99)))
     poses = "front/images.txt", "poses.tum"
     lines = {
         "words": "one two\n",
@@ -298,43 +300,39 @@ def texts() -> Iterator[Case]:
         "twice": "100.0 0 0 0 0 0 0 1\n100.0 0 0 0 0 0 0 1\n",
     }
     for name, text in lines.items():
-        yield Case(f"poses: {name}", CHECK, CHECKED, drive(write(poses[1], text)), "poses.tum: line")
+        yield checked(f"poses: {name}", "poses.tum: line", write(poses[1], text))
     far = "\n".join(f"{100 + 0.1 * n:.1f} 1e300 0 0 0 0 0 1" for n in range(30))
-    yield Case("poses: 1e300", CHECK, CHECKED, drive(write(poses[1], far)), "off the earth")
+    yield checked("poses: 1e300", "off the earth", write(poses[1], far))
     utm = "\n".join(f"{100 + 0.1 * n:.1f} {560000 + n} 5930000 0 0 0 0 1" for n in range(30))
-    yield Case(
-        "poses: UTM and an origin elsewhere", CHECK, CHECKED, drive(write(poses[1], utm)), "such as UTM"
-    )
+    yield checked("poses: UTM and an origin elsewhere", "such as UTM", write(poses[1], utm))
     slow = "\n".join(f"{100 + n:.1f} {n} 0 0 0 0 0 1" for n in range(5))
-    yield Case("poses: 1 Hz", CHECK, CHECKED, drive(write(poses[1], slow)), "drive.max_gap_s")
+    yield checked("poses: 1 Hz", "drive.max_gap_s", write(poses[1], slow))
     ns = "\n".join(f"{(100 + 0.1 * n) * 1e9:.0f} {n} 0 0 0 0 0 1" for n in range(30))
-    yield Case("poses: ns", CHECK, CHECKED, drive(write(poses[1], ns)), "nanoseconds")
+    yield checked("poses: ns", "nanoseconds", write(poses[1], ns))
     late = "\n".join(f"{9100 + 0.1 * n:.1f} {n} 0 0 0 0 0 1" for n in range(30))
-    yield Case("poses: of another day", CHECK, CHECKED, drive(write(poses[1], late)), "begin 9000 s later")
+    yield checked("poses: of another day", "begin 9000 s later", write(poses[1], late))
 
 
 def names() -> Iterator[Case]:
     """Names that are no names."""
     for name, (text, says) in BAD_NAMES.items():
-        yield Case(f"camera's name: {name}", CHECK, CHECKED, drive(renamed(text)), says)
+        yield checked(f"camera's name: {name}", says, renamed(text))
         if text:
             change = described(lambda content, text=text: content.update(name=text))
             yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
         if isinstance(text, str):
-            yield Case(
-                f"class in a map: {name}",
-                "v2hdm export",
-                ("map.geojson", "--format", "csv", "--output", "there"),
-                _map_of_class(text),
-                says,
-            )
+            yield exported(f"class in a map: {name}", _map_of_class(text), says)
     for word in ("both", "all", "Both"):
-        yield Case(f"camera called {word}", CHECK, CHECKED, drive(renamed(word)), "results of all")
+        yield checked(f"camera called {word}", "results of all", renamed(word))
     for number in (7, 1.5):
-        yield Case(
-            f"camera called {number}", CHECK, CHECKED, drive(renamed(number)), "verdict", code=0,
-            leaves="^work/here/out(/|$)", tells=True,
-        )  # fmt: skip
+        yield checked(
+            f"camera called {number}",
+            "verdict",
+            renamed(number),
+            code=0,
+            leaves="^work/here/out(/|$)",
+            tells=True,
+        )
 
 
 def _map_of_class(kind: str) -> Prepare:
@@ -350,21 +348,15 @@ def _map_of_class(kind: str) -> Prepare:
 def images() -> Iterator[Case]:
     """Broken images, one by one and in a drive."""
     for name, (data, says) in IMAGES.items():
-        yield Case(f"image: {name}", "v2hdm detect", ("a.jpg",), write("a.jpg", data), says)
-        yield Case(
-            f"image in a drive: {name}", CHECK, CHECKED, drive(write("front/images/000001.jpg", data)), says
-        )  # fmt: skip
-    yield Case(
-        "image: damaged inside", "v2hdm detect", ("a.jpg",), write("a.jpg", damaged_inside()), "damaged"
-    )
+        yield detects(f"image: {name}", "a.jpg", write("a.jpg", data), says)
+        yield checked(f"image in a drive: {name}", says, write("front/images/000001.jpg", data))
+    yield detects("image: damaged inside", "a.jpg", write("a.jpg", damaged_inside()), "damaged")
     deep = picture(".png", depth=np.uint16)
-    yield Case("image: 16 bits", "v2hdm detect", ("a.png",), write("a.png", deep), "16 bits")
-    yield Case("image: a pipe", "v2hdm detect", ("imgs",), _imgs(pipe("imgs/b.jpg")), "device")
-    yield Case("image: a folder", "v2hdm detect", ("imgs",), _imgs(folder_instead("imgs/b.jpg")), "folder")
+    yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits")
+    yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
+    yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
     turned = with_orientation(picture(), 6)
-    yield Case(
-        "image in a drive: turned", CHECK, CHECKED, drive(write("front/images/000001.jpg", turned)), "EXIF"
-    )  # fmt: skip
+    yield checked("image in a drive: turned", "EXIF", write("front/images/000001.jpg", turned))
 
 
 def _imgs(change: Callable[[Path], object]) -> Prepare:
@@ -388,9 +380,7 @@ def fields() -> Iterator[Case]:
             def change(content: dict, key: str = key, value: object = value) -> None:
                 content["cameras"]["front"][key] = value
 
-            yield Case(
-                f"front, {key}: {value!r:.20}", CHECK, CHECKED, drive(described(change)), _names(key, value)
-            )
+            yield checked(f"front, {key}: {value!r:.20}", _names(key, value), described(change))
     for key in ("poses", "pose_noise", "origin", "truth", "bag", "cameras"):
         for value in wrong:
             if value is None and key in ("pose_noise", "origin", "truth"):
@@ -401,7 +391,7 @@ def fields() -> Iterator[Case]:
             def put(content: dict, key: str = key, value: object = value) -> None:
                 content[key] = value
 
-            yield Case(f"{key}: {value!r:.20}", CHECK, CHECKED, drive(described(put)), _names(key, value))
+            yield checked(f"{key}: {value!r:.20}", _names(key, value), described(put))
     info = "front/camera_info.yaml"
     numbers = {
         "width 0": ("image_width: 64", "image_width: 0", "image_width"),
@@ -417,7 +407,7 @@ def fields() -> Iterator[Case]:
         "lens that is a list": ("plumb_bob", "[a]", "distortion_model"),
     }
     for name, (old, new, says) in numbers.items():
-        yield Case(f"camera_info: {name}", CHECK, CHECKED, drive(edit(info, old, new)), says)
+        yield checked(f"camera_info: {name}", says, edit(info, old, new))
 
 
 def _names(key: str, value: object) -> str:
@@ -428,33 +418,32 @@ def _names(key: str, value: object) -> str:
 def outputs() -> Iterator[Case]:
     """Outputs that are inputs, the user's, somebody else's or nowhere."""
     imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
-    detect = "v2hdm detect"
-    yield Case("draw into the source", detect, ("imgs", "--draw", "imgs"), imgs, "no results of ours")
-    yield Case("output is the source", detect, ("imgs/a.jpg", "--output", "imgs/a.jpg"), imgs, "inputs")
-    yield Case(
-        "output is a link to the source", detect, ("imgs/a.jpg", "--output", "link"),
-        _both(imgs, lambda root: (root / "link").symlink_to("imgs/a.jpg")), "inputs",
-    )  # fmt: skip
-    yield Case(
-        "output is the source by another name", detect, ("imgs/a.jpg", "--output", "twin"),
-        _both(imgs, lambda root: os.link(root / "imgs/a.jpg", root / "twin")), "inputs",
-    )  # fmt: skip
-    yield Case("output is an image of the source", detect, ("imgs", "--output", "imgs/a.jpg"), imgs, "inputs")
-    yield Case(
-        "output is the calibration", detect, ("imgs/a.jpg", "--camera", "c.yaml", "--output", "c.yaml"),
-        _both(imgs, _calibration), "inputs",
-    )  # fmt: skip
-    yield Case(
-        "output is a file of the user's", detect, ("imgs", "--output", "precious.txt"), imgs, "holds no det"
+    yield detects("draw into the source", "imgs --draw imgs", imgs, "no results of ours")
+    yield detects("output is the source", "imgs/a.jpg --output imgs/a.jpg", imgs, "inputs")
+    yield detects(
+        "output is a link to the source",
+        "imgs/a.jpg --output link",
+        _both(imgs, lambda root: (root / "link").symlink_to("imgs/a.jpg")),
+        "inputs",
     )
-    yield Case("output is a folder", detect, ("imgs", "--output", "imgs"), imgs, "give another --output")
-    yield Case("output in a file", detect, ("imgs", "--output", "precious.txt/x"), imgs, "cannot write")
-    yield Case(
-        "output on a full disk", detect, ("imgs", "--output", "x.jsonl"), imgs, "cannot write", disk_bytes=1
+    yield detects(
+        "output is the source by another name",
+        "imgs/a.jpg --output twin",
+        _both(imgs, lambda root: os.link(root / "imgs/a.jpg", root / "twin")),
+        "inputs",
     )
-    yield Case(
-        "drawing on a full disk", detect, ("imgs", "--draw", "d"), imgs, "cannot be written", disk_bytes=200
+    yield detects("output is an image of the source", "imgs --output imgs/a.jpg", imgs, "inputs")
+    yield detects(
+        "output is the calibration",
+        "imgs/a.jpg --camera c.yaml --output c.yaml",
+        _both(imgs, _calibration),
+        "inputs",
     )
+    yield detects("output is a file of the user's", "imgs --output precious.txt", imgs, "holds no det")
+    yield detects("output is a folder", "imgs --output imgs", imgs, "give another --output")
+    yield detects("output in a file", "imgs --output precious.txt/x", imgs, "cannot write")
+    yield detects("output on a full disk", "imgs --output x.jsonl", imgs, "cannot write", disk_bytes=1)
+    yield detects("drawing on a full disk", "imgs --draw d", imgs, "cannot be written", disk_bytes=200)
     for name, make in {
         "somebody's folder": _folder_with("out", "thesis.tex"),
         "a drive": lambda root: _write_files(root / "out", _example()),
@@ -474,15 +463,12 @@ def outputs() -> Iterator[Case]:
     )
     for most in (0, 10, 1000, 5000):
         name = f"result on a disk with room for {most} bytes"
-        yield Case(name, CHECK, CHECKED, drive(), "cannot be written", disk_bytes=most)
+        yield checked(name, "cannot be written", disk_bytes=most)
     yield Case(
         "export onto the map", "v2hdm export", ("map.geojson", "--format", "geojson"),
         lambda root: write_geojson(make_map(), root / "map.geojson"), "written over",
     )  # fmt: skip
-    yield Case(
-        "export onto a link to the map", "v2hdm export",
-        ("map.geojson", "--format", "csv", "--output", "there"), _linked_map, "written over",
-    )  # fmt: skip
+    yield exported("export onto a link to the map", _linked_map, "written over")
 
 
 def _both(*steps: Callable[[Path], object]) -> Prepare:
@@ -558,34 +544,28 @@ def arguments() -> Iterator[Case]:
         yield Case(f"export {line}", "v2hdm export", line.split(), _both(), says)
 
 
-SETTINGS = {
-    "workers=-1": "workers is -1",
+def _plainly(lines: str) -> dict[str, str]:
+    """Settings that an error repeats: of ``data.width=7`` it says ``width is 7``, of words in quotes."""
+    pairs = [(line, *line.split("=")) for line in lines.split()]
+    return {line: f"{key.rpartition('.')[2]} is '?{value}" for line, key, value in pairs}
+
+
+SETTINGS = _plainly(
+    "workers=-1 device=tpu mode=x mapping.max_range_m=nan mapping.max_range_m=inf mapping.max_range_m=0 "
+    "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_length_m=-1 detector.threads=0 "
+    "detector.blur_px=99 detector.max_range_m=-1 detector.min_score=nan detector.border_px=-3 "
+    "drive.max_gap_s=-1 drive.max_gap_s=nan"
+) | {
     "workers=99999999999999999999": "workers is",
     "workers=many": "workers=many",
-    "device=tpu": "device is 'tpu'",
-    "mode=x": "mode is 'x'",
     "name=../x": "separator of folders",
     "name=..": "begins with a dot",
     "'name=\"a/b\"'": "separator of folders",
-    "mapping.max_range_m=nan": "max_range_m is nan",
-    "mapping.max_range_m=inf": "max_range_m is inf",
-    "mapping.max_range_m=0": "max_range_m is 0",
-    "mapping.rounds=0": "rounds is 0",
-    "mapping.loss=x": "loss is 'x'",
-    "mapping.pose_model=x": "pose_model is 'x'",
-    "mapping.lanes.min_length_m=-1": "min_length_m is -1",
     "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
     "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
     "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
     "mapping.survey.points_map=[[1.0]]": "points_map",
-    "detector.threads=0": "threads is 0",
-    "detector.blur_px=99": "blur_px is 99",
-    "detector.max_range_m=-1": "max_range_m is -1",
-    "detector.min_score=nan": "min_score is nan",
-    "detector.border_px=-3": "border_px is -3",
     "detector.model=nowhere.onnx": "nowhere.onnx",
-    "drive.max_gap_s=-1": "max_gap_s is -1",
-    "drive.max_gap_s=nan": "max_gap_s is nan",
     "export=[pdf]": "pdf",
     "maping.max_range_m=1": "did you mean mapping",
     "drive": "is no key=value",
@@ -595,61 +575,29 @@ SETTINGS = {
     "drive.cameras=front": "drive.cameras",
     "--config-name=x": "'x'",
 }
-
-SIMULATED = {
+SIMULATED = _plainly(
+    "simulate.seed=-1 simulate.cameras.front.width=0 simulate.cameras.front.width=100000 "
+    "simulate.route.image_spacing_m=0 simulate.route.speed_mps=nan "
+    "simulate.exposure.full_well_electrons=0 simulate.yard.barriers=-5"
+) | {
     "simulate.name=../x": "separator of folders",
-    "simulate.seed=-1": "simulate.seed is -1",
-    "simulate.cameras.front.width=0": "width is 0",
-    "simulate.cameras.front.width=100000": "width is 100000",
-    "simulate.route.image_spacing_m=0": "image_spacing_m is 0",
-    "simulate.route.speed_mps=nan": "speed_mps is nan",
-    "simulate.exposure.full_well_electrons=0": "full_well_electrons is 0",
-    "simulate.yard.barriers=-5": "barriers is -5",
     "+simulate.cameras.both=${simulate.cameras.front}": "results of all",
 }
-
-TRAINING = {
-    "batch=0": "batch is 0",
-    "batch=-4": "batch is -4",
-    "data.width=7": "data.width is 7",
-    "data.width=0": "data.width is 0",
-    "data.height=100": "data.height is 100",
+TRAINING = _plainly(
+    "batch=0 batch=-4 data.width=7 data.width=0 data.height=100 data.reservoir=0 data.views_per_render=0 "
+    "data.workers=-1 data.kerbs=nan data.labelled_share=2 learning_rate=nan learning_rate=-1 learning_rate=0 "
+    "weight_decay=inf minutes=-1 minutes=nan minutes=inf steps=0 warmup=1 ema_updates=0 threads=0 seed=-1 "
+    "checkpoint_minutes=0 net.head_width=0 loss.dice=-1 validation.images=-1"
+) | {
     "data.width=1024": "data.width x data.height",
-    "data.reservoir=0": "data.reservoir is 0",
-    "data.views_per_render=0": "views_per_render is 0",
-    "data.workers=-1": "data.workers is -1",
-    "data.kerbs=nan": "data.kerbs is nan",
-    "data.labelled_share=2": "labelled_share is 2",
-    "learning_rate=nan": "learning_rate is nan",
-    "learning_rate=-1": "learning_rate is -1",
-    "learning_rate=0": "learning_rate is 0",
-    "weight_decay=inf": "weight_decay is inf",
-    "minutes=-1": "minutes is -1",
-    "minutes=nan": "minutes is nan",
-    "minutes=inf": "minutes is inf",
-    "steps=0": "steps is 0",
-    "warmup=1": "warmup is 1",
-    "ema_updates=0": "ema_updates is 0",
-    "threads=0": "threads is 0",
-    "seed=-1": "seed is -1",
-    "checkpoint_minutes=0": "checkpoint_minutes is 0",
     "net.widths=[8]": "net.widths",
     "net.widths=[]": "net.widths",
-    "net.head_width=0": "net.head_width is 0",
-    "loss.dice=-1": "loss.dice is -1",
-    "validation.images=-1": "validation.images is -1",
     "device=abacus": "device=abacus",
     "start=nowhere.pt": "nowhere.pt",
     "catalogue=nowhere.yaml": "nowhere.yaml",
     "data.coco=nowhere.json": "nowhere.json",
 }
-
-EXPORTS = {
-    "opset=3": "opset is 3",
-    "opset=99": "opset is 99",
-    "tolerance=nan": "tolerance is nan",
-    "int8.frames=0": "int8.frames is 0",
-    "int8.bounds.kinds_agree=7": "kinds_agree is 7",
+EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kinds_agree=7") | {
     "checkpoint=nowhere.pt": "nowhere.pt",
     "precision=int4": "precision",
     "output=a.pt": "inputs",

@@ -5,8 +5,6 @@ this process, and asserts its exit code, exactly one line of error without a tra
 was there is what it was, that nothing new is left, and that it ended in time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib

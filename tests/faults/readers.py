@@ -1,7 +1,5 @@
 """The readers of files from strangers, each with a writer of a sound file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,26 +1,157 @@
-"""Every bad input ends in one line that says what is wrong; the table is in tests/faults/cases.py."""
+"""Whatever a user gives ends in a value or in one line that says what is wrong."""
 
-from __future__ import annotations
-
+import tarfile
 from pathlib import Path
 
 import pytest
+import yaml
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
-from tests.faults.cases import all_cases
-from tests.faults.judge import HYDRA_DOORS, Case, judge
+from tests.faults.cases import JSON_TEXTS, YAML_TEXTS, all_cases, damaged_inside
+from tests.faults.judge import HYDRA_DOORS, judge
+from tests.faults.readers import READERS, refusal
+from v2hdm.detection.frames import read_bgr
+from v2hdm.errors import DriveError, V2hdmError
+from v2hdm.io.safe.texts import parse_json, parse_yaml, shown, take_name
 
 CASES = all_cases()
 QUICK = [case for number, case in enumerate(CASES) if case.door not in HYDRA_DOORS or number % 8 == 0]
 """The doors that load torch and Hydra take half a second a case: of those every eighth."""
 
 
-def test_the_table_is_large_and_names_each_case_once() -> None:
+def test_the_table_is_large_and_names_each_case_once():
     names = [case.name for case in CASES]
     assert len(names) >= 250
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("case", QUICK, ids=[case.name for case in QUICK])
-def test_a_bad_input_ends_well(case: Case, tmp_path: Path) -> None:
+def test_a_bad_input_ends_well(case, tmp_path):
     outcome = judge(case, tmp_path)
     assert not outcome.faults(case), outcome.error
+
+
+CORPUS = Path(__file__).with_name("corpus.tar.xz")
+
+
+def inputs():
+    """By reader."""
+    found: dict[str, list[bytes]] = {}
+    with tarfile.open(CORPUS) as archive:
+        for member in archive:
+            stream = archive.extractfile(member)
+            found.setdefault(member.name.split("/")[0], []).append(stream.read())
+    return found
+
+
+INPUTS = inputs()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("reader", INPUTS)
+def test_what_fuzzing_has_reached_is_read_or_refused(reader, tmp_path):
+    write, read = READERS[reader]
+    path = tmp_path / "file"
+    write(path)  # and what belongs beside it
+    for data in INPUTS[reader]:
+        path.write_bytes(data)
+        assert "\n" not in (refusal(lambda: read(path), V2hdmError) or "")
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**12), 10**12) | st.floats(allow_nan=False) | st.text(),
+    lambda below: st.lists(below, max_size=4) | st.dictionaries(st.text(), below, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.text(), PLAIN, max_size=4))
+def test_what_yaml_writes_of_plain_values_is_read_as_it_was(content):
+    try:
+        text = yaml.safe_dump(content, allow_unicode=True)
+        known = yaml.safe_load(text) == content
+    except yaml.YAMLError:
+        known = False
+    if known:
+        assert parse_yaml(text, "here", DriveError) == content
+
+
+@given(st.text() | st.binary().map(lambda data: data.decode("utf-8", "replace")))
+@example("\ufeff")
+@example("%YAML 9.9\n---\na: 1")
+@example("1: 2\n? \n")
+def test_any_text_is_plain_values_or_one_line(text):
+    for parse in (parse_yaml, parse_json):
+        assert "\n" not in (refusal(lambda parse=parse: parse(text, "here", DriveError), DriveError) or "")
+
+
+@given(st.text(max_size=80))
+def test_a_name_that_is_taken_names_one_entry_of_a_folder(text):
+    said = refusal(lambda: take_name(text, "here", DriveError), DriveError)
+    if said is not None:
+        assert said.isprintable()
+        return
+    name = take_name(text, "here", DriveError)
+    path = Path("/folder") / f"calibration_{name}.yaml"
+    assert path.parent == Path("/folder")
+    assert Path("/folder", name).parent == Path("/folder")
+    assert name.isprintable()
+    assert len(path.name.encode()) < 230
+
+
+@given(PLAIN)
+def test_what_is_shown_of_a_value_is_a_short_piece_of_one_line(content):
+    text = shown(content)
+    assert len(text) <= 300
+    assert "\n" not in text
+    assert "None" not in text or "None" in str(content)
+
+
+Cut = tuple[float, float, bytes]
+CUTS = st.lists(
+    st.tuples(st.floats(0, 1), st.floats(0, 0.2), st.binary(max_size=6) | st.sampled_from(
+        [b"nan", b"1e999", b"-1", b"[", b"{", b"&a", b"*a", b"!!x ", b"\t", b"\n", b"null", b"true", b"\xff"]
+    )),
+    min_size=1, max_size=3,
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", READERS)
+@settings(max_examples=40)
+@given(cuts=CUTS)
+def test_a_file_that_was_damaged_is_read_or_refused(tmp_path_factory, name, cuts):
+    write, read = READERS[name]
+    path = tmp_path_factory.mktemp("damaged") / "file"
+    write(path)
+    data = path.read_bytes()
+    for at, length, new in cuts:
+        begin = int(at * len(data))
+        data = data[:begin] + new + data[begin + int(length * len(data)) :]
+    path.write_bytes(data)
+    assert "\n" not in (refusal(lambda: read(path), V2hdmError) or "")
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_whole_is_read(tmp_path, name):
+    write, read = READERS[name]
+    write(tmp_path / "file")
+    assert read(tmp_path / "file") is not None
+
+
+def test_every_text_of_the_table_is_refused_by_the_gate_or_by_its_form():
+    for name, (text, _) in YAML_TEXTS.items():
+        if isinstance(text, str):
+            said = refusal(lambda text=text: parse_yaml(text, "here", DriveError), DriveError)
+            assert said is not None or not isinstance(parse_yaml(text, "here", DriveError), dict), name
+    for text, _ in JSON_TEXTS.values():
+        if isinstance(text, str):
+            refusal(lambda text=text: parse_json(text, "here", DriveError), DriveError)
+
+
+def test_the_decoders_complaints_are_kept_from_the_terminal(tmp_path, capfd):
+    (tmp_path / "a.jpg").write_bytes(damaged_inside())
+    with pytest.raises(DriveError, match="damaged"):
+        read_bgr(tmp_path / "a.jpg")
+    assert capfd.readouterr().err == ""

@@ -1,18 +1,15 @@
-"""Doors on a disk that fails at one call; `python -m tests.benchmarks.faults` makes all of them fail."""
-
-from __future__ import annotations
+"""Doors on a disk that fails at some calls: a small edition of `python -m tests.benchmarks.faults`."""
 
 import errno
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.benchmarks.faults.failing_calls import Failure, watch, why_not
+from tests.benchmarks.faults.forked import Forked
+from tests.benchmarks.faults.situations import Expected, Situation, calibrating
 from tests.faults.cases import picture
-from tests.faults.doors import Expected, Situation, calibrating
-from tests.faults.failing_calls import Failure, watch, why_not
-from tests.faults.forked import Forked
 from tests.faults.judge import Case, judge, judge_again
 from v2hdm.mosaic.blend import Sheet
 from v2hdm.mosaic.result import geotiff
@@ -21,8 +18,8 @@ from v2hdm.mosaic.shots import Canvas
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
 
 
-def detecting() -> Situation:
-    def prepare(root: Path) -> None:
+def detecting():
+    def prepare(root):
         (root / "images").mkdir()
         for name in ("a.jpg", "b.jpg"):
             (root / "images" / name).write_bytes(picture(height=96, width=128))
@@ -32,9 +29,7 @@ def detecting() -> Situation:
 
 
 @pytest.mark.parametrize(("situation", "places"), [(detecting(), 5), (calibrating(), 1)])
-def test_a_door_on_a_failing_disk_does_all_or_tells_and_works_afterwards(
-    situation: Situation, places: int, tmp_path: Path
-) -> None:
+def test_a_door_on_a_failing_disk_does_all_or_tells_and_works_afterwards(situation, places, tmp_path):
     outcomes, calls = [], []
     for number in range(2):
         runner = Forked(tmp_path / f"good{number}")
@@ -51,15 +46,15 @@ def test_a_door_on_a_failing_disk_does_all_or_tells_and_works_afterwards(
             assert not defects, (calls[at], failure, outcome.error)
 
 
-def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path: Path) -> None:
+def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path):
     pytest.importorskip("rasterio", reason="no rasterio: pip install 'v2hdm[gis]'")
     canvas = Canvas(np.zeros(2), 0.02, 512, 512)
     seen = np.random.default_rng(0).integers(0, 255, (512, 512, 4), dtype=np.uint8)
 
-    def write() -> int:
+    def write():
         try:
-            with geotiff(tmp_path / "a.tif", canvas, None) as mosaic:
-                mosaic.put(Sheet(0, 0, seen))
+            with geotiff(tmp_path / "a.tif", canvas, None) as put:
+                put(Sheet(0, 0, seen))
         except OSError:
             return 2
         return 0
@@ -75,8 +70,8 @@ def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path: Path) -> Non
         assert left == ([whole] if ended.code == 0 else [])
 
 
-def test_calls_below_a_folder_are_counted_and_no_others(tmp_path: Path) -> None:
-    def work() -> int:
+def test_calls_below_a_folder_are_counted_and_no_others(tmp_path):
+    def work():
         (tmp_path / "here").mkdir()
         os.write(os.open(tmp_path / "here" / "a", os.O_WRONLY | os.O_CREAT), b"a")
         (tmp_path / "here" / "a").rename(tmp_path / "here" / "b")

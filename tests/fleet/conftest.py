@@ -1,22 +1,16 @@
 """One Ray of our own for all tests of a process."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.stores import quick as quick
 from tests.stores import s3 as s3
 from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
 
 @pytest.fixture(scope="session")
-def ray() -> Iterator[Any]:
+def ray():
     pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
     import ray
 
@@ -30,7 +24,7 @@ def ray() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def drive(rendered: Callable[[PortConfig], Path]) -> Path:
+def drive(rendered):
     """Ten images of one camera on a straight."""
     route = RouteConfig(pieces=[[26.0, 0.0]], image_spacing_m=2.6)
     yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)

@@ -1,12 +1,10 @@
 """Run files of fleets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 
 def written(folder: Path, name: str, drive: object) -> Path:
-    """The run file of one drive."""
+    """The run file of one drive, which may be too short for a map of centimetres."""
     path = folder / f"{name}.yaml"
-    path.write_text(f"# @package _global_\nname: {name}\ndrive:\n  path: {drive}\n")
+    path.write_text(f"# @package _global_\nname: {name}\naccuracy_goal_cm: 100\ndrive:\n  path: {drive}\n")
     return path

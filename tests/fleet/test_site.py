@@ -1,13 +1,8 @@
 """One site from many drives: by workers, some of which die, it is the map of one process."""
 
-from __future__ import annotations
-
 import os
 import signal
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -17,17 +12,16 @@ pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 from tests.fleet.run_files import written
 from v2hdm.errors import DriveError, WorkerError
-from v2hdm.fleet.executor import RayExecutor
-from v2hdm.fleet.plan import Row, plan_site
+from v2hdm.fleet.plan import plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.workers import map_drive
+from v2hdm.fleet.workers import RayExecutor, map_drive
 from v2hdm.pipeline.run import run
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def drives(tmp_path_factory):
     """One small port, seen on two visits."""
     folders = []
     for visit, name in enumerate(("monday", "friday")):
@@ -41,21 +35,19 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
-    ray: Any, drives: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(ray, drives, tmp_path, monkeypatch):
     @contextmanager
-    def here(address: str, workers: int) -> Iterator[Any]:
+    def here(address, workers):
         yield ray
 
     died = tmp_path / "died"
 
-    def mapping(*arguments: Any) -> Any:
-        import v2hdm.fleet.executor as executor
+    def mapping(*arguments):
+        import v2hdm.fleet.workers as executor
 
         done = executor._done
 
-        def dies_once(*work: Any) -> Any:
+        def dies_once(*work):
             if not died.exists():
                 died.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -73,7 +65,7 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
     settings = ["workers=1"]
     told: list[tuple[str, str, int, int]] = []
 
-    def fleet() -> Row:
+    def fleet():
         overrides = [*settings, f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
         options = FleetOptions(tmp_path / "table", site="port")
         (row,) = run_fleet(files, overrides, options, lambda *message: told.append(message))
@@ -98,7 +90,7 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def one_thread():
     """As in workers: how many threads share a product decides its last bits."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -108,16 +100,14 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def test_what_is_wrong_in_a_task_is_told_as_by_one_process(
-    ray: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuses() -> None:
+def test_what_is_wrong_in_a_task_is_told_as_by_one_process(ray, tmp_path, monkeypatch):
+    def refuses():
         raise DriveError("images/3.jpg: cannot be read")
 
-    def dies() -> None:
+    def dies():
         os.kill(os.getpid(), signal.SIGKILL)
 
-    monkeypatch.setattr("v2hdm.fleet.executor.RETRIES", 0)
+    monkeypatch.setattr("v2hdm.fleet.workers.RETRIES", 0)
     executor = RayExecutor(2, str(tmp_path))
     waits = [executor.begin(work) for work in (refuses, dies)]
     with pytest.raises(DriveError, match="cannot be read"):

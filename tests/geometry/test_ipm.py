@@ -1,12 +1,15 @@
-"""The IPM and the extrinsic: round trips, and the extrinsic nearest to an inexact IPM."""
+"""The IPM and the extrinsic, polygons and quadrilaterals of image and ground."""
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.adjust.scene import mounted
 from v2hdm.geometry.ipm import (
     apply_homography,
     apply_in_front,
+    direction_covariance,
     extrinsic_from_ipm,
     facing_ipm,
     flat_motion,
@@ -15,7 +18,19 @@ from v2hdm.geometry.ipm import (
     ipm_from_extrinsic,
     project_ground,
 )
-from v2hdm.geometry.rigid import camera_centre, exp
+from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
+from v2hdm.geometry.quadrilateral import (
+    Quad,
+    align,
+    diameters,
+    is_convex,
+    is_convex_px,
+    long_axis,
+    order_corners,
+    quad_from_hull,
+    side_frames,
+)
+from v2hdm.geometry.rigid import camera_centre, exp, ground_in_vehicle
 from v2hdm.records import CameraInfo
 
 INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 639.5], [0, 880, 359.5], [0, 0, 1]]))
@@ -54,12 +69,28 @@ def test_an_inexact_ipm_yields_the_rigid_camera_above_the_ground_whose_columns_a
 
 
 @pytest.mark.parametrize("mount", range(3))
-def test_ground_points_return_from_their_pixels(mount):
-    roi = ROI * [-1, 1] if mount == 1 else ROI
-    pixels, depth_m = project_ground(INFO.intrinsic, MOUNTS[mount], roi)
+@pytest.mark.parametrize("tangent", [np.zeros(6), np.array([12.0, -5.0, 0.02, -0.01, 0.02, 0.7])])
+def test_ground_points_return_from_their_pixels_under_a_tilted_pose_too(mount, tangent):
+    pose = exp(tangent)
+    cam_from_map = MOUNTS[mount] @ np.linalg.inv(pose)
+    back = ground_from_pinhole_px(INFO.intrinsic, cam_from_map)
+    ahead = (ROI * [-1, 1] if mount == 1 else ROI) @ pose[:2, :2].T + pose[:2, 3]
+    pixels, depth_m = project_ground(INFO.intrinsic, cam_from_map, ahead)
     assert (depth_m > 0).all()
-    back = apply_in_front(ground_from_pinhole_px(INFO.intrinsic, MOUNTS[mount]), pixels)
-    np.testing.assert_allclose(back, roi, atol=1e-9)
+    np.testing.assert_allclose(apply_in_front(back, pixels), ahead, atol=1e-9)
+
+
+def test_for_a_level_vehicle_the_plain_route_is_the_posed_one():
+    pose, pixels = exp(np.array([3.0, 4.0, 0, 0, 0, 1.1])), np.array([[500.0, 500.0], [800.0, 420.0]])
+    posed = ground_from_pinhole_px(INFO.intrinsic, MOUNTS[0] @ np.linalg.inv(pose))
+    plain = flat_motion(pose) @ facing_ipm(-ipm_from_extrinsic(INFO, MOUNTS[0]), np.array([8.0, 0.0]))
+    np.testing.assert_allclose(apply_in_front(plain, pixels), apply_in_front(posed, pixels), atol=1e-9)
+
+
+def test_a_pitch_error_moves_a_point_along_its_ray_as_the_formula_says():
+    """At h = 2.4 m and r = 10 m, one milliradian of pitch is (100 + 5.76) / 2.4 mm = 44 mm."""
+    covariance = direction_covariance(np.array([10.0, 0.0]), np.array(2.4), 1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.04407, 0.010], rtol=1e-3)
 
 
 def test_a_batch_of_cameras_projects_as_each_of_them_does():
@@ -98,3 +129,120 @@ def test_a_motion_in_the_plane_is_the_homography_of_that_plane():
     motion = exp(np.array([3.0, -2.0, 0, 0, 0, 0.7]))
     moved = (np.column_stack([ROI, np.zeros(5), np.ones(5)]) @ motion.T)[:, :2]
     np.testing.assert_allclose(apply_homography(flat_motion(motion), ROI), moved, atol=1e-12)
+
+
+def area(polygon):
+    return abs(float(signed_area(polygon)))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_inside_a_polygon_of_either_sense(order):
+    square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])[::order]
+    points = np.array([[1.0, 1.0], [3.0, 1.0], [np.nan, 1.0]])
+    assert inside_convex(square, points).tolist() == [True, False, False]
+
+
+def test_a_ground_point_ahead_is_on_the_vehicles_x_axis():
+    map_from_vehicle = np.eye(4)
+    map_from_vehicle[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    map_from_vehicle[:2, 3] = [10.0, 5.0]
+    points = ground_in_vehicle(map_from_vehicle, np.array([[10.0, 8.0], [9.0, 5.0]]))
+    assert points == pytest.approx(np.array([[3.0, 0.0], [0.0, 1.0]]), abs=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_two_squares_share(order):
+    square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])
+    assert area(clip_convex(square, square[::order] + 1.0)) == pytest.approx(1.0)
+    assert area(clip_convex(square, square[::order] + 1e-7)) == pytest.approx(4.0, abs=1e-5)
+    assert len(clip_convex(square, square[::order] + 3.0)) == 0
+
+
+def test_nearly_equal_polygons_share_nearly_all():
+    """OpenCV's intersection of some such pairs is empty."""
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        turn = rng.uniform(0, 2 * np.pi)
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        diamond = np.array([[0.6, 0], [0, 0.3], [-0.6, 0], [0, -0.3]]) @ rotation.T + rng.uniform(-50, 50, 2)
+        other = diamond + rng.normal(0, 1e-3, (4, 2))
+        assert area(clip_convex(diamond, other)) > 0.95 * area(diamond)
+
+
+DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
+KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
+OFFSET = np.array([0.1, -0.05])
+ALL = np.ones(4, dtype=bool)
+
+
+@pytest.mark.parametrize("shift", range(4))
+def test_a_cyclic_shift_is_found_and_undone(shift):
+    turned = np.roll(DIAMOND, shift, axis=0) + OFFSET
+    found = align(DIAMOND, ALL, turned, ALL)
+    assert found.shift == shift
+    np.testing.assert_allclose(found.offset, OFFSET)
+    np.testing.assert_allclose(turned[(np.arange(4) + found.shift) % 4], DIAMOND + OFFSET)
+    assert found.deformation_m == pytest.approx(0.0, abs=1e-12)
+
+
+def test_corners_that_are_not_valid_take_no_part_and_another_shape_shows_as_deformation():
+    broken = DIAMOND.copy()
+    broken[2] = np.nan
+    found = align(DIAMOND, ALL, broken, np.array([True, True, False, True]))
+    assert (found.shift, found.common) == (0, 3)
+    assert found.deformation_m == pytest.approx(0.0, abs=1e-12)
+    assert np.isinf(align(DIAMOND, ALL, DIAMOND, np.array([True, False, False, False])).deformation_m)
+    assert align(DIAMOND, ALL, 1.5 * DIAMOND, ALL).deformation_m == pytest.approx(0.3)
+
+
+def test_alignment_broadcasts_over_tracks_and_detections():
+    tracks = np.stack([DIAMOND, DIAMOND + 5.0, DIAMOND - 3.0])[:, None]
+    found = align(tracks, np.ones((3, 1, 4), bool), np.stack([DIAMOND] * 2), np.ones((2, 4), bool))
+    assert found.shift.shape == (3, 2)
+    np.testing.assert_allclose(found.offset[:, 0, 0], [0.0, -5.0, 3.0], atol=1e-12)
+
+
+def test_area_sense_and_diameter_of_a_diamond_and_of_its_image_whose_second_axis_turns_down():
+    in_image = DIAMOND * [1, -1]
+    assert signed_area(DIAMOND) == pytest.approx(0.36) == -signed_area(in_image)
+    assert diameters(DIAMOND, ALL) == pytest.approx(1.2)
+    assert is_convex(DIAMOND)
+    assert is_convex_px(in_image)
+    assert not any([is_convex(DIAMOND[::-1]), is_convex_px(DIAMOND), is_convex(in_image)])
+
+
+def test_ordered_corners_run_counter_clockwise_on_the_screen():
+    assert signed_area(KITE) < 0
+    assert is_convex_px(KITE)
+    assert not is_convex_px(KITE[::-1])
+
+
+@pytest.mark.parametrize(("corners", "outwards"), [(KITE, 1), (DIAMOND, -1)], ids=["image", "map"])
+def test_normals_of_image_corners_point_outwards_and_of_map_corners_inwards(corners, outwards):
+    _, normal, _ = side_frames(corners)
+    middle = (corners + np.roll(corners, -1, axis=0)) / 2
+    assert (outwards * ((middle - corners.mean(axis=0)) * normal).sum(axis=1) > 0).all()
+
+
+def test_the_width_of_a_bar_is_its_breadth():
+    assert Quad(order_corners(np.array([[0, 0], [30, 0], [30, 4], [0, 4.0]]))).width == pytest.approx(4.0)
+
+
+def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
+    along = np.linspace(0, 1, 40, endpoint=False)[:, None]
+    outline = np.concatenate([KITE[e] * (1 - along) + KITE[(e + 1) % 4] * along for e in range(4)])
+    found = quad_from_hull(cv2.convexHull(outline.astype(np.float32)))
+    distance = np.linalg.norm(found[:, None] - KITE, axis=-1).min(axis=1)
+    assert distance.max() < 0.05
+
+
+@pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
+def test_points_that_enclose_nothing_give_no_quadrilateral(outline):
+    assert quad_from_hull(cv2.convexHull(outline.astype(np.float32))) is None
+
+
+@pytest.mark.parametrize("shift", range(4))
+def test_the_axis_of_a_dash_does_not_depend_on_its_first_corner(shift):
+    dash = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 0.12], [0.0, 0.12]])
+    turned = np.roll(dash, shift, axis=0)
+    np.testing.assert_allclose(long_axis(turned), [1.0, 0.0], atol=1e-12)

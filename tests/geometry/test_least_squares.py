@@ -1,21 +1,18 @@
 """The one least-squares loop: recovery, what nothing observes, robust weights, damping and manifolds."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
 import pytest
 
-from v2hdm.geometry.least_squares import Normal, gauss_newton, normal_equations
+from v2hdm.geometry.least_squares import gauss_newton, normal_equations
 from v2hdm.geometry.rigid import exp, inverse, log
-from v2hdm.records import FloatArray
 
 AT = np.linspace(0.0, 2.0, 30)
 TRUE = np.array([1.5, -0.8])
 
 
-def curve(x: FloatArray, seen: FloatArray, weight: FloatArray | None = None) -> Normal:
+def curve(x, seen, weight=None):
     """``seen`` (30,) as a exp(b t), in standard deviations of .01."""
     grown = np.exp(x[1] * AT)
     slopes = np.stack([grown, x[0] * AT * grown], axis=1)
@@ -23,11 +20,11 @@ def curve(x: FloatArray, seen: FloatArray, weight: FloatArray | None = None) -> 
     return normal_equations((x[0] * grown - seen)[:, None], slopes[:, None], weights[:, None, None])
 
 
-def noisy(seed: int) -> FloatArray:
+def noisy(seed):
     return TRUE[0] * np.exp(TRUE[1] * AT) + np.random.default_rng(seed).normal(0, 0.01, 30)
 
 
-def test_a_curve_is_recovered_and_its_sigmas_hold() -> None:
+def test_a_curve_is_recovered_and_its_sigmas_hold():
     fits = [gauss_newton(partial(curve, seen=noisy(seed)), np.array([1.0, 0.0])) for seed in range(200)]
     assert all(fit.converged for fit in fits)
     squares = [(fit.x - TRUE) @ np.linalg.solve(fit.covariance, fit.x - TRUE) for fit in fits]
@@ -35,8 +32,8 @@ def test_a_curve_is_recovered_and_its_sigmas_hold() -> None:
     assert fits[0].predicted_cost == pytest.approx(curve(fits[0].x, noisy(0)).cost, rel=1e-9)
 
 
-def test_what_nothing_observes_stays_where_it_was_and_has_no_finite_sigma() -> None:
-    def linearise(x: FloatArray) -> Normal:
+def test_what_nothing_observes_stays_where_it_was_and_has_no_finite_sigma():
+    def linearise(x):
         return normal_equations(np.array([[x[0] + x[1] - 3.0]]), np.array([[[1.0, 1.0, 0.0]]]))
 
     fit = gauss_newton(linearise, np.array([0.0, 0.0, 7.0]))
@@ -44,11 +41,11 @@ def test_what_nothing_observes_stays_where_it_was_and_has_no_finite_sigma() -> N
     assert np.isinf(np.diag(fit.covariance)).all()
 
 
-def test_robust_weights_leave_outliers_aside() -> None:
+def test_robust_weights_leave_outliers_aside():
     seen = noisy(1)
     seen[::6] += 3.0
 
-    def linearise(x: FloatArray) -> Normal:
+    def linearise(x):
         off = (x[0] * np.exp(x[1] * AT) - seen) / 0.01
         return curve(x, seen, 1 / (1 + (off / 2.5) ** 2))
 
@@ -56,8 +53,8 @@ def test_robust_weights_leave_outliers_aside() -> None:
     assert np.abs(gauss_newton(linearise, TRUE, steps=100).x - TRUE).max() < 0.02
 
 
-def test_damping_reaches_a_minimum_that_whole_steps_leap_over() -> None:
-    def linearise(x: FloatArray) -> Normal:
+def test_damping_reaches_a_minimum_that_whole_steps_leap_over():
+    def linearise(x):
         return normal_equations(np.arctan(x)[None], (1 / (1 + x**2))[None, None])
 
     far = np.array([3.0])
@@ -68,12 +65,12 @@ def test_damping_reaches_a_minimum_that_whole_steps_leap_over() -> None:
     assert abs(fit.x[0]) < 1e-8
 
 
-def test_a_motion_is_found_on_its_manifold() -> None:
+def test_a_motion_is_found_on_its_manifold():
     rng = np.random.default_rng(2)
     true, points = exp(rng.normal(0, 0.5, 6)), rng.normal(0, 3, (9, 3))
     moved = points @ true[:3, :3].T + true[:3, 3]
 
-    def linearise(x: FloatArray) -> Normal:
+    def linearise(x):
         now = points @ x[:3, :3].T + x[:3, 3]
         turn = np.cross(np.eye(3), now[:, None]).swapaxes(1, 2)
         return normal_equations(
@@ -85,14 +82,14 @@ def test_a_motion_is_found_on_its_manifold() -> None:
     np.testing.assert_allclose(log(fit.x @ inverse(true)), 0.0, atol=1e-9)
 
 
-def test_a_problem_that_is_not_finite_ends_at_once_and_costs_infinitely_much() -> None:
+def test_a_problem_that_is_not_finite_ends_at_once_and_costs_infinitely_much():
     fit = gauss_newton(lambda x: normal_equations(np.array([[np.nan]]), np.ones((1, 1, 1))), np.zeros(1))
     assert not fit.converged
     assert np.isinf(fit.predicted_cost)
 
 
-def test_steps_are_limited_and_counted() -> None:
-    def linearise(x: FloatArray) -> Normal:
+def test_steps_are_limited_and_counted():
+    def linearise(x):
         return normal_equations((x - 10.0)[None], np.ones((1, 1, 1)))
 
     fit = gauss_newton(linearise, np.zeros(1), limit=lambda step: np.clip(step, -3.0, 3.0))

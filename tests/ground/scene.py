@@ -1,27 +1,17 @@
 """A drive over a flat, rough floor, small enough for a test: every pixel is looked up where its ray lands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.records import (
-    Camera,
-    CameraInfo,
-    CentrePrior,
-    Drive,
-    FloatArray,
-    Image,
-    PoseNoise,
-    Trajectory,
-)
+from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray, Image, PoseNoise, Trajectory
 
 INFO = CameraInfo(
     "front", 480, 320, np.array([[340.0, 0, 239.5], [0, 340.0, 159.5], [0, 0, 1]]), "plumb_bob",
@@ -39,11 +29,7 @@ _EVERY_M = 0.8
 
 def extrinsic(roll_deg: float = 0.0, pitch_deg: float = 20.0, yaw_deg: float = 0.0) -> FloatArray:
     """``cam_from_vehicle`` of a camera at :data:`CENTRE` that looks ahead and down."""
-    turn = rotation_from_euler(*(np.deg2rad([a]) for a in (roll_deg, pitch_deg, yaw_deg)))[0]
-    turn = turn @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turn.T, -turn.T @ CENTRE
-    return out
+    return mounted(CENTRE, pitch_deg, yaw_deg, roll_deg)
 
 
 def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:

@@ -1,36 +1,36 @@
 """The ground of a small drive shows its mounting and what is wrong with its poses, clock and lens."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, with_trajectory
+from v2hdm.cli.main import run
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
 from v2hdm.ground.patches import read_grey
-from v2hdm.records import Drive, FloatArray, Trajectory
+from v2hdm.io.calibration import read_calibration
+from v2hdm.io.drive.writing import write_drive
+from v2hdm.records import Trajectory
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
 FEW = GroundOptions(pairs=14, clock_pairs=6, readings=False, free=())
 
 
 @pytest.fixture(scope="module")
-def turning(tmp_path_factory) -> Drive:
+def turning(tmp_path_factory):
     return make_drive(tmp_path_factory.mktemp("turning"), 70.0, TRUE)
 
 
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory) -> Drive:
+def straight(tmp_path_factory):
     return make_drive(tmp_path_factory.mktemp("straight"), 0.0, TRUE)
 
 
-def angles_off_deg(found: FloatArray) -> FloatArray:
+def angles_off_deg(found):
     return np.rad2deg(mounting_angles(found) - mounting_angles(TRUE))
 
 
@@ -137,9 +137,38 @@ def test_the_mapper_starts_from_the_ground_only_where_it_was_found(straight, tmp
     assert better_start(straight, {"front": nothing}).cameras["front"].initial_ipm == "estimated"
 
 
-def test_the_grey_of_an_image_is_the_same_from_a_jpeg_and_from_its_pixels_as_png(tmp_path: Path) -> None:
+def test_the_grey_of_an_image_is_the_same_from_a_jpeg_and_from_its_pixels_as_png(tmp_path):
     colours = np.random.default_rng(2).integers(0, 256, (60, 80, 3), dtype=np.uint8)
     jpeg, png = tmp_path / "a.jpg", tmp_path / "a.png"
     cv2.imwrite(str(jpeg), cv2.resize(colours, (320, 240)))
     cv2.imwrite(str(png), cv2.imread(str(jpeg)))
     np.testing.assert_array_equal(read_grey(str(jpeg)), read_grey(str(png)))
+
+
+def test_the_door_writes_a_mounting_and_its_picture(tmp_path, capsys):
+    true = extrinsic(roll_deg=0.5, yaw_deg=-1.0)
+    drive = make_drive(tmp_path / "drive", 40.0, true)
+    assert drive.trajectory is not None
+    write_drive(tmp_path / "drive", drive, drive.trajectory)
+    output = tmp_path / "mounting"
+    assert run(
+        ["calibrate", "ground", str(tmp_path / "drive"), "--output", str(output), "--workers", "1"]
+    ) in (0, 3)
+    found = read_calibration(output / "calibration_front.yaml")
+    np.testing.assert_allclose(found.cam_from_vehicle[:3, :3], true[:3, :3], atol=0.005)
+    assert (output / "ground_front.png").stat().st_size > 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("front: roll 0.")
+    assert "verdict: " in shown
+
+
+def test_a_folder_with_other_files_is_refused_and_left_alone(tmp_path, capsys):
+    drive = make_drive(tmp_path / "drive", 0.0, extrinsic())
+    assert drive.trajectory is not None
+    write_drive(tmp_path / "drive", drive, drive.trajectory)
+    mine = tmp_path / "mine" / "calibration_front.yaml"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    assert run(["calibrate", "ground", str(tmp_path / "drive"), "--output", str(mine.parent)]) == 2
+    assert "no results of ours" in capsys.readouterr().err
+    assert mine.read_text() == "mine"

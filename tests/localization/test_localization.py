@@ -1,13 +1,11 @@
 """A vehicle follows itself through a map of markings by what its cameras see."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.localization.filter import POSE, Markings, Seen, State, locate, pose_of, predict, start
+from v2hdm.localization.filter import Markings, Seen, locate, pose_of, predict, start
 from v2hdm.records import HdMap, Marking
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
@@ -18,16 +16,12 @@ DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])
 DIAMOND = np.array([[0.5, 0.0], [0.0, 0.4], [-0.5, 0.0], [0.0, -0.4]])
 
 
-def looking_ahead() -> np.ndarray:
+def looking_ahead():
     """cam_from_vehicle of a camera 2.4 m above the ground, 15 degrees down."""
-    c, s = np.cos(np.deg2rad(15)), np.sin(np.deg2rad(15))
-    out = np.eye(4)
-    out[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    out[:3, 3] = -out[:3, :3] @ [1.5, 0.0, 2.4]
-    return out
+    return mounted([1.5, 0.0, 2.4], pitch_deg=15)
 
 
-def mapped(true: HdMap, rng: np.random.Generator, sigma_m: float = 0.01) -> HdMap:
+def mapped(true, rng, sigma_m=0.01):
     """A yard as a drive has mapped it."""
     block = sigma_m**2 * np.eye(8)
     corners = [one.corners_map + sigma_m * rng.standard_normal((4, 2)) for one in true.markings]
@@ -35,7 +29,7 @@ def mapped(true: HdMap, rng: np.random.Generator, sigma_m: float = 0.01) -> HdMa
     return HdMap(tuple(Marking(kind, c, 10, block, sigma_m) for kind, c in zip(kinds, corners, strict=True)))
 
 
-def yard(rng: np.random.Generator, length_m: float = 120.0) -> HdMap:
+def yard(rng, length_m=120.0):
     """Dashes to the left and diamonds here and there to the right of a straight way along x."""
     markings = []
     for x in np.arange(0.0, length_m, 5.0):
@@ -45,7 +39,7 @@ def yard(rng: np.random.Generator, length_m: float = 120.0) -> HdMap:
     return HdMap(tuple(markings))
 
 
-def seen_from(pose: np.ndarray, hd_map: HdMap, rng: np.random.Generator) -> list[Seen]:
+def seen_from(pose, hd_map, rng):
     """What the camera finds from a true pose (5,): whole markings within 15 m, with noise."""
     camera = looking_ahead()
     out = []
@@ -61,14 +55,14 @@ def seen_from(pose: np.ndarray, hd_map: HdMap, rng: np.random.Generator) -> list
     return out
 
 
-def drive(count: int, rng: np.random.Generator) -> np.ndarray:
+def drive(count, rng):
     """True x, y, heading, roll, pitch (F, 5) of a vehicle that swerves a little at about 4 m/s."""
     heading = 0.05 * np.sin(STEP_S * np.arange(100 * count) / 200)
     way = np.cumsum(0.04 * STEP_S * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)[::100]
     return np.column_stack([way - way[0], heading[::100], *(ATTITUDE_RAD * rng.standard_normal((2, count)))])
 
 
-def follow(true: np.ndarray, painted: HdMap, off: np.ndarray, rng: np.random.Generator) -> list[State]:
+def follow(true, painted, off, rng):
     """States after each frame, in a map with errors of 1 cm; the first pose is given ``off`` (2,), m."""
     begin = pose_of(true[0])
     begin[:2, 3] += off
@@ -80,11 +74,11 @@ def follow(true: np.ndarray, painted: HdMap, off: np.ndarray, rng: np.random.Gen
     return states
 
 
-def errors(states: list[State], true: np.ndarray) -> np.ndarray:
+def errors(states, true):
     return np.stack([state.mean[:2] for state in states]) - true[:, :2]
 
 
-def test_a_vehicle_knows_where_it_is_to_centimetres_from_markings_alone() -> None:
+def test_a_vehicle_knows_where_it_is_to_centimetres_from_markings_alone():
     rng = np.random.default_rng(0)
     hd_map, true = yard(rng), drive(100, rng)
     states = follow(true, hd_map, np.zeros(2), rng)
@@ -93,14 +87,14 @@ def test_a_vehicle_knows_where_it_is_to_centimetres_from_markings_alone() -> Non
     assert np.degrees(np.sqrt(np.mean(np.square(turn)))) < 0.1
 
 
-def test_a_start_half_a_metre_off_is_forgotten_at_the_first_markings() -> None:
+def test_a_start_half_a_metre_off_is_forgotten_at_the_first_markings():
     rng = np.random.default_rng(1)
     hd_map, true = yard(rng), drive(20, rng)
     states = follow(true, hd_map, np.array([0.4, -0.3]), rng)
     assert np.hypot(*errors(states, true)[1:].T).max() < 0.06
 
 
-def test_the_stated_errors_hold() -> None:
+def test_the_stated_errors_hold():
     squared = []
     for seed in range(6):
         rng = np.random.default_rng(10 + seed)
@@ -111,7 +105,7 @@ def test_the_stated_errors_hold() -> None:
     assert 0.8 < np.mean(squared) < 3.0  # of two coordinates: honest is 2
 
 
-def test_where_nothing_is_painted_the_vehicle_says_that_it_is_lost_and_finds_itself_again() -> None:
+def test_where_nothing_is_painted_the_vehicle_says_that_it_is_lost_and_finds_itself_again():
     rng = np.random.default_rng(2)
     painted = yard(rng)
     gap = [m for m in painted.markings if not 30 < m.corners_map[:, 0].mean() < 60]
@@ -126,7 +120,7 @@ def test_where_nothing_is_painted_the_vehicle_says_that_it_is_lost_and_finds_its
     assert error[after].max() < 0.1
 
 
-def test_a_detection_that_two_markings_could_explain_is_not_used() -> None:
+def test_a_detection_that_two_markings_could_explain_is_not_used():
     rng = np.random.default_rng(3)
     dashes = HdMap(tuple(Marking("lane_dash", DASH + np.array([x, 1.8]), 10) for x in (8.0, 11.0)))
     seen = seen_from(np.zeros(5), dashes, rng)[:1]
@@ -134,16 +128,3 @@ def test_a_detection_that_two_markings_could_explain_is_not_used() -> None:
     assert locate(unsure, seen, Markings(dashes))[1] == []
     sure = start(pose_of(np.zeros(5)), 0.3, 0.02, ATTITUDE_RAD)
     assert len(locate(sure, seen, Markings(dashes))[1]) == 1
-
-
-def test_motion_between_frames_agrees_with_its_own_derivative() -> None:
-    state = State(np.array([1.0, 2.0, 0.7, 3.0, 0.2, 0.0, 0.0]), np.diag(np.full(7, 1e-8)))
-    after = predict(state, 0.3, 0.0)
-    noise = predict(State(state.mean, np.zeros((7, 7))), 0.3, 0.0).covariance
-    slopes = [
-        (predict(State(state.mean + step, state.covariance), 0.3, 0.0).mean - after.mean) / 1e-6
-        for step in 1e-6 * np.eye(7)
-    ]
-    expected = np.array(slopes).T @ state.covariance @ np.array(slopes)
-    assert after.covariance - noise == pytest.approx(expected, abs=1e-13)
-    assert len(POSE) == 5

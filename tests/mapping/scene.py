@@ -4,8 +4,6 @@ Everything is drawn from one generator, so a seed names a scene. The truth stays
 gets a :class:`v2hdm.records.Drive` and detections.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import (
@@ -30,8 +29,6 @@ from v2hdm.records import (
     MarkingDetection,
     PoseNoise,
 )
-
-OPTICAL_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(kw_only=True)
@@ -69,21 +66,11 @@ class Scene:
     cam_from_vehicle: dict[str, FloatArray]
 
 
-def extrinsic(
-    yaw_deg: float, pitch_deg: float, roll_deg: float, centre: tuple[float, float, float]
-) -> FloatArray:
-    """``cam_from_vehicle`` of a camera at ``centre`` looking along yaw, pitched down."""
-    vehicle_from_body = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
-    rotation = OPTICAL_FROM_BODY @ vehicle_from_body.T
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, -rotation @ np.asarray(centre)
-    return out
-
-
 MOUNTS = {
-    "front": (1.0, 16.0, 0.5, (3.6, 0.1, 2.4)),
-    "rear": (181.0, 18.0, -0.4, (-0.9, -0.1, 2.6)),
+    "front": mounted((3.6, 0.1, 2.4), pitch_deg=16.0, yaw_deg=1.0, roll_deg=0.5),
+    "rear": mounted((-0.9, -0.1, 2.6), pitch_deg=18.0, yaw_deg=181.0, roll_deg=-0.4),
 }
+"""``cam_from_vehicle`` of the cameras."""
 
 
 def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Marking]] = list) -> Scene:
@@ -95,7 +82,7 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
     route = _route(options)
     markings, lanes = _paint(route, options)
     markings = repaint(markings)
-    truth = {name: extrinsic(*MOUNTS[name]) for name in options.cameras}
+    truth = {name: MOUNTS[name] for name in options.cameras}
     cameras = {name: _camera(name, truth[name], options, rng) for name in options.cameras}
     true_poses, recorded = _poses(route, options, rng)
     images, detections = [], []
@@ -104,14 +91,9 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
             images.append(Image(name, 0.2 * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
             seen = _look(cameras[name].info, truth[name], true_poses[j], markings, lanes, options, rng)
             detections.append(ImageDetections(len(images) - 1, *seen))
-    noise = PoseNoise(
-        max(options.rtk_m, 0.005),
-        max(np.deg2rad(options.heading_deg), 2e-4),
-        max(np.deg2rad(options.jitter_deg), 2e-4),
-        position_drift_m=0.0,
-        heading_drift_rad=0.0,
-        roll_pitch_drift_rad=0.0,
-    )
+    heading_rad, jitter_rad = (max(np.deg2rad(a), 2e-4) for a in (options.heading_deg, options.jitter_deg))
+    none = dict.fromkeys(("position_drift_m", "heading_drift_rad", "roll_pitch_drift_rad"), 0.0)
+    noise = PoseNoise(max(options.rtk_m, 0.005), heading_rad, jitter_rad, **none)
     drive = Drive("yard", Path(), cameras, images, noise)
     return Scene(drive, detections, markings, lanes, truth)
 
@@ -148,15 +130,8 @@ def _placed(shape: FloatArray, pose: FloatArray) -> FloatArray:
 def _paint(route: FloatArray, options: SceneOptions) -> tuple[list[Marking], list[FloatArray]]:
     diamond = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
     dash = np.array([[1.5, -0.075], [1.5, 0.075], [-1.5, 0.075], [-1.5, -0.075]])
-    markings = (
-        []
-        if options.dashes_only
-        else [
-            Marking("diamond", _placed(diamond, pose), 0)
-            for lateral in (1.5, -1.2)
-            for pose in _beside(route, 5.0, lateral)[1:]
-        ]
-    )
+    rows = () if options.dashes_only else (1.5, -1.2)
+    markings = [Marking("diamond", _placed(diamond, p), 0) for d in rows for p in _beside(route, 5.0, d)[1:]]
     sides = (1.8, -1.8) if options.dashes_only else (3.2,)
     markings += [Marking("lane_dash", _placed(dash, p), 0) for d in sides for p in _beside(route, 6.0, d)[1:]]
     lanes = [Lane("lane_line", _beside(route, 0.5, lateral)[:, :2], 0) for lateral in options.lines]

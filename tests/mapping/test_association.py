@@ -1,13 +1,11 @@
 """Tracks stay pure under a wrong IPM; merging joins what is one marking and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.mapping.scene import Scene, SceneOptions, make_scene
+from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.association.ground import Located, locate
 from v2hdm.association.groups import (
     Association,
@@ -18,7 +16,7 @@ from v2hdm.association.groups import (
     same_groups,
 )
 from v2hdm.association.options import AssociationOptions
-from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.geometry.quadrilateral import align
 from v2hdm.mapping.bundle import vehicle_twists
@@ -28,22 +26,26 @@ MAX_RANGE_M = 16.0
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return make_scene(SceneOptions(length_m=80.0, seed=11, false_rate=0.0))
 
 
 @pytest.fixture(scope="module")
-def sightings(scene: Scene) -> Sightings:
+def sightings(scene):
     return collect_sightings(scene.drive, scene.detections, ("front", "rear"))
 
 
-def true_rig(scene: Scene, sightings: Sightings) -> Rig:
+def true_rig(scene, sightings):
     rig = initial_rig(scene.drive.cameras, sightings.map_from_vehicle)
     truth = np.stack([scene.cam_from_vehicle[name] for name in sightings.cameras])
     return Rig(rig.intrinsic, truth, sightings.map_from_vehicle)
 
 
-def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
+MERGING = {"floor_m": 0.05, "gate_sigmas": 4.0, "max_distance_m": 1.5, "shape_tolerance": 0.25}
+SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+def true_marking(scene, sightings):
     """Index of the marking (S,) that each sighting shows, by its corners under the true extrinsic."""
     located = locate(sightings, true_rig(scene, sightings))
     corners = np.stack([m.corners_map for m in scene.markings])
@@ -52,7 +54,14 @@ def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
     return np.nanmean(distance, axis=2).argmin(axis=1)
 
 
-def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Association, Located]:
+def located_at(corners, ray):
+    """Corners (n, 4, 2) that are known to a centimetre, along such rays."""
+    count, everywhere = len(corners), np.ones((len(corners), 4), bool)
+    covariance = np.tile(np.eye(2) * 1e-4, (count, 4, 1, 1))
+    return Located(corners, covariance, ray, np.full(count, 2.4), everywhere, everywhere)
+
+
+def tracks_under(rig, sightings, sigma_rad):
     located = locate(sightings, rig)
     near = located.range_m <= MAX_RANGE_M
     located = replace(located, valid=located.valid & near, informs=located.informs & near)
@@ -61,23 +70,21 @@ def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Asso
     ), located
 
 
-def test_under_an_ipm_that_is_wrong_by_decimetres_no_track_mixes_two_markings(
-    scene: Scene, sightings: Sightings
-) -> None:
-    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+@pytest.fixture(scope="module")
+def tracks(scene, sightings):
+    """Under an IPM that is wrong by decimetres."""
+    return tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)[0]
+
+
+def test_no_track_mixes_two_markings_and_all_are_long_although_images_miss_some(scene, sightings, tracks):
     marking = true_marking(scene, sightings)
     grouped = tracks.group >= 0
     per_track = np.unique(np.stack([tracks.group[grouped], marking[grouped]]), axis=1)
     assert per_track.shape[1] == tracks.count
+    assert np.median(np.bincount(tracks.group[grouped])) >= 8
 
 
-def test_tracks_are_long_although_images_miss_markings(scene: Scene, sightings: Sightings) -> None:
-    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
-    assert np.median(np.bincount(tracks.group[tracks.group >= 0])) >= 8
-
-
-def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings) -> None:
-    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+def test_corner_orders_agree_within_a_track(scene, sightings, tracks):
     located = locate(sightings, true_rig(scene, sightings))
     true_corners = np.stack([m.corners_map for m in scene.markings])[true_marking(scene, sightings)]
     whole = np.ones((len(sightings), 4), dtype=bool)
@@ -90,18 +97,10 @@ def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings) 
     assert votes.max(axis=1).sum() >= 0.99 * votes.sum()
 
 
-def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings) -> None:
+def test_merging_leaves_one_group_per_marking(scene, sightings):
     rig = true_rig(scene, sightings)
     tracks, located = tracks_under(rig, sightings, 0.002)
-    merged = merge_groups(
-        tracks,
-        sightings,
-        fuse_groups(tracks, located, 0.0017),
-        floor_m=0.05,
-        gate_sigmas=4.0,
-        max_distance_m=1.5,
-        shape_tolerance=0.25,
-    )
+    merged = merge_groups(tracks, sightings, fuse_groups(tracks, located, 0.0017), **MERGING)
     marking = true_marking(scene, sightings)
     # A sighting with a grossly misplaced corner may stay alone; it never makes a marking.
     size = np.bincount(merged.group[merged.group >= 0])
@@ -112,59 +111,34 @@ def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings
     assert merged.count < tracks.count
 
 
-def test_two_markings_of_one_image_are_never_merged(sightings: Sightings) -> None:
+def test_two_markings_of_one_image_are_never_merged(sightings):
     together = sightings.subset(np.flatnonzero(sightings.image == sightings.image[0])[:2])
-    association = Association(np.array([0, 1]), np.zeros(2, int), 2)
-    rig_corners = np.tile(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), (2, 1, 1))
-    located = Located(
-        rig_corners,
-        np.tile(np.eye(2) * 1e-4, (2, 4, 1, 1)),
-        rig_corners + 5,
-        np.full(2, 2.4),
-        np.ones((2, 4), bool),
-        np.ones((2, 4), bool),
-    )
-    merged = merge_groups(
-        association,
-        together,
-        fuse_groups(association, located, 0.001),
-        floor_m=0.05,
-        gate_sigmas=4.0,
-        max_distance_m=1.5,
-        shape_tolerance=0.25,
-    )
-    assert merged.count == 2
+    association, corners = Association(np.array([0, 1]), np.zeros(2, int), 2), np.tile(SQUARE, (2, 1, 1))
+    fused = fuse_groups(association, located_at(corners, corners + 5), 0.001)
+    assert merge_groups(association, together, fused, **MERGING).count == 2
 
 
-def test_groups_are_renumbered_when_rows_are_dropped() -> None:
+def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_other_numbers():
     association = Association(np.array([0, 1, 2, 1, -1]), np.arange(5) % 4, 3)
     kept = keep_rows(association, np.array([False, True, True, True, True]))
-    assert kept.group.tolist() == [-1, 0, 1, 0, -1]
-    assert kept.count == 2
-
-
-def test_the_same_division_under_other_numbers_is_the_same() -> None:
-    a = Association(np.array([0, 0, 1, 2, -1]), np.zeros(5, int), 3)
-    b = Association(np.array([5, 5, 0, 1, 1]), np.zeros(5, int), 6)
-    c = Association(np.array([5, 0, 0, 1, 1]), np.zeros(5, int), 6)
+    assert (kept.group.tolist(), kept.count) == ([-1, 0, 1, 0, -1], 2)
+    a, b, c = (
+        Association(np.array(group), np.zeros(5, int), count)
+        for group, count in (([0, 0, 1, 2, -1], 3), ([5, 5, 0, 1, 1], 6), ([5, 0, 0, 1, 1], 6))
+    )
     assert same_groups(a, b)
     assert not same_groups(a, c)
 
 
-def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
-    corners = np.tile(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), (4, 1, 1))
+def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones():
+    corners, ray = np.tile(SQUARE, (4, 1, 1)), np.full((4, 4, 2), 4.0)
     corners[3] += 0.8
-    ray = np.full((4, 4, 2), 4.0)
     ray[3] = 14.0
-    everywhere = np.ones((4, 4), bool)
-    located = Located(
-        corners, np.tile(np.eye(2) * 1e-4, (4, 4, 1, 1)), ray, np.full(4, 2.4), everywhere, everywhere
-    )
-    fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located, 0.002)
+    fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located_at(corners, ray), 0.002)
     assert np.abs(fused.corners_map[0] - corners[0]).max() < 0.02
 
 
-def test_merging_no_groups_gives_none(scene: Scene, sightings: Sightings) -> None:
+def test_merging_no_groups_gives_none(scene, sightings):
     none = keep_rows(
         tracks_under(true_rig(scene, sightings), sightings, 0.001)[0], np.zeros(len(sightings), dtype=bool)
     )
@@ -176,7 +150,7 @@ def test_merging_no_groups_gives_none(scene: Scene, sightings: Sightings) -> Non
     assert (merged.group == -1).all()
 
 
-def test_a_steady_turn_has_one_twist_everywhere() -> None:
+def test_a_steady_turn_has_one_twist_everywhere():
     """5 m/s on a circle of 10 m radius: half a radian a second to the left."""
     stamp_s = np.array([0.0, 0.2, 0.5, 0.6, 1.0])
     heading = 0.5 * stamp_s
@@ -188,5 +162,5 @@ def test_a_steady_turn_has_one_twist_everywhere() -> None:
     np.testing.assert_allclose(vehicle_twists(poses, stamp_s), expected, atol=1e-9)
 
 
-def test_a_single_pose_stands_still() -> None:
+def test_a_single_pose_stands_still():
     np.testing.assert_array_equal(vehicle_twists(np.eye(4)[None], np.zeros(1)), np.zeros((1, 6)))

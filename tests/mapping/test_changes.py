@@ -1,74 +1,57 @@
 """A yard that was painted anew in places, seen by a second drive: what stayed, moved, vanished and is new."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.mapping.scene import (
-    ADDED,
-    DIAMOND,
-    MOVED,
-    REMOVED,
-    Scene,
-    SceneOptions,
-    make_scene,
-    match,
-    repainted,
-)
+from tests.mapping.scene import ADDED, DIAMOND, MOVED, REMOVED, SceneOptions, make_scene, match, repainted
 from v2hdm.errors import MappingError
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Changes, Fate, Lane, Marking
+from v2hdm.records import Fate, Lane, Marking
 from v2hdm.site.changes import Base, fused_markings
-from v2hdm.site.fates import Decision, Watched, decide
+from v2hdm.site.fates import Watched, decide
 from v2hdm.site.map_errors import Errors, updated_lanes
 
 
-def base_of(result: MethodResult, folder: Path) -> Base:
+def base_of(result, folder):
     """A result as the base of the next one, by way of its file."""
     write_geojson(result.hd_map, folder / "map.geojson")
-    assert result.poses is not None
     left_out = tuple((one.kind, one.position_map, one.sightings) for one in result.excluded)
     return Base(read_geojson(folder / "map.geojson"), result.poses.map_from_vehicle, left_out)
 
 
 @pytest.fixture(scope="module")
-def before() -> Scene:
+def before():
     return make_scene(SceneOptions(length_m=70.0, seed=21))
 
 
 @pytest.fixture(scope="module")
-def base(before: Scene, tmp_path_factory: pytest.TempPathFactory) -> Base:
+def base(before, tmp_path_factory):
     found = run_methods(before.drive, before.detections, ("front", "rear"))["Opt"]
     return base_of(found, tmp_path_factory.mktemp("base"))
 
 
 @pytest.fixture(scope="module")
-def updated(base: Base) -> tuple[Scene, MethodResult]:
+def updated(base):
     now = make_scene(SceneOptions(length_m=70.0, seed=22), repainted)
     return now, run_methods(now.drive, now.detections, ("front", "rear"), base=base)["Opt"]
 
 
-def changes_of(result: MethodResult) -> Changes:
+def changes_of(result):
     assert result.changes is not None
     return result.changes
 
 
-def near(corners: np.ndarray | None, centre: np.ndarray) -> bool:
+def near(corners, centre):
     return corners is not None and bool(np.linalg.norm(corners.mean(axis=0) - centre) < 0.1)
 
 
-def test_what_moved_is_listed_with_its_way_and_nothing_else(
-    before: Scene, updated: tuple[Scene, MethodResult]
-) -> None:
+def test_what_moved_is_listed_with_its_way_and_nothing_else(before, updated):
     moved = changes_of(updated[1]).of(Fate.MOVED)
     assert len(moved) == len(MOVED)
     for number, shift in MOVED.items():
@@ -81,9 +64,7 @@ def test_what_moved_is_listed_with_its_way_and_nothing_else(
         assert one.probability > 0.99
 
 
-def test_what_vanished_left_the_map_and_stays_in_the_list(
-    before: Scene, updated: tuple[Scene, MethodResult]
-) -> None:
+def test_what_vanished_left_the_map_and_stays_in_the_list(before, updated):
     now, result = updated
     gone = changes_of(result).of(Fate.VANISHED)
     centres = [before.markings[k].corners_map.mean(axis=0) for k in REMOVED]
@@ -95,7 +76,7 @@ def test_what_vanished_left_the_map_and_stays_in_the_list(
     assert len(pairs) == len(result.hd_map.markings)
 
 
-def test_new_paint_has_an_id_that_no_other_ever_had(base: Base, updated: tuple[Scene, MethodResult]) -> None:
+def test_new_paint_has_an_id_that_no_other_ever_had(base, updated):
     result = updated[1]
     new = changes_of(result).of(Fate.NEW)
     assert len(new) == len(ADDED)
@@ -104,7 +85,7 @@ def test_new_paint_has_an_id_that_no_other_ever_had(base: Base, updated: tuple[S
     assert min(one.id for one in new) > max(given)
 
 
-def test_ids_stay(base: Base, updated: tuple[Scene, MethodResult]) -> None:
+def test_ids_stay(base, updated):
     vanished = {one.id for one in changes_of(updated[1]).of(Fate.VANISHED)}
     moved = {one.id for one in changes_of(updated[1]).of(Fate.MOVED)}
     now = {one.id: one for one in updated[1].hd_map.markings}
@@ -117,12 +98,9 @@ def test_ids_stay(base: Base, updated: tuple[Scene, MethodResult]) -> None:
     assert {one.id for one in base.hd_map.lanes} <= set(ids)
 
 
-def test_observations_bear_the_ids_and_corners_of_the_updated_map(
-    updated: tuple[Scene, MethodResult],
-) -> None:
+def test_observations_bear_the_ids_and_corners_of_the_updated_map(updated):
     now, result = updated
     assert result.residuals is not None
-    assert result.poses is not None
     corners = {one.id: one.corners_map for one in result.hd_map.markings}
     images = {image.path.as_posix(): image for image in now.drive.images}
     found, off_px = result.residuals, []
@@ -138,16 +116,14 @@ def test_observations_bear_the_ids_and_corners_of_the_updated_map(
     assert np.percentile(off_px, 90) < 8.0
 
 
-def test_two_drives_together_are_better_than_either(
-    before: Scene, base: Base, updated: tuple[Scene, MethodResult]
-) -> None:
+def test_two_drives_together_are_better_than_either(before, base, updated):
     now = updated[0]
     alone = run_methods(now.drive, now.detections, ("front", "rear"))["Opt"].hd_map
     errors = [match(one, now.markings, 0.3)[1] for one in (alone, updated[1].hd_map)]
     assert errors[1] < errors[0]
 
 
-def test_an_id_that_is_gone_is_never_given_again(tmp_path: Path, updated: tuple[Scene, MethodResult]) -> None:
+def test_an_id_that_is_gone_is_never_given_again(tmp_path, updated):
     hd_map = updated[1].hd_map
     last = max(one.id or 0 for one in hd_map.markings)
     without = replace(hd_map, markings=tuple(one for one in hd_map.markings if one.id != last))
@@ -158,7 +134,7 @@ def test_an_id_that_is_gone_is_never_given_again(tmp_path: Path, updated: tuple[
     assert again.largest_id == hd_map.largest_id + 1
 
 
-def test_a_map_of_another_place_is_refused(base: Base, updated: tuple[Scene, MethodResult]) -> None:
+def test_a_map_of_another_place_is_refused(base, updated):
     elsewhere = [replace(one, corners_map=one.corners_map + 2.4) for one in base.hd_map.markings]
     wrong = replace(base, hd_map=replace(base.hd_map, markings=tuple(elsewhere)))
     with pytest.raises(MappingError, match="is the map of this site and frame"):
@@ -170,13 +146,13 @@ def test_a_map_of_another_place_is_refused(base: Base, updated: tuple[Scene, Met
 SHARED_M, OWN_M = 0.015, 0.004
 
 
-def street(count: int) -> np.ndarray:
+def street(count):
     """Corners (count, 4, 2) of diamonds 4 m apart."""
     places = np.column_stack([4.0 * np.arange(count), np.where(np.arange(count) % 2, 3.0, -3.0)])
     return DIAMOND + places[:, None]
 
 
-def mapped(corners: np.ndarray, rng: np.random.Generator, over_m: float = 30.0) -> list[Marking]:
+def mapped(corners, rng, over_m=30.0):
     """A map of the street: a drift that all share, and errors of each corner."""
     centres = corners.mean(axis=1)
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
@@ -187,15 +163,15 @@ def mapped(corners: np.ndarray, rng: np.random.Generator, over_m: float = 30.0) 
     return [Marking("diamond", one, 10, whole, OWN_M / 2, id=k + 1) for k, one in enumerate(noisy)]
 
 
-def decided(old: list[Marking], new: list[Marking], looks: int = 8) -> Decision:
-    def watched(markings: list[Marking]) -> Watched:
+def decided(old, new, looks=8):
+    def watched(markings):
         return Watched(np.full(len(markings), -np.log(10.0 * (looks + 1))), np.full(len(markings), -0.05))
 
     errors = [Errors.of(markings, 30.0) for markings in (old, new)]
     return decide(old, new, *errors, watched(old), watched(new))
 
 
-def test_the_drift_of_either_map_counts_once() -> None:
+def test_the_drift_of_either_map_counts_once():
     squared, stated = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -211,7 +187,7 @@ def test_the_drift_of_either_map_counts_once() -> None:
     assert np.mean(squared) == pytest.approx(expected, rel=0.35)
 
 
-def test_what_a_drive_did_not_pass_moves_with_what_it_did() -> None:
+def test_what_a_drive_did_not_pass_moves_with_what_it_did():
     """The old map's drift is found out along half of the street; nearby the other half is better, too."""
     before, after, stated = [], [], []
     for seed in range(40):
@@ -228,7 +204,7 @@ def test_what_a_drive_did_not_pass_moves_with_what_it_did() -> None:
 
 
 @pytest.mark.parametrize("shift_m", [0.1, 0.3, 1.0])
-def test_a_move_is_told_from_the_drift_of_two_maps(shift_m: float) -> None:
+def test_a_move_is_told_from_the_drift_of_two_maps(shift_m):
     rng = np.random.default_rng(5)
     corners = street(40)
     now = corners.copy()
@@ -239,7 +215,7 @@ def test_a_move_is_told_from_the_drift_of_two_maps(shift_m: float) -> None:
     assert not decision.fresh
 
 
-def test_what_no_image_looked_at_is_not_gone() -> None:
+def test_what_no_image_looked_at_is_not_gone():
     rng = np.random.default_rng(6)
     corners = street(30)
     old, new = mapped(corners, rng), [one for k, one in enumerate(mapped(corners, rng)) if k not in (4, 9)]
@@ -251,7 +227,7 @@ def test_what_no_image_looked_at_is_not_gone() -> None:
     assert decision.gone[9] < 0.1
 
 
-def test_a_lane_keeps_its_id_and_its_course_where_the_drive_has_none() -> None:
+def test_a_lane_keeps_its_id_and_its_course_where_the_drive_has_none():
     along = np.arange(0.0, 60.0, 0.5)
     old = [Lane("lane_line", np.column_stack([along, 0.0 * along]), 5, id=3)]
     part = along[(along > 20) & (along < 40)]

@@ -1,23 +1,26 @@
-"""Lane clouds drawn by hand: what belongs together is joined, what does not is not."""
-
-from __future__ import annotations
+"""Lanes and symbols of the map."""
 
 import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
+import pytest
 
-from v2hdm.records import FloatArray, Lane
+from tests.cameras import mounted
+from v2hdm.association.ground import images_with_symbol
+from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
+from v2hdm.geometry.planar import signed_area
+from v2hdm.records import Marking
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
+from v2hdm.site.symbols import map_symbols
 
 OPTIONS = LaneOptions()
 
 
-def cloud_of(
-    lines: list[FloatArray], dash: bool = False, images: int = 12, sigma_m: float = 0.03, seed: int = 0
-) -> LaneCloud:
+def cloud_of(lines, dash=False, images=12, sigma_m=0.03, seed=0):
     """Each line (N, 2) seen by ``images`` images, every point off by ``sigma_m``."""
     rng = np.random.default_rng(seed)
     points, tangents, image = [], [], []
@@ -38,28 +41,28 @@ def cloud_of(
     )
 
 
-def guides_of(lines: list[FloatArray]) -> Guides:
+def guides_of(lines):
     """Whole lines (N, 2), each as one image saw it."""
     index = np.arange(len(lines))
     return Guides(np.concatenate(lines), np.repeat(index, [len(line) for line in lines]), index)
 
 
-def arc(start: float, stop: float, radius: float = 60.0) -> FloatArray:
+def arc(start, stop, radius=60.0):
     """A bend to the left from the origin, between two distances along it, m."""
     angle = np.arange(start, stop, 0.3) / radius
     return radius * np.column_stack([np.sin(angle), 1 - np.cos(angle)])
 
 
-def straight(start: float, stop: float, y: float = 0.0, step: float = 0.3) -> FloatArray:
+def straight(start, stop, y=0.0, step=0.3):
     x = np.arange(start, stop, step)
     return np.column_stack([x, np.full_like(x, y)])
 
 
-def length(lane: Lane) -> float:
+def length(lane):
     return float(np.linalg.norm(np.diff(lane.points_map, axis=0), axis=1).sum())
 
 
-def test_a_straight_line_becomes_one_polyline_on_its_centre() -> None:
+def test_a_straight_line_becomes_one_polyline_on_its_centre():
     (lane,) = map_lanes(cloud_of([straight(0, 40)]), OPTIONS)
     assert lane.kind == "lane_line"
     assert length(lane) > 38
@@ -68,14 +71,14 @@ def test_a_straight_line_becomes_one_polyline_on_its_centre() -> None:
     np.testing.assert_allclose(steps, OPTIONS.node_spacing_m, rtol=0.1)
 
 
-def test_a_turn_of_twelve_metres_radius_stays_one_line() -> None:
+def test_a_turn_of_twelve_metres_radius_stays_one_line():
     angle = np.arange(0, np.pi, 0.3 / 12)
     (lane,) = map_lanes(cloud_of([12 * np.column_stack([np.cos(angle), np.sin(angle)])]), OPTIONS)
     assert length(lane) > 0.95 * 12 * np.pi
     assert np.abs(np.linalg.norm(lane.points_map, axis=1) - 12).max() < 0.05
 
 
-def test_dashes_of_one_line_become_one_dashed_lane_across_their_gaps() -> None:
+def test_dashes_of_one_line_become_one_dashed_lane_across_their_gaps():
     dashes = [straight(s, s + 3.0) for s in np.arange(0, 36, 6.0)]
     (lane,) = map_lanes(cloud_of(dashes, dash=True), OPTIONS)
     assert lane.kind == "lane_dash"
@@ -83,7 +86,7 @@ def test_dashes_of_one_line_become_one_dashed_lane_across_their_gaps() -> None:
     assert np.abs(lane.points_map[:, 1]).max() < 0.05
 
 
-def test_dashes_of_a_bend_follow_it_across_their_gaps() -> None:
+def test_dashes_of_a_bend_follow_it_across_their_gaps():
     radius = 25.0
     dashes = []
     for start in np.arange(0, 30, 6.0):
@@ -93,12 +96,12 @@ def test_dashes_of_a_bend_follow_it_across_their_gaps() -> None:
     assert np.abs(np.linalg.norm(lane.points_map, axis=1) - radius).max() < 0.1
 
 
-def test_solid_paint_is_not_continued_across_a_wide_gap() -> None:
+def test_solid_paint_is_not_continued_across_a_wide_gap():
     lanes = map_lanes(cloud_of([straight(0, 15), straight(22, 40)]), OPTIONS)
     assert len(lanes) == 2
 
 
-def test_neighbouring_dashed_lines_are_never_connected() -> None:
+def test_neighbouring_dashed_lines_are_never_connected():
     left = [straight(s, s + 3.0, 1.7) for s in np.arange(0, 24, 6.0)]
     right = [straight(s, s + 3.0, -1.7) for s in np.arange(3, 27, 6.0)]
     lanes = map_lanes(cloud_of(left + right, dash=True), OPTIONS)
@@ -106,13 +109,13 @@ def test_neighbouring_dashed_lines_are_never_connected() -> None:
     assert all(np.ptp(lane.points_map[:, 1]) < 0.1 for lane in lanes)
 
 
-def test_a_double_line_stays_double() -> None:
+def test_a_double_line_stays_double():
     lanes = map_lanes(cloud_of([straight(0, 20, 0.0), straight(0, 20, 0.35)]), OPTIONS)
     assert len(lanes) == 2
     assert sorted(round(float(np.median(lane.points_map[:, 1])), 1) for lane in lanes) == [0.0, 0.3]
 
 
-def test_crossing_lines_do_not_bend_each_other() -> None:
+def test_crossing_lines_do_not_bend_each_other():
     across = straight(-10, 10)[:, ::-1] + [10.0, 0.0]
     lanes = map_lanes(cloud_of([straight(0, 20), across]), OPTIONS)
     assert sum(length(lane) for lane in lanes) > 36
@@ -120,17 +123,17 @@ def test_crossing_lines_do_not_bend_each_other() -> None:
         assert min(np.abs(lane.points_map[:, 1]).max(), np.abs(lane.points_map[:, 0] - 10).max()) < 0.06
 
 
-def test_what_two_images_saw_is_no_lane() -> None:
+def test_what_two_images_saw_is_no_lane():
     assert map_lanes(cloud_of([straight(0, 20)], images=2), OPTIONS) == ()
 
 
-def test_a_closed_line_is_closed() -> None:
+def test_a_closed_line_is_closed():
     angle = np.arange(0, 2 * np.pi, 0.3 / 15)
     (lane,) = map_lanes(cloud_of([15 * np.column_stack([np.cos(angle), np.sin(angle)])]), OPTIONS)
     assert np.linalg.norm(lane.points_map[0] - lane.points_map[-1]) < 0.6
 
 
-def test_an_empty_cloud_has_no_lanes() -> None:
+def test_an_empty_cloud_has_no_lanes():
     assert (
         map_lanes(
             LaneCloud(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)),
@@ -140,7 +143,7 @@ def test_an_empty_cloud_has_no_lanes() -> None:
     )
 
 
-def test_a_hundred_thousand_points_take_seconds() -> None:
+def test_a_hundred_thousand_points_take_seconds():
     cloud = cloud_of([straight(0, 350, y, 0.25) for y in (-3.5, 0.0, 3.5, 7.0)], images=18)
     assert len(cloud.weight) > 100_000
     begin = time.process_time()
@@ -149,7 +152,7 @@ def test_a_hundred_thousand_points_take_seconds() -> None:
     assert time.process_time() - begin < 15
 
 
-def test_a_break_is_bridged_along_the_lines_that_images_saw_run_across_it() -> None:
+def test_a_break_is_bridged_along_the_lines_that_images_saw_run_across_it():
     cloud = cloud_of([arc(0, 15), arc(30, 45)], dash=True)
     assert len(map_lanes(cloud, OPTIONS)) == 2
     beside = arc(5, 40) + np.array([0.0, 0.1])
@@ -159,21 +162,158 @@ def test_a_break_is_bridged_along_the_lines_that_images_saw_run_across_it() -> N
     assert np.abs(np.linalg.norm(lane.points_map - [0.0, 60.0], axis=1) - 60).max() < 0.05
 
 
-def test_a_break_that_too_few_images_saw_a_line_cross_stays_one() -> None:
+def test_a_break_that_too_few_images_saw_a_line_cross_stays_one():
     cloud = cloud_of([arc(0, 15), arc(30, 45)], dash=True)
     few = [arc(5, 40)] * (OPTIONS.min_images - 1)
     short_of_it = [arc(5, 27)] * 10 + [arc(20, 40)] * 10
     assert len(map_lanes(replace(cloud, guides=guides_of(few + short_of_it)), OPTIONS)) == 2
 
 
-def test_lines_beside_each_other_are_not_bridged_whatever_was_seen() -> None:
+def test_lines_beside_each_other_are_not_bridged_whatever_was_seen():
     cloud = cloud_of([straight(0, 20), straight(21, 40, y=3.0)])
     across = np.column_stack([np.linspace(15, 25, 40), np.linspace(-3.0, 6.0, 40)])
     assert len(map_lanes(replace(cloud, guides=guides_of([across] * 20)), OPTIONS)) == 2
 
 
-def test_a_short_piece_must_be_seen_more_often_than_a_long_one() -> None:
+def test_a_short_piece_must_be_seen_more_often_than_a_long_one():
     piece = straight(0, 4.0)
     assert map_lanes(cloud_of([piece], images=OPTIONS.min_images), OPTIONS) == ()
     assert len(map_lanes(cloud_of([piece], images=3 * OPTIONS.min_images), OPTIONS)) == 1
     assert len(map_lanes(cloud_of([straight(0, 12)], images=OPTIONS.min_images), OPTIONS)) == 1
+
+
+INTRINSIC = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
+ARROW = np.array(
+    [[-1.5, -0.08], [0.5, -0.08], [0.5, -0.35], [1.5, 0.0], [0.5, 0.35], [0.5, 0.08], [-1.5, 0.08]]
+)
+
+
+def scene(arrow_x_m):
+    """Three frames, a metre apart, that all see an arrow ahead of the first one."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0.0, 1.0, 2.0]
+    rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], poses)
+    outlines = []
+    for pose in poses:
+        vehicle = np.column_stack(
+            [ARROW + np.array([arrow_x_m, 1.0]), np.zeros(len(ARROW)), np.ones(len(ARROW))]
+        )
+        cam = vehicle @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
+        outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
+    return Symbols(np.zeros(3, dtype=np.int64), np.arange(3), tuple(outlines), ("arrow",) * 3), rig
+
+
+def rectangle(centre, length_m, width_m):
+    """Corners (4, 2) of a rectangle, long in x."""
+    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [length_m / 2, width_m / 2]
+    return np.asarray(centre) + half
+
+
+def test_parts_of_the_arrow_are_counted_in_every_image_that_shows_it():
+    symbols, rig = scene(9.0)
+    shaft, head = rectangle((8.5, 1.0), 1.6, 0.15), rectangle((9.8, 1.02), 0.5, 0.3)
+    beside, far = rectangle((9.0, 1.4), 1.6, 0.15), rectangle((5.0, 1.0), 1.6, 0.15)
+    corners = np.stack([shaft, head, beside, far, np.full((4, 2), np.nan)])
+    assert images_with_symbol(symbols, rig, corners).tolist() == [3, 3, 0, 0, 0]
+
+
+def test_what_an_arrow_crosses_is_no_part_of_it():
+    symbols, rig = scene(9.0)
+    stop_line = rectangle((8.5, 1.0), 0.4, 3.0)
+    assert images_with_symbol(symbols, rig, stop_line[None]).tolist() == [0]
+
+
+def test_far_arrows_say_nothing():
+    symbols, rig = scene(40.0)
+    assert images_with_symbol(symbols, rig, rectangle((40.0, 1.05), 0.5, 0.3)[None]).tolist() == [0]
+
+
+def test_without_symbols_there_is_nothing_to_count():
+    _, rig = scene(9.0)
+    assert images_with_symbol(NO_SYMBOLS, rig, np.zeros((4, 4, 2))).tolist() == [0, 0, 0, 0]
+
+
+JITTER_RAD = 0.002
+AT, OFF = np.array([9.0, 1.0]), np.array([0.1, 0.0])
+
+
+def seen(shapes, kinds, poses_x):
+    """What a camera at so many places ahead says of shapes on the ground, one from each."""
+    poses = np.tile(np.eye(4), (len(poses_x), 1, 1))
+    poses[:, 0, 3] = poses_x
+    rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], poses)
+    outlines = []
+    for shape, pose in zip(shapes, poses, strict=True):
+        ground = np.column_stack([shape, np.zeros(len(shape)), np.ones(len(shape))])
+        cam = ground @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
+        outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
+    count = len(poses_x)
+    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds)), rig
+
+
+def overlap(one, other):
+    """Intersection over union, by cells of a centimetre."""
+    low = np.minimum(one.min(axis=0), other.min(axis=0)) - 0.1
+    size = np.ceil((np.maximum(one.max(axis=0), other.max(axis=0)) + 0.1 - low) * 100).astype(int)
+    masks = []
+    for shape in (one, other):
+        mask = np.zeros(size[::-1], dtype=np.uint8)
+        cv2.fillPoly(mask, [np.round((shape - low) * 100).astype(np.int32)], 1)
+        masks.append(mask > 0)
+    return float((masks[0] & masks[1]).sum() / (masks[0] | masks[1]).sum())
+
+
+def test_an_arrow_is_mapped_where_it_lies():
+    symbols, rig = scene(9.0)
+    (arrow,) = map_symbols(symbols, rig, JITTER_RAD, ())
+    assert (arrow.kind, arrow.sightings) == ("arrow", 3)
+    assert overlap(arrow.outline_map, ARROW + AT) > 0.97
+    assert abs(signed_area(arrow.outline_map) - signed_area(ARROW)) < 0.01 * signed_area(ARROW)
+    assert signed_area(arrow.outline_map) > 0
+    assert arrow.sigma_m is not None
+    assert arrow.sigma_m < 0.001
+
+
+def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma():
+    true = ARROW + AT
+    shapes = [true, true + OFF, true, true, true]
+    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), JITTER_RAD, ())
+    assert overlap(arrow.outline_map, true) > 0.95
+    assert arrow.sigma_m is not None
+    assert 0.005 < arrow.sigma_m < 0.05
+
+
+def test_the_class_is_what_most_sightings_say():
+    shapes = [ARROW + AT] * 4
+    kinds = ["arrow", "parking_t", "parking_t", "parking_t"]
+    (symbol,) = map_symbols(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]), JITTER_RAD, ())
+    assert (symbol.kind, symbol.sightings) == ("parking_t", 4)
+
+
+def test_neighbours_are_symbols_of_their_own():
+    bars = [np.array([[7.0, y], [9.0, y], [9.0, y + 0.4], [7.0, y + 0.4]]) for y in (-1.0, 0.0)]
+    found = map_symbols(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]), JITTER_RAD, ())
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize("x", [40.0, 9.0])
+def test_what_is_far_or_seen_seldom_is_left_out(x):
+    symbols, rig = scene(x)
+    if x == 9.0:
+        seldom = replace(symbols, frame=np.array([0, 1, 1]))
+        assert map_symbols(seldom, rig, JITTER_RAD, ()) == ()
+    else:
+        assert map_symbols(symbols, rig, JITTER_RAD, ()) == ()
+
+
+def test_paint_that_is_a_marking_is_no_symbol():
+    symbols, rig = scene(9.0)
+    square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
+    on, beside = (Marking("pad", square + place, 9) for place in ([9.0, 1.0], [9.0, 3.0]))
+    assert map_symbols(symbols, rig, JITTER_RAD, (on,)) == ()
+    assert len(map_symbols(symbols, rig, JITTER_RAD, (beside,))) == 1
+
+
+def test_without_sightings_there_are_no_symbols():
+    _, rig = scene(9.0)
+    assert map_symbols(NO_SYMBOLS, rig, JITTER_RAD, ()) == ()

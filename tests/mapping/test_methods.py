@@ -1,36 +1,40 @@
-"""The four methods on a made-up yard: markings found, none invented, extrinsics recovered."""
+"""The four methods on a made-up yard: all at once, marking by marking, by an executor, through kornia."""
 
-from __future__ import annotations
-
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from tests.mapping.scene import MATCH_M, Scene, SceneOptions, make_scene, match, rotation_error_deg
+from tests.mapping.scene import MATCH_M, SceneOptions, make_scene, match, rotation_error_deg
+from v2hdm.association.ground import locate
+from v2hdm.association.sightings import collect_sightings
 from v2hdm.errors import ConfigError, MappingError
+from v2hdm.executor import InProcess
+from v2hdm.geometry import ipm, tensors
+from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.io.drive import join_drives
 from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.optimise import initial_rig
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.results import MethodResult
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return make_scene(SceneOptions(length_m=100.0, seed=21))
 
 
 @pytest.fixture(scope="module")
-def results(scene: Scene) -> dict[str, MethodResult]:
+def results(scene):
     return run_methods(scene.drive, scene.detections, ("front", "rear"))
 
 
-def test_every_method_ran(results: dict[str, MethodResult]) -> None:
+def test_every_method_ran(results):
     assert list(results) == ["CNI", "ENI", "Opt", "ONI"]
 
 
-def test_the_optimised_map_holds_every_marking_once_and_no_other(
-    scene: Scene, results: dict[str, MethodResult]
-) -> None:
+def test_the_optimised_map_holds_every_marking_once_and_no_other(scene, results):
     mapped = results["Opt"].hd_map
     pairs, rmse_m = match(mapped, scene.markings, MATCH_M)
     assert len(pairs) == len(mapped.markings)
@@ -39,7 +43,7 @@ def test_the_optimised_map_holds_every_marking_once_and_no_other(
     assert rmse_m < 0.015
 
 
-def test_the_extrinsics_are_recovered(scene: Scene, results: dict[str, MethodResult]) -> None:
+def test_the_extrinsics_are_recovered(scene, results):
     for name, calibration in results["Opt"].calibrations.items():
         truth = scene.cam_from_vehicle[name]
         assert rotation_error_deg(calibration.cam_from_vehicle, truth) < 0.06
@@ -47,9 +51,7 @@ def test_the_extrinsics_are_recovered(scene: Scene, results: dict[str, MethodRes
         assert np.linalg.norm(centre + truth[:3, :3].T @ truth[:3, 3]) < 0.02
 
 
-def test_corner_errors_are_as_large_as_their_covariances_say(
-    scene: Scene, results: dict[str, MethodResult]
-) -> None:
+def test_corner_errors_are_as_large_as_their_covariances_say(scene, results):
     mapped = results["Opt"].hd_map
     pairs, _ = match(mapped, scene.markings, MATCH_M)
     normalised = []
@@ -65,16 +67,14 @@ def test_corner_errors_are_as_large_as_their_covariances_say(
     assert 0.2 < np.mean(normalised) < 2.0
 
 
-def test_reprojection_improves_by_the_optimisation(results: dict[str, MethodResult]) -> None:
+def test_reprojection_improves_by_the_optimisation(results):
     optimised = results["Opt"]
     assert optimised.reprojection_rmse_px is not None
     assert optimised.initial_reprojection_rmse_px is not None
     assert optimised.reprojection_rmse_px < 0.5 < 5.0 < optimised.initial_reprojection_rmse_px
 
 
-def test_the_naive_map_is_good_under_a_good_ipm_and_bad_under_a_bad_one(
-    scene: Scene, results: dict[str, MethodResult]
-) -> None:
+def test_the_naive_map_is_good_under_a_good_ipm_and_bad_under_a_bad_one(scene, results):
     _, calibrated_m = match(results["CNI"].hd_map, scene.markings, 2.0)
     _, estimated_m = match(results["ENI"].hd_map, scene.markings, 2.0)
     _, optimised_m = match(results["ONI"].hd_map, scene.markings, 2.0)
@@ -83,13 +83,13 @@ def test_the_naive_map_is_good_under_a_good_ipm_and_bad_under_a_bad_one(
     assert optimised_m < 1.2 * calibrated_m
 
 
-def test_each_exclusion_has_a_place_and_a_reason(results: dict[str, MethodResult]) -> None:
+def test_each_exclusion_has_a_place_and_a_reason(results):
     for exclusion in results["Opt"].excluded:
         assert np.isfinite(exclusion.position_map).all()
         assert exclusion.reason
 
 
-def test_lanes_follow_their_lines(scene: Scene, results: dict[str, MethodResult]) -> None:
+def test_lanes_follow_their_lines(scene, results):
     solid = next(lane for lane in scene.lanes if lane.kind == "lane_line").points_map
     mapped = np.concatenate(
         [lane.points_map for lane in results["Opt"].hd_map.lanes if lane.kind == "lane_line"]
@@ -99,7 +99,7 @@ def test_lanes_follow_their_lines(scene: Scene, results: dict[str, MethodResult]
     assert (distance.min(axis=0) < 0.3).mean() > 0.9
 
 
-def test_a_straight_street_with_one_camera_and_only_dashes_gives_the_yaw() -> None:
+def test_a_straight_street_with_one_camera_and_only_dashes_gives_the_yaw():
     street = make_scene(
         SceneOptions(length_m=90.0, turns=False, dashes_only=True, cameras=("front",), step_m=1.2, seed=22)
     )
@@ -110,35 +110,35 @@ def test_a_straight_street_with_one_camera_and_only_dashes_gives_the_yaw() -> No
     assert rotation_error_deg(estimate, street.cam_from_vehicle["front"]) < 0.08
 
 
-def test_a_camera_that_saw_nothing_keeps_its_extrinsic(scene: Scene) -> None:
+def test_a_camera_that_saw_nothing_keeps_its_extrinsic(scene):
     front_only = [found for found in scene.detections if scene.drive.images[found.image].camera == "front"]
     found = run_methods(scene.drive, front_only, ("front", "rear"))["Opt"]
     assert found.calibrations["rear"].covariance is None
     assert found.calibrations["front"].covariance is not None
 
 
-def test_a_drive_without_a_marking_says_so(scene: Scene) -> None:
+def test_a_drive_without_a_marking_says_so(scene):
     nothing = [replace(found, markings=()) for found in scene.detections]
     with pytest.raises(MappingError, match="no marking was found"):
         run_methods(scene.drive, nothing, ("front",))
 
 
-def test_markings_seen_once_each_say_so(scene: Scene) -> None:
+def test_markings_seen_once_each_say_so(scene):
     with pytest.raises(MappingError, match="two images"):
         run_methods(scene.drive, scene.detections[:2], ("front",))
 
 
-def test_an_unknown_camera_is_named(scene: Scene) -> None:
+def test_an_unknown_camera_is_named(scene):
     with pytest.raises(MappingError, match=r"'left'.*front, rear"):
         run_methods(scene.drive, scene.detections, ("left",))
 
 
-def test_an_option_out_of_range_is_named(scene: Scene) -> None:
+def test_an_option_out_of_range_is_named(scene):
     with pytest.raises(ConfigError, match=r"mapping\.max_range_m"):
         run_methods(scene.drive, scene.detections, ("front",), MappingOptions(max_range_m=0.0))
 
 
-def test_where_no_marking_lies_inside_the_regions_of_interest_the_naive_maps_are_empty(scene: Scene) -> None:
+def test_where_no_marking_lies_inside_the_regions_of_interest_the_naive_maps_are_empty(scene):
     tiny = np.array([[6.0, -0.05], [6.1, -0.05], [6.1, 0.05], [6.0, 0.05]])
     cameras = {
         name: replace(camera, roi_vehicle=tiny * np.sign(camera.roi_vehicle[:, 0].mean()))
@@ -147,3 +147,164 @@ def test_where_no_marking_lies_inside_the_regions_of_interest_the_naive_maps_are
     found = run_methods(replace(scene.drive, cameras=cameras), scene.detections, ("front", "rear"))
     assert [len(found[name].hd_map.markings) for name in ("CNI", "ENI", "ONI")] == [0, 0, 0]
     assert found["Opt"].hd_map.markings
+
+
+INCREMENTAL = MappingOptions(mode="incremental")
+
+
+def test_marking_by_marking_the_map_is_nearly_that_of_all_at_once():
+    scene = make_scene(SceneOptions(length_m=80.0, seed=21, hidden_corner_rate=0.0))
+    result = run_methods(scene.drive, scene.detections, ("front", "rear"), INCREMENTAL)["Opt"]
+    pairs, rmse_m = match(result.hd_map, scene.markings, MATCH_M)
+    assert len(pairs) == len(result.hd_map.markings)
+    assert len({b for _, b in pairs}) == len(pairs)
+    assert len(pairs) >= 0.9 * len(scene.markings)
+    assert rmse_m < 0.05
+    for name, truth in scene.cam_from_vehicle.items():
+        assert rotation_error_deg(result.calibrations[name].cam_from_vehicle, truth) < 0.1
+    assert all(np.all(np.isfinite(marking.covariance_m2)) for marking in result.hd_map.markings)
+
+
+def test_both_modes_say_the_same_of_themselves():
+    scene = make_scene(SceneOptions(length_m=50.0, seed=5))
+    batch, grown = (
+        run_methods(scene.drive, scene.detections, ("front", "rear"), options)["Opt"]
+        for options in (MappingOptions(), INCREMENTAL)
+    )
+    assert batch.reprojection_rmse_px is not None
+    assert grown.reprojection_rmse_px is not None
+    assert grown.reprojection_rmse_px == pytest.approx(batch.reprojection_rmse_px, rel=0.2)
+    assert grown.initial_reprojection_rmse_px == pytest.approx(batch.initial_reprojection_rmse_px, rel=0.2)
+    assert batch.diagnostics.keys() == grown.diagnostics.keys()
+    assert grown.diagnostics["observations"] == pytest.approx(batch.diagnostics["observations"], rel=0.1)
+    assert grown.diagnostics["chi2_per_dof"] == pytest.approx(1.0, abs=0.3)
+    assert grown.certainty.keys() == batch.certainty.keys() == {"front", "rear"}
+    for name, calibration in batch.calibrations.items():
+        assert calibration.covariance is not None
+        sigma, other = (
+            np.sqrt(np.diag(c)) for c in (calibration.covariance, grown.calibrations[name].covariance)
+        )
+        assert np.all(other < 1.6 * sigma)
+        assert np.all(other > 0.7 * sigma)
+    ours, theirs = (
+        np.median([marking.relative_sigma_m for marking in result.hd_map.markings])
+        for result in (grown, batch)
+    )
+    assert ours == pytest.approx(theirs, rel=0.3)
+    assert grown.evidence.held_out_loss is not None
+    assert grown.evidence.held_out_loss < 3.0
+    assert len(grown.evidence.score_tests) == len(batch.evidence.score_tests)
+    assert grown.poses is not None
+    assert grown.clocks[0].keys() == batch.clocks[0].keys()
+    assert not batch.growth
+    sizes = [len(markings) for markings in grown.growth]
+    assert len(sizes) >= 4
+    assert sizes[0] <= 2
+    assert sizes[:-1] == sorted(sizes[:-1])
+    assert grown.growth[-1] == grown.hd_map.markings
+
+
+def test_an_unknown_mode_is_refused():
+    scene = make_scene(SceneOptions(length_m=20.0, seed=1))
+    with pytest.raises(ConfigError, match=r"mapping.mode is 'online'; choose batch or incremental"):
+        run_methods(scene.drive, scene.detections, ("front",), replace(INCREMENTAL, mode="online"))
+
+
+def test_how_large_the_map_is_is_told_as_it_grows():
+    scene = make_scene(SceneOptions(length_m=80.0, seed=2))
+    told: list[str] = []
+    run_methods(scene.drive, scene.detections, ("front",), INCREMENTAL, told.append)
+    growing = [int(text.split()[3]) for text in told if text.startswith("linking anew with")]
+    assert len(growing) >= 2
+    assert growing == sorted(growing)
+    assert growing[0] >= 12
+
+
+class ByPost(InProcess):
+    """An executor to which all work is posted, as to another process; notes what it was."""
+
+    def __init__(self):
+        self.begun: list[str] = []
+
+    def begin(self, work):
+        self.begun.append(getattr(work, "func", work).__name__)
+        result = pickle.dumps(pickle.loads(pickle.dumps(work))())
+        return lambda: pickle.loads(result)
+
+
+def test_an_executor_links_each_visit_by_itself_and_the_map_is_the_same_to_the_last_bit(tmp_path):
+    options = SceneOptions(length_m=50.0, cameras=("front",), seed=21)
+    scenes = [make_scene(options), make_scene(replace(options, seed=22))]
+    drives = [replace(one.drive, name=str(n), root=tmp_path / str(n)) for n, one in enumerate(scenes)]
+    count = len(drives[0].images)
+    seen = [*scenes[0].detections, *(replace(d, image=d.image + count) for d in scenes[1].detections)]
+    given = join_drives(drives), seen, ("front",), MappingOptions(pose_model="heave")
+    executor = ByPost()
+    methods, together = run_methods(*given, executor=executor), run_methods(*given)
+    assert executor.begun.count("_link") >= 2 * 2
+    for name, one in methods.items():
+        assert repr(one.hd_map) == repr(together[name].hd_map), name
+    theirs, ours = ([one.corners_map for one in m["Opt"].hd_map.markings] for m in (together, methods))
+    np.testing.assert_array_equal(ours, theirs)
+
+
+CAMERAS = ("front", "rear")
+
+
+@pytest.fixture(scope="module")
+def short_scene():
+    return make_scene(SceneOptions(length_m=40.0, seed=21))
+
+
+@pytest.fixture(scope="module")
+def sightings(short_scene):
+    return collect_sightings(short_scene.drive, short_scene.detections, CAMERAS)
+
+
+def homographies(sightings, rig):
+    vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[sightings.frame])
+    cam_from_map = rig.cam_from_vehicle[sightings.camera] @ vehicle_from_map
+    return ipm.ground_from_pinhole_px(rig.intrinsic[sightings.camera], cam_from_map)
+
+
+def test_start_values_and_every_sighting_go_through_kornia(short_scene, sightings, monkeypatch):
+    mapped: set[tuple[float, float]] = set()
+    backward, started = [0], []
+    transform_points, compose = tensors.transform_points, tensors.Rt_to_matrix4x4
+    grad = torch.autograd.grad
+
+    def transforming(homography, points):
+        mapped.update(map(tuple, points.detach().reshape(-1, 2).tolist()))
+        return transform_points(homography, points)
+
+    def composing(rotation, translation):
+        started.append(len(rotation))
+        return compose(rotation, translation)
+
+    def differentiating(*args, **kwargs):
+        backward[0] += 1
+        return grad(*args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tensors, "transform_points", transforming)
+    monkeypatch.setattr(tensors, "Rt_to_matrix4x4", composing)
+    monkeypatch.setattr(torch.autograd, "grad", differentiating)
+    assert run_methods(short_scene.drive, short_scene.detections, CAMERAS)["Opt"].hd_map.markings
+    corners = sightings.corners_pinhole_px[np.isfinite(sightings.corners_pinhole_px).all(axis=2)]
+    assert {(float(u), float(v)) for u, v in corners} <= mapped
+    assert started == [len(CAMERAS)]
+    assert backward[0] >= 2
+
+
+def test_it_is_that_of_the_vehicle_to_a_nanometre(short_scene, sightings):
+    cameras = {name: short_scene.drive.cameras[name] for name in CAMERAS}
+    rig = initial_rig(cameras, sightings.map_from_vehicle)
+    start = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in cameras.values()]
+    np.testing.assert_allclose(rig.cam_from_vehicle, start, atol=1e-12)
+    located = locate(sightings, rig)
+    by_numpy = ipm.apply_in_front(homographies(sightings, rig), sightings.corners_pinhole_px)
+    np.testing.assert_allclose(located.corners_map[located.informs], by_numpy[located.informs], atol=1e-9)
+    jacobian = ipm.homography_jacobian(homographies(sightings, rig), sightings.corners_pinhole_px)
+    covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
+    np.testing.assert_allclose(
+        located.covariance_m2[located.informs], covariance[located.informs], rtol=1e-9, atol=1e-12
+    )

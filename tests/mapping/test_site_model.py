@@ -1,7 +1,5 @@
 """What a class has in common, and how often a place was seen, say what lies there and where."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,9 +7,9 @@ import pytest
 
 from v2hdm.association.groups import FusedGroups
 from v2hdm.site.candidates import Candidates, Counts, Dissent, with_dissent
-from v2hdm.site.markings import Classified, classify
+from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
-from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, PIECE, Posterior, posterior
+from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, PIECE, posterior
 from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
@@ -20,7 +18,7 @@ END = [1, 2]
 """Two corners of DASH at one end."""
 
 
-def painted(shapes: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+def painted(shapes, rng):
     """Markings (N, 4, 2) of these shapes, in a row, turned any way, beginning with any corner."""
     turn = rng.uniform(0, 2 * np.pi, len(shapes))
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
@@ -28,67 +26,69 @@ def painted(shapes: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.roll(one, int(rng.integers(4)), axis=0) for one in placed])
 
 
-def solved(true: np.ndarray, rng: np.random.Generator, sigma_m: float = 0.01) -> Candidates:
+def solved(true, rng, sigma_m=0.01):
     """The markings as a drive would map them: each corner off by ``sigma_m``, all of it by 2 cm more."""
     corners = true + 0.02 * rng.standard_normal((len(true), 1, 2)) + sigma_m * rng.standard_normal(true.shape)
     block = sigma_m**2 * np.eye(8) + 0.02**2 * np.kron(np.ones((4, 4)), np.eye(2))
     return Candidates(corners, np.tile(block, (len(true), 1, 1)))
 
 
-def well_seen(count: int) -> Counts:
+def row(seed, shapes, sigma_m=0.01):
+    """True markings in a row, and as a drive would map them."""
+    rng = np.random.default_rng(seed)
+    true = painted(shapes, rng)
+    return true, solved(true, rng, sigma_m)
+
+
+def well_seen(count):
     """Each place in ten images, in all of its easy views, and never as part of a symbol."""
     ten = np.full(count, 10)
     return Counts(ten, 4 * ten, 4 * ten, ten - 2, ten - 2, 0 * ten)
 
 
-def of_one_class(candidates: Candidates, counts: Counts | None = None) -> Posterior:
+def of_one_class(candidates, counts=None):
     return posterior(
         candidates, np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates))
     )
 
 
-def without(candidates: Candidates, place: int, corners: list[int]) -> Candidates:
+def without(candidates, place, corners):
     """The candidates, of which one has ``corners`` that nobody saw."""
     seen, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     seen[place, corners] = np.nan
     return Candidates.seen(seen, covariance)
 
 
-def shape_rmse(corners: np.ndarray, true: np.ndarray) -> float:
+def shape_rmse(corners, true):
     """Root mean square distance of corners, common shifts of a marking taken out."""
     error = corners - true
     return float(np.sqrt(np.mean(np.sum((error - error.mean(axis=1, keepdims=True)) ** 2, axis=2))))
 
 
-def normalised(found: Posterior, true: np.ndarray) -> np.ndarray:
+def normalised(found, true):
     """Squared errors (N,) of all eight coordinates, in the stated covariance."""
     error = (found.candidates.corners_map - true).reshape(-1, 8, 1)
     return (error.transpose(0, 2, 1) @ np.linalg.solve(found.candidates.covariance_m2, error))[:, 0, 0]
 
 
 @pytest.mark.parametrize("shape", [DIAMOND, DASH])
-def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape: np.ndarray) -> None:
-    rng = np.random.default_rng(0)
-    true = painted([shape] * 60, rng)
-    candidates = solved(true, rng, 0.02)
+def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape):
+    true, candidates = row(0, [shape] * 60, 0.02)
     found = of_one_class(candidates)
     assert shape_rmse(found.candidates.corners_map, true) < 0.7 * shape_rmse(candidates.corners_map, true)
     assert normalised(found, true).mean() / 8 < 1.1
     assert (found.log_odds > 5).all()
 
 
-def test_a_corner_that_nobody_saw_is_where_the_class_has_it() -> None:
-    rng = np.random.default_rng(1)
-    true = painted([DIAMOND] * 30, rng)
-    found = of_one_class(without(solved(true, rng), 4, [2]))
+def test_a_corner_that_nobody_saw_is_where_the_class_has_it():
+    true, candidates = row(1, [DIAMOND] * 30)
+    found = of_one_class(without(candidates, 4, [2]))
     assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
     assert normalised(found, true)[4] < 20
 
 
-def test_a_corner_on_a_known_line_is_found_along_it() -> None:
-    rng = np.random.default_rng(2)
-    true = painted([DASH] * 30, rng)
-    candidates = solved(true, rng)
+def test_a_corner_on_a_known_line_is_found_along_it():
+    true, candidates = row(2, [DASH] * 30)
     side = true[4, 1] - true[4, 0]
     long = [0, 1, 2, 3] if np.linalg.norm(side) > 1 else [1, 2, 3, 0]
     along = (true[4, long[1]] - true[4, long[0]]) / 3.0
@@ -101,16 +101,14 @@ def test_a_corner_on_a_known_line_is_found_along_it() -> None:
     assert found.probability[4, OF_CLASS] > 0.5
 
 
-def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it() -> None:
-    rng = np.random.default_rng(3)
-    true = painted([DIAMOND] * 40, rng)
-    candidates = solved(true, rng)
+def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it():
+    true, candidates = row(3, [DIAMOND] * 40)
     candidates.corners_map[7, 2] += 0.4 * (true[7, 2] - true[7].mean(axis=0))
     found = of_one_class(candidates)
     assert np.linalg.norm(found.candidates.corners_map[7] - true[7], axis=1).max() < 0.08
 
 
-def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_differ() -> None:
+def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_differ():
     rng = np.random.default_rng(4)
     lengths = [1.0] * 34 + [0.9, 0.92, 0.94, 1.06, 1.08, 1.1]
     true = painted([DASH * [length, 1.0] for length in lengths], rng)
@@ -120,10 +118,8 @@ def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_d
     assert (normalised(found, true) < 25).all()
 
 
-def test_a_worn_end_is_not_taken_for_the_end_of_the_paint() -> None:
-    rng = np.random.default_rng(5)
-    true = painted([DASH] * 60, rng)
-    candidates = solved(true, rng, 0.005)
+def test_a_worn_end_is_not_taken_for_the_end_of_the_paint():
+    true, candidates = row(5, [DASH] * 60, 0.005)
     for worn in (10, 20, 30, 40):
         k = int(np.argmax(np.linalg.norm(np.roll(true[worn], -1, axis=0) - true[worn], axis=1)))
         for corner, other in ((k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)):
@@ -134,7 +130,7 @@ def test_a_worn_end_is_not_taken_for_the_end_of_the_paint() -> None:
     assert (found.log_odds > 5).all()
 
 
-def moved_end(candidates: Candidates, place: int, along: float, slant: float = 0.0) -> None:
+def moved_end(candidates, place, along, slant=0.0):
     """Move one end of a dash outwards by ``along`` of its length, one of its corners by ``slant`` more."""
     corners = candidates.corners_map[place]
     k = int(np.argmax(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)))
@@ -142,28 +138,16 @@ def moved_end(candidates: Candidates, place: int, along: float, slant: float = 0
         corners[corner] += part * (corners[corner] - corners[other])
 
 
-def test_a_piece_of_a_dash_is_not_taken_for_a_short_dash() -> None:
-    rng = np.random.default_rng(15)
-    true = painted([DASH] * 30, rng)
-    candidates = solved(true, rng, 0.005)
-    moved_end(candidates, 12, -0.7)
+@pytest.mark.parametrize(("seed", "moved"), [(15, (-0.7, 0.0)), (16, (0.15, 0.04))])
+def test_a_piece_of_a_dash_is_no_short_dash_and_an_end_that_runs_on_into_a_stroke_is_no_end(seed, moved):
+    true, candidates = row(seed, [DASH] * 30, 0.005)
+    moved_end(candidates, 12, *moved)
     found = of_one_class(candidates)
     assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
-def test_an_end_that_runs_on_into_a_slanted_stroke_is_no_end() -> None:
-    rng = np.random.default_rng(16)
-    true = painted([DASH] * 30, rng)
-    candidates = solved(true, rng, 0.005)
-    moved_end(candidates, 12, 0.15, 0.04)
-    found = of_one_class(candidates)
-    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
-
-
-def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape() -> None:
-    rng = np.random.default_rng(17)
-    true = painted([DIAMOND] * 60, rng)
-    candidates = solved(true, rng, 0.01)
+def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape():
+    true, candidates = row(17, [DIAMOND] * 60, 0.01)
     shift = 0.1 * (true[12, 1] - true[12, 0])
     candidates.corners_map[12, 0] += shift
     candidates.corners_map[12, 2] -= shift
@@ -171,15 +155,14 @@ def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape() -> None:
     assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
-def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it() -> None:
-    rng = np.random.default_rng(6)
-    true = painted([DIAMOND] * 30, rng)
-    found = of_one_class(without(solved(true, rng), 4, [0, 1]))
+def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it():
+    _, candidates = row(6, [DIAMOND] * 30)
+    found = of_one_class(without(candidates, 4, [0, 1]))
     assert found.candidates.sigma_m[4].max() > 0.15
     assert found.candidates.sigma_m[[3, 5]].max() < 0.1
 
 
-def test_one_end_says_nothing_of_the_other_where_lengths_differ() -> None:
+def test_one_end_says_nothing_of_the_other_where_lengths_differ():
     rng = np.random.default_rng(7)
     true = painted([DASH * [(1.0, 0.8)[k % 2], 1.0] for k in range(40)], rng)
     ends = np.argsort(np.linalg.norm(true[4] - true[4, 0], axis=1))[2:].tolist()
@@ -187,7 +170,7 @@ def test_one_end_says_nothing_of_the_other_where_lengths_differ() -> None:
     assert found.candidates.sigma_m[4].max() > 0.15
 
 
-def test_a_class_may_have_several_shapes() -> None:
+def test_a_class_may_have_several_shapes():
     rng = np.random.default_rng(8)
     true = painted([DIAMOND * (1.0, 1.4)[k % 2] for k in range(40)], rng)
     shapes = learn_shapes(solved(true, rng))
@@ -195,10 +178,9 @@ def test_a_class_may_have_several_shapes() -> None:
     assert sum(shape.share for shape in shapes) == pytest.approx(1.0)
 
 
-def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelograms() -> None:
-    rng = np.random.default_rng(9)
-    true = painted([DIAMOND * rng.uniform(0.5, 2.0) for _ in range(12)], rng)
-    candidates = solved(true, rng, 0.02)
+def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelograms():
+    sizes = np.random.default_rng(8).uniform(0.5, 2.0, 12)
+    true, candidates = row(9, [DIAMOND * size for size in sizes], 0.02)
     found = of_one_class(candidates)
     corners = found.candidates.corners_map
     closure = corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]
@@ -207,30 +189,28 @@ def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelogr
     assert (found.log_odds > 3).all()
 
 
-def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it() -> None:
-    rng = np.random.default_rng(10)
-    candidates, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
+def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it():
+    (_, candidates), counts = row(10, [DIAMOND] * 40), well_seen(40)
     counts.found[7], counts.images[7] = 1, 3
     assert of_one_class(candidates, counts).log_odds[7] > 2
 
 
-def odd_and_seldom() -> tuple[Candidates, Counts]:
+def odd_and_seldom():
     """Forty candidates, of which number 7 is of no marking's shape and seen in three images of many."""
-    rng = np.random.default_rng(11)
-    candidates, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
-    candidates.corners_map[7] += rng.normal(0, 0.25, (4, 2))
+    (_, candidates), counts = row(11, [DIAMOND] * 40), well_seen(40)
+    candidates.corners_map[7] += np.random.default_rng(11).normal(0, 0.25, (4, 2))
     counts.found[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
     counts.observations[7], counts.agreeing[7] = 12, 8
     return candidates, counts
 
 
-def test_what_has_no_shape_and_is_seldom_found_is_clutter() -> None:
+def test_what_has_no_shape_and_is_seldom_found_is_clutter():
     found = of_one_class(*odd_and_seldom())
     assert found.probability[7, CLUTTER] > 0.8
     assert (np.delete(found.log_odds, 7) > 5).all()
 
 
-def test_what_many_images_show_as_an_arrow_is_part_of_one() -> None:
+def test_what_many_images_show_as_an_arrow_is_part_of_one():
     rng = np.random.default_rng(12)
     true = painted([DASH * [(0.6 if k == 7 else 1.0), 1.0] for k in range(40)], rng)
     counts = well_seen(40)
@@ -238,7 +218,7 @@ def test_what_many_images_show_as_an_arrow_is_part_of_one() -> None:
     assert of_one_class(solved(true, rng), counts).probability[7, PART_OF_SYMBOL] > 0.9
 
 
-def test_what_one_image_shows_as_an_arrow_stays_a_marking() -> None:
+def test_what_one_image_shows_as_an_arrow_stays_a_marking():
     rng = np.random.default_rng(13)
     counts = well_seen(40)
     counts.as_symbol[7] = 1
@@ -252,19 +232,19 @@ class Told:
     kind: np.ndarray
     known: Counts
 
-    def names(self) -> tuple[str, ...]:
+    def names(self):
         return ("diamond",) * len(self.kind)
 
-    def counts(self, corners_map: np.ndarray) -> Counts:
+    def counts(self, corners_map):
         return self.known
 
 
-def verdict(candidates: Candidates, counts: Counts | None = None) -> Classified:
+def verdict(candidates, counts=None):
     told = Told(np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates)))
     return classify(candidates, told, AcceptanceOptions())
 
 
-def test_reasons_name_what_has_won() -> None:
+def test_reasons_name_what_has_won():
     candidates, counts = odd_and_seldom()
     counts.as_symbol[3] = 40
     classified = verdict(without(candidates, 5, [0, 1, 2]), counts)
@@ -277,9 +257,8 @@ def test_reasons_name_what_has_won() -> None:
     assert [one.reason for one in classified.exclusions()] == list(reasons.values())
 
 
-def test_of_two_markings_on_one_spot_the_likelier_stays() -> None:
-    rng = np.random.default_rng(14)
-    candidates, counts = solved(painted([DIAMOND] * 20, rng), rng), well_seen(20)
+def test_of_two_markings_on_one_spot_the_likelier_stays():
+    (_, candidates), counts = row(14, [DIAMOND] * 20), well_seen(20)
     candidates.corners_map[2] = candidates.corners_map[1] + [0.1, 0.0]
     counts.images[2] = 4
     classified = verdict(candidates, counts)
@@ -287,23 +266,21 @@ def test_of_two_markings_on_one_spot_the_likelier_stays() -> None:
     assert classified.verdict[2] == "lies on a better supported marking"
 
 
-def test_a_shift_that_all_markings_share_speaks_against_none() -> None:
-    rng = np.random.default_rng(15)
-    candidates = solved(painted([DIAMOND] * 20, rng), rng)
+def test_a_shift_that_all_markings_share_speaks_against_none():
+    _, candidates = row(15, [DIAMOND] * 20)
     shared = replace(
         candidates, covariance_m2=candidates.covariance_m2 + 0.4**2 * np.kron(np.ones((4, 4)), np.eye(2))
     )
     assert not any(verdict(shared).verdict)
 
 
-def test_a_place_less_certain_than_allowed_is_left_out() -> None:
-    rng = np.random.default_rng(16)
-    candidates = solved(painted([DIAMOND] * 20, rng), rng)
+def test_a_place_less_certain_than_allowed_is_left_out():
+    _, candidates = row(16, [DIAMOND] * 20)
     candidates.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
     assert verdict(candidates).verdict[3] == "its position is too uncertain"
 
 
-def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diamond() -> None:
+def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diamond():
     rng = np.random.default_rng(16)
     true = painted([DIAMOND] * 40, rng)
     candidates = solved(true, rng)
@@ -315,7 +292,7 @@ def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diam
     assert normalised(found, true)[7] < 20
 
 
-def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first() -> None:
+def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first():
     rng = np.random.default_rng(17)
     true = painted([DIAMOND] * 40 + [0.7 * DIAMOND] * 12, rng)
     found = of_one_class(solved(true, rng))
@@ -323,7 +300,7 @@ def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first() -> None:
     assert shape_rmse(found.candidates.corners_map, true) < 0.02
 
 
-def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size() -> None:
+def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size():
     rng = np.random.default_rng(18)
     true = painted([DIAMOND] * 5, rng)
     candidates = solved(true, rng)
@@ -334,7 +311,7 @@ def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size() -> None
     assert (found.probability[[0, 1, 3, 4], OF_CLASS] > 0.8).all()
 
 
-def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict() -> None:
+def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
     rng = np.random.default_rng(19)
     true = painted([DASH] * 3, rng)
     candidates = solved(true, rng, 0.02)
@@ -355,7 +332,7 @@ def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict() ->
     np.testing.assert_allclose(added[[0, 2]], 0)
 
 
-def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen() -> None:
+def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen():
     unseen = np.full((1, 4, 2), np.nan)
     found = Candidates.seen(unseen, np.full((1, 8, 8), np.nan), np.array([[30.0, 4.0]]))
     np.testing.assert_array_equal(found.corners_map, np.broadcast_to([30.0, 4.0], (1, 4, 2)))

@@ -1,7 +1,5 @@
 """Edits of a file as QGIS makes them: in place, through the same OGR library, and maps to try formats on."""
 
-from __future__ import annotations
-
 import ctypes
 import warnings
 from pathlib import Path

@@ -1,19 +1,30 @@
-"""``v2hdm export``: what goes along, what comes back, and what a user may get wrong."""
+"""``v2hdm export``: calibrations in the forms of other tools, and what a user may get wrong."""
 
-from __future__ import annotations
+import xml.etree.ElementTree as ET
+from dataclasses import replace
 
-import subprocess
-import sys
-from pathlib import Path
-
+import cv2
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
-from tests.docs.blocks import ROOT, blocks
+from tests.docs.blocks import blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
 from v2hdm.cli.main import run
-from v2hdm.io.calibration import write_calibration
+from v2hdm.errors import MapFileError
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import exp
+from v2hdm.io.calibration import (
+    CALIBRATION_FORMATS,
+    Provenance,
+    read_calibration,
+    read_camera_info,
+    read_provenance,
+    write_calibration,
+    write_calibration_as,
+)
 from v2hdm.io.maps import read_geojson, read_geopackage_verdict
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
@@ -24,7 +35,7 @@ VERDICT = {"status": "PASS"}
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     write_geojson(street(), tmp_path / "map.geojson", VERDICT)
     write_geopackage(street(), tmp_path / "map.gpkg", VERDICT)
     write_calibration(Calibration(camera_info(), looking_forward()), tmp_path / "calibration_front.yaml")
@@ -32,18 +43,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_every_format_of_a_map_is_documented() -> None:
+def test_every_format_of_a_map_is_documented():
     exports = " ".join(block.text for block in blocks("docs/exports.md", "sh"))
     assert all(f"--format {name}" in exports for name in FORMATS)
     assert f"export=[{','.join(FORMATS)}]" in exports
 
 
-def test_the_verdict_goes_along(folder: Path) -> None:
+def test_the_verdict_goes_along(folder):
     assert run(["export", "map.geojson", "--format", "gpkg", "--output", "there"]) == 0
     assert read_geopackage_verdict(folder / "there" / "map.gpkg") == VERDICT
 
 
-def test_an_edited_geopackage_becomes_the_geojson_again(folder: Path) -> None:
+def test_an_edited_geopackage_becomes_the_geojson_again(folder):
     before = read_geojson(folder / "map.geojson")
     assert run(["export", "map.gpkg", "--format", "geojson"]) == 0
     after = read_geojson(folder / "map.geojson")
@@ -66,9 +77,7 @@ def test_an_edited_geopackage_becomes_the_geojson_again(folder: Path) -> None:
         (["map.geojson", "--format", "csv", "--output", "map.gpkg"], "cannot be written"),
     ],
 )
-def test_what_a_user_must_mend_is_one_line(
-    folder: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_user_must_mend_is_one_line(folder, arguments, message, capsys):
     assert run(["export", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
@@ -76,13 +85,130 @@ def test_what_a_user_must_mend_is_one_line(
     assert error.count("\n") == 1
 
 
-def test_without_its_package_a_format_is_one_line_that_names_the_extra(folder: Path) -> None:
-    (folder / "pyogrio.py").write_text('raise ModuleNotFoundError("not installed", name="pyogrio")')
-    arguments = [sys.executable, "-m", "v2hdm", "export", "map.geojson", "--format", "gpkg"]
-    done = subprocess.run(
-        arguments, cwd=folder, env={"PYTHONPATH": f"{folder}:{ROOT}"}, capture_output=True, text=True
+SIGMAS = [0.01, 0.02, 0.03, *np.radians([0.1, 0.2, 0.3])]
+MOVED = exp(np.array([0.1, -0.2, 0.3, 0.05, 0.3, -0.1]))
+CALIBRATION = Calibration(camera_info("front"), MOVED @ looking_forward(), np.diag(np.square(SIGMAS)))
+ABOUT = Provenance("yard: 7", "2026-05-04", "WARN")
+FORMS = list(CALIBRATION_FORMATS)
+
+
+def written(folder, form, calibration=CALIBRATION):
+    return write_calibration_as(form, calibration, ABOUT, folder, "front")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_tells_sigmas_drive_date_and_verdict(tmp_path, form):
+    lines = written(tmp_path, form).read_text(encoding="utf-8").splitlines()
+    told = yaml.safe_load("\n".join(line[2:] for line in lines if line.startswith("# ")))
+    assert told["camera_name"] == "front"
+    assert (told["drive"], str(told["date"]), told["verdict"]) == ("yard: 7", "2026-05-04", "WARN")
+    np.testing.assert_allclose(told["translation_sigma_m"], SIGMAS[:3])
+    np.testing.assert_allclose(told["rotation_sigma_deg"], np.degrees(SIGMAS[3:]))
+
+
+def test_camera_info_is_read_as_ros_does_and_as_a_drive_s(tmp_path):
+    path = written(tmp_path, "camera_info")
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for name, columns in (("camera", 3), ("projection", 4), ("rectification", 3)):
+        matrix = content[f"{name}_matrix"]
+        assert (matrix["rows"], matrix["cols"], len(matrix["data"])) == (3, columns, 3 * columns)
+    info = read_camera_info(path)
+    np.testing.assert_array_equal(info.intrinsic, CALIBRATION.info.intrinsic)
+    assert (info.name, info.distortion) == ("front", CALIBRATION.info.distortion)
+
+
+def test_a_static_transform_is_where_the_camera_sits_on_the_vehicle(tmp_path):
+    (one,) = yaml.safe_load(written(tmp_path, "static_transform").read_text())["transforms"]
+    assert (one["header"]["frame_id"], one["child_frame_id"]) == ("base_link", "front_optical_frame")
+    rotation = Rotation.from_quat([one["transform"]["rotation"][axis] for axis in "xyzw"]).as_matrix()
+    translation = [one["transform"]["translation"][axis] for axis in "xyz"]
+    assert_inverse(rotation, translation, CALIBRATION.cam_from_vehicle)
+
+
+def assert_inverse(rotation, translation, cam_from_vehicle):
+    vehicle_from_cam = np.linalg.inv(cam_from_vehicle)
+    np.testing.assert_allclose(rotation, vehicle_from_cam[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(np.array(translation), vehicle_from_cam[:3, 3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "cam_from_vehicle",
+    [
+        CALIBRATION.cam_from_vehicle,
+        looking_forward(),
+        np.diag([1.0, -1.0, -1.0, 1.0]),  # straight down
+        looking_forward(2.0, 0.0) @ exp(np.array([0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0])),  # on its side
+    ],
+    ids=["askew", "forward", "down", "on its side"],
+)
+def test_a_urdf_s_origin_is_where_the_camera_sits_on_the_vehicle(tmp_path, cam_from_vehicle):
+    path = written(tmp_path, "urdf", replace(CALIBRATION, cam_from_vehicle=cam_from_vehicle))
+    root = ET.parse(path).getroot()
+    (joint,) = root.findall("joint[@type='fixed']")
+    ends = [joint.find(side).get("link") for side in ("parent", "child")]  # type: ignore[union-attr]
+    assert ends == [link.get("name") for link in root.findall("link")] == ["base_link", "front_optical_frame"]
+    origin = joint.find("origin")
+    xyz, rpy = ([float(value) for value in origin.get(key, "").split()] for key in ("xyz", "rpy"))
+    assert_inverse(Rotation.from_euler("xyz", rpy).as_matrix(), xyz, cam_from_vehicle)
+
+
+def test_kalibr_has_the_same_pixels(tmp_path):
+    camera = yaml.safe_load(written(tmp_path, "kalibr").read_text())["cam0"]
+    np.testing.assert_array_equal(camera["T_cam_vehicle"], CALIBRATION.cam_from_vehicle)
+    fx, fy, cx, cy = camera["intrinsics"]
+    assert (camera["camera_model"], camera["distortion_model"]) == ("pinhole", "radtan")
+    assert camera["resolution"] == [64, 48]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    points = np.array([[0.3, 0.2, 1.0], [-0.2, 0.1, 1.0]])
+    got, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), matrix, np.array(camera["distortion_coeffs"])
     )
-    assert done.returncode == 2
-    assert done.stderr == (
-        "error: the format gpkg needs pyogrio: install the gis extra, pip install 'v2hdm[gis]'\n"
-    )
+    lens = np.array(CALIBRATION.info.distortion)
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CALIBRATION.info.intrinsic, lens)
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens", "named"),
+    [
+        ("plumb_bob", (-0.1, 0.02, 0.001, -0.001, 0.01), None),
+        ("rational_polynomial", (0.1, 0.02, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0), None),
+        ("equidistant", (0.01, 0.002, 0.0, 0.0), "equidistant"),
+    ],
+)
+def test_a_lens_that_kalibr_lacks_is_refused_in_one_line(tmp_path, model, lens, named):
+    info = replace(CALIBRATION.info, distortion_model=model, distortion=lens)
+    if named is not None:
+        text = written(tmp_path, "kalibr", replace(CALIBRATION, info=info)).read_text()
+        assert yaml.safe_load(text)["cam0"]["distortion_model"] == named
+        return
+    with pytest.raises(MapFileError, match="camera 'front': Kalibr has no lens") as caught:
+        written(tmp_path, "kalibr", replace(CALIBRATION, info=info))
+    assert "\n" not in str(caught.value)
+
+
+def test_opencv_reads_the_ipm_and_all_else(tmp_path):
+    storage = cv2.FileStorage(str(written(tmp_path, "opencv")), cv2.FileStorage_READ)
+    assert storage.isOpened()
+    assert storage.getNode("camera_name").string() == "front"
+    assert storage.getNode("image_width").real() == 64
+    info = CALIBRATION.info
+    for key, expected in (
+        ("camera_matrix", info.intrinsic),
+        ("distortion_coefficients", [info.distortion]),
+        ("cam_from_vehicle", CALIBRATION.cam_from_vehicle),
+        ("vehicle_from_pinhole_px", ipm_from_extrinsic(info, CALIBRATION.cam_from_vehicle)),
+        ("covariance", CALIBRATION.covariance),
+    ):
+        np.testing.assert_array_equal(storage.getNode(key).mat(), expected)
+    storage.release()
+
+
+def test_a_calibration_keeps_its_drive_and_date_in_its_file(tmp_path):
+    path = tmp_path / "calibration_front.yaml"
+    about = Provenance.today("yard", {"status": "PASS"})
+    write_calibration(CALIBRATION, path, verdict={"status": "PASS"}, about=about)
+    assert read_provenance(path) == about
+    np.testing.assert_array_equal(read_calibration(path).cam_from_vehicle, CALIBRATION.cam_from_vehicle)
+    write_calibration(CALIBRATION, path)
+    assert read_provenance(path) == Provenance()

@@ -1,7 +1,5 @@
 """Every export, read by a tool that is not ours, has the map's coordinates, heights, ids and covariances."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import sqlite3
@@ -11,7 +9,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import ezdxf
 import lanelet2
@@ -19,7 +16,6 @@ import numpy as np
 import pyogrio.raw
 import pytest
 import yaml
-from lanelet2.core import LaneletMap
 from lanelet2.projection import LocalCartesianProjector, UtmProjector
 
 from tests.maps.gis import ORIGIN, street
@@ -34,18 +30,18 @@ BOTH = pytest.mark.parametrize("origin", [ORIGIN, None])
 VERDICT = {"status": "PASS", "findings": []}
 
 
-def features(hd_map: HdMap) -> dict[int, Marking | Lane]:
+def features(hd_map):
     """By the ids that a file gives them: counted from 1, markings first."""
     return dict(enumerate([*hd_map.markings, *hd_map.lanes], start=1))
 
 
-def xyz(feature: Marking | Lane) -> np.ndarray:
+def xyz(feature):
     points = feature.corners_map if isinstance(feature, Marking) else feature.points_map
     heights = np.zeros(len(points)) if feature.heights_m is None else feature.heights_m
     return np.column_stack([points, heights])
 
 
-def ring(feature: Marking | Lane) -> np.ndarray:
+def ring(feature):
     """The points' order as written; of the map's markings the second one runs clockwise."""
     order = np.arange(len(xyz(feature)))
     if not isinstance(feature, Marking):
@@ -54,12 +50,12 @@ def ring(feature: Marking | Lane) -> np.ndarray:
     return order if x @ np.roll(y, -1) - y @ np.roll(x, -1) > 0 else order[::-1]
 
 
-def in_ring_order(covariance: np.ndarray, feature: Marking) -> np.ndarray:
+def in_ring_order(covariance, feature):
     order = np.stack([2 * ring(feature), 2 * ring(feature) + 1], axis=1).ravel()
     return covariance[np.ix_(order, order)]
 
 
-def to_map(positions: np.ndarray, origin: GeodeticOrigin | None) -> np.ndarray:
+def to_map(positions, origin):
     """Longitude, latitude and height in the map, by GeographicLib within lanelet2."""
     if origin is None:
         return positions
@@ -68,18 +64,18 @@ def to_map(positions: np.ndarray, origin: GeodeticOrigin | None) -> np.ndarray:
     return np.array([[place.x, place.y, place.z] for place in places])
 
 
-def cartesian(origin: GeodeticOrigin) -> LocalCartesianProjector:
+def cartesian(origin):
     place = lanelet2.io.Origin(origin.latitude_deg, origin.longitude_deg, origin.altitude_m)
     return LocalCartesianProjector(place)
 
 
-def exported(folder: Path, file_format: str, hd_map: HdMap, projector: str | None = None) -> Path:
+def exported(folder, file_format, hd_map, projector=None):
     (path,) = write_map(hd_map, folder, "map", [file_format], VERDICT, projector)
     return path
 
 
 @BOTH
-def test_geojson_is_read_by_gdal(tmp_path: Path, origin: GeodeticOrigin | None) -> None:
+def test_geojson_is_read_by_gdal(tmp_path, origin):
     hd_map = street(origin)
     meta, fids, geometry, columns = pyogrio.raw.read(exported(tmp_path, "geojson", hd_map), return_fids=True)
     assert fids.tolist() == list(range(1, 9))
@@ -92,7 +88,7 @@ def test_geojson_is_read_by_gdal(tmp_path: Path, origin: GeodeticOrigin | None) 
         )
 
 
-def from_wkb(wkb: bytes) -> np.ndarray:
+def from_wkb(wkb):
     """The points (N, 3) of a little-endian line or polygon of one ring with heights."""
     kind, count = struct.unpack_from("<II", wkb, 1)
     start = 9
@@ -106,9 +102,7 @@ def from_wkb(wkb: bytes) -> np.ndarray:
 
 @BOTH
 @pytest.mark.parametrize("with_heights", [True, False])
-def test_csv_has_every_point_with_its_covariance(
-    tmp_path: Path, origin: GeodeticOrigin | None, with_heights: bool
-) -> None:
+def test_csv_has_every_point_with_its_covariance(tmp_path, origin, with_heights):
     hd_map = street(origin, with_heights)
     with exported(tmp_path, "csv", hd_map).open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -136,7 +130,7 @@ def test_csv_has_every_point_with_its_covariance(
 
 
 @BOTH
-def test_a_geopackage_is_read_by_sqlite_alone(tmp_path: Path, origin: GeodeticOrigin | None) -> None:
+def test_a_geopackage_is_read_by_sqlite_alone(tmp_path, origin):
     hd_map = street(origin)
     data = sqlite3.connect(exported(tmp_path, "gpkg", hd_map))
     rows = data.execute("SELECT id, class, geom, covariance_m2 FROM markings").fetchall()
@@ -164,7 +158,7 @@ def test_a_geopackage_is_read_by_sqlite_alone(tmp_path: Path, origin: GeodeticOr
     data.close()
 
 
-def test_a_geopackage_brings_a_style_of_every_class_as_qgis_looks_for_it(tmp_path: Path) -> None:
+def test_a_geopackage_brings_a_style_of_every_class_as_qgis_looks_for_it(tmp_path):
     data = sqlite3.connect(exported(tmp_path, "gpkg", street()))
     rows = data.execute(
         "SELECT f_table_name, f_geometry_column, styleQML, useAsDefault FROM layer_styles"
@@ -184,7 +178,7 @@ def test_a_geopackage_brings_a_style_of_every_class_as_qgis_looks_for_it(tmp_pat
         assert {one.get("symbol") for one in categories} == symbols
 
 
-def test_a_dxf_is_read_by_gdal_and_holds_what_cad_does_not_know(tmp_path: Path) -> None:
+def test_a_dxf_is_read_by_gdal_and_holds_what_cad_does_not_know(tmp_path):
     hd_map = street()
     path = exported(tmp_path, "dxf", hd_map)
     meta, _, geometry, columns = pyogrio.raw.read(path)
@@ -206,15 +200,15 @@ def test_a_dxf_is_read_by_gdal_and_holds_what_cad_does_not_know(tmp_path: Path) 
             np.testing.assert_array_equal(matrix, in_ring_order(one.covariance_m2, one))
 
 
-def load(path: Path, origin: GeodeticOrigin | None) -> LaneletMap:
+def load(path, origin):
     return lanelet2.io.load(str(path), cartesian(origin or GeodeticOrigin(0.0, 0.0, 0.0)))
 
 
-def points_of(line: object) -> np.ndarray:
+def points_of(line):
     return np.array([[point.x, point.y, point.z] for point in line])  # type: ignore[attr-defined]
 
 
-def routing(loaded: LaneletMap) -> tuple[Any, Any]:
+def routing(loaded):
     rules = lanelet2.traffic_rules.create(
         lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
     )
@@ -222,9 +216,7 @@ def routing(loaded: LaneletMap) -> tuple[Any, Any]:
 
 
 @BOTH
-def test_every_marking_and_line_is_found_through_lanelet2(
-    tmp_path: Path, origin: GeodeticOrigin | None
-) -> None:
+def test_every_marking_and_line_is_found_through_lanelet2(tmp_path, origin):
     hd_map = street(origin)
     loaded = load(exported(tmp_path, "lanelet2", hd_map), origin)
     for number, one in features(hd_map).items():
@@ -253,9 +245,7 @@ def test_every_marking_and_line_is_found_through_lanelet2(
 
 
 @BOTH
-def test_heights_are_ellipsoidal_or_local_as_the_projector_says(
-    tmp_path: Path, origin: GeodeticOrigin | None
-) -> None:
+def test_heights_are_ellipsoidal_or_local_as_the_projector_says(tmp_path, origin):
     hd_map = street(origin)
     path = exported(tmp_path, "lanelet2", hd_map)
     z = np.concatenate([points_of(one)[:, 2] for one in load(path, origin).polygonLayer])
@@ -272,11 +262,11 @@ def test_heights_are_ellipsoidal_or_local_as_the_projector_says(
         assert info["map_origin"]["longitude"] == origin.longitude_deg
 
 
-def nodes(path: Path) -> list[ET.Element]:
+def nodes(path):
     return ET.parse(path).getroot().findall("node")
 
 
-def test_a_stop_line_has_the_regulatory_element_that_the_map_validator_asks_for(tmp_path: Path) -> None:
+def test_a_stop_line_has_the_regulatory_element_that_the_map_validator_asks_for(tmp_path):
     hd_map = street()
     loaded = load(exported(tmp_path, "lanelet2", hd_map), ORIGIN)
     (rule,) = loaded.regulatoryElementLayer
@@ -295,7 +285,7 @@ def test_a_stop_line_has_the_regulatory_element_that_the_map_validator_asks_for(
     assert lanelet.rightBound.attributes["subtype"] == "solid"
 
 
-def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_path: Path) -> None:
+def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_path):
     loaded = load(exported(tmp_path, "lanelet2", street()), ORIGIN)
     assert len(loaded.laneletLayer) == 2
     rules, graph = routing(loaded)
@@ -311,7 +301,7 @@ def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_pat
         assert points_of(lanelet.centerline)[-1, 0] > points_of(lanelet.centerline)[0, 0] + 20
 
 
-def test_lanelet2_ids_are_positive_unique_and_stay_when_another_feature_goes(tmp_path: Path) -> None:
+def test_lanelet2_ids_are_positive_unique_and_stay_when_another_feature_goes(tmp_path):
     hd_map = street()
     known = HdMap(
         tuple(replace(one, id=k + 1) for k, one in enumerate(hd_map.markings)),
@@ -325,7 +315,7 @@ def test_lanelet2_ids_are_positive_unique_and_stay_when_another_feature_goes(tmp
     assert all(before[key] == text for key, text in after.items())
 
 
-def identified(path: Path) -> dict[int, bytes]:
+def identified(path):
     """Every primitive of an OSM file by its id."""
     root = ET.parse(path).getroot()
     assert root[0].tag == "MetaInfo"
@@ -336,7 +326,7 @@ def identified(path: Path) -> dict[int, bytes]:
     return by_id
 
 
-def test_mgrs_coordinates_are_those_of_utm_within_the_square(tmp_path: Path) -> None:
+def test_mgrs_coordinates_are_those_of_utm_within_the_square(tmp_path):
     hd_map = street()
     path = exported(tmp_path, "lanelet2", hd_map, "MGRS")
     assert yaml.safe_load(path.with_name("map_projector_info.yaml").read_text()) == {
@@ -368,15 +358,13 @@ def test_mgrs_coordinates_are_those_of_utm_within_the_square(tmp_path: Path) -> 
         (78.2, 15.6, "33XWG", (13697, 80760)),  # Svalbard
     ],
 )
-def test_places_of_the_world_are_in_their_grid_squares(
-    latitude_deg: float, longitude_deg: float, square: str, metres: tuple[int, int]
-) -> None:
-    found = grid_places(np.array([longitude_deg]), np.array([latitude_deg]))
-    assert found.square == square
-    np.testing.assert_allclose(found.local, [metres], atol=1.0)
+def test_places_of_the_world_are_in_their_grid_squares(latitude_deg, longitude_deg, square, metres):
+    found, local = grid_places(np.array([longitude_deg]), np.array([latitude_deg]))
+    assert found == square
+    np.testing.assert_allclose(local, [metres], atol=1.0)
 
 
-def test_an_mgrs_projector_across_grid_squares_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_an_mgrs_projector_across_grid_squares_is_refused_in_one_line(tmp_path):
     # The equator is a border between rows.
     hd_map = street(GeodeticOrigin(0.0, 9.5, 0.0))
     with pytest.raises(ConfigError, match="spans the MGRS squares 32MNE, 32NNF, and") as caught:
@@ -394,17 +382,15 @@ def test_an_mgrs_projector_across_grid_squares_is_refused_in_one_line(tmp_path: 
         (GeodeticOrigin(85.0, 0.0, 0.0), "MGRS", "MGRS ends at"),
     ],
 )
-def test_a_projector_that_does_not_suit_the_map_is_refused(
-    tmp_path: Path, origin: GeodeticOrigin | None, projector: str, message: str
-) -> None:
+def test_a_projector_that_does_not_suit_the_map_is_refused(tmp_path, origin, projector, message):
     with pytest.raises(ConfigError, match=message):
         exported(tmp_path, "lanelet2", street(origin), projector)
 
 
-def test_lines_bound_a_lane_where_a_truck_but_not_two_fit_between_them() -> None:
+def test_lines_bound_a_lane_where_a_truck_but_not_two_fit_between_them():
     x = np.arange(0.0, 40.0, 0.5)
 
-    def line(y: float, order: int = 1) -> np.ndarray:
+    def line(y, order=1):
         return np.column_stack([x, np.full(len(x), y)])[::order]
 
     assert not closed_lanes([line(0.0), line(2.0)])
@@ -420,9 +406,7 @@ def test_lines_bound_a_lane_where_a_truck_but_not_two_fit_between_them() -> None
     assert len(closed_lanes([line(0.0), line(3.5), across])) == 1
 
 
-def test_a_map_without_an_origin_says_that_a_gis_takes_it_for_degrees(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_map_without_an_origin_says_that_a_gis_takes_it_for_degrees(tmp_path, caplog):
     write_map(street(None), tmp_path, "map", ["geojson", "gpkg"])
     assert [record.levelname for record in caplog.records if record.name.startswith("v2hdm")] == ["WARNING"]
     assert "map.geojson: the drive has no origin" in caplog.text
@@ -432,25 +416,23 @@ def test_a_map_without_an_origin_says_that_a_gis_takes_it_for_degrees(
 
 
 @pytest.mark.parametrize(("file_format", "package"), [("gpkg", "pyogrio"), ("dxf", "ezdxf")])
-def test_a_package_that_is_not_installed_is_one_line_that_names_the_extra(
-    file_format: str, package: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_that_is_not_installed_is_one_line_that_names_the_extra(file_format, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ConfigError, match=rf"{file_format} needs {package}: .*v2hdm\[gis\]"):
         check_formats([file_format], "export")
 
 
-def test_an_unknown_format_is_refused_by_name() -> None:
+def test_an_unknown_format_is_refused_by_name():
     with pytest.raises(ConfigError, match="export: unknown format 'shp'; choose from: geojson, csv"):
         check_formats(["geojson", "shp"], "export")
 
 
 @pytest.mark.parametrize("file_format", list(FORMATS))
-def test_an_empty_map_can_be_written(tmp_path: Path, file_format: str) -> None:
+def test_an_empty_map_can_be_written(tmp_path, file_format):
     assert exported(tmp_path, file_format, HdMap((), (), ORIGIN)).is_file()
 
 
-def test_classes_of_ones_own_with_signs_in_their_names_are_written(tmp_path: Path) -> None:
+def test_classes_of_ones_own_with_signs_in_their_names_are_written(tmp_path):
     marking = replace(street().markings[0], kind='pad <&"/ 7>', covariance_m2=None, relative_sigma_m=None)
     names: dict[str, Callable[[Path], str]] = {
         "dxf": lambda path: next(iter(ezdxf.readfile(path).modelspace())).dxf.layer,
@@ -461,8 +443,8 @@ def test_classes_of_ones_own_with_signs_in_their_names_are_written(tmp_path: Pat
         assert name(path).startswith("pad ")
 
 
-def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(tmp_path: Path) -> None:
-    def line(kind: str, y: float, begin: float) -> Lane:
+def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(tmp_path):
+    def line(kind, y, begin):
         x = np.arange(begin, 60.0, 0.37)
         return Lane(kind, np.column_stack([x, np.full(len(x), y)]), 3)
 
@@ -476,6 +458,5 @@ def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(
     assert graph.left(beside).id == begun.id
     assert graph.right(begun).id == beside.id
     route = graph.getRoute(before, begun)
-    assert route is not None
     assert [one.id for one in route.shortestPath()] == [before.id, beside.id, begun.id]
     assert before.leftBound[-1].id == beside.leftBound[0].id

@@ -1,7 +1,6 @@
-from __future__ import annotations
+"""Maps and calibrations survive their files, with residuals, exclusions, verdict and clocks beside them."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pyproj
@@ -14,14 +13,23 @@ from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.io.calibration import read_calibration, write_calibration
-from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, with_heights, write_geojson
-from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
+from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, read_verdict, with_heights, write_geojson
+from v2hdm.io.maps.evidence import (
+    ExcludedMarking,
+    Residuals,
+    read_exclusions,
+    read_residuals,
+    write_exclusions,
+    write_residuals,
+)
+from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
+from v2hdm.store.files import load_yaml
 
 LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)
 
 
 @given(LATITUDES, LONGITUDES, st.floats(-400, 4000))
-def test_enu_agrees_with_pyproj_and_returns(latitude: float, longitude: float, altitude: float) -> None:
+def test_enu_agrees_with_pyproj_and_returns(latitude, longitude, altitude):
     origin = GeodeticOrigin(latitude, longitude, altitude)
     points = np.random.default_rng(0).uniform(-3000, 3000, (50, 3)) * [1, 1, 0.05]
     degrees = geodetic_from_enu(origin, points)
@@ -34,7 +42,7 @@ def test_enu_agrees_with_pyproj_and_returns(latitude: float, longitude: float, a
     np.testing.assert_allclose(expected, points, atol=1e-6)
 
 
-def assert_same(got: HdMap, expected: HdMap) -> None:
+def assert_same(got, expected):
     assert got.origin == expected.origin
     assert len(got.markings) == len(expected.markings)
     for a, b in zip(got.markings, expected.markings, strict=True):
@@ -51,7 +59,7 @@ def assert_same(got: HdMap, expected: HdMap) -> None:
 
 
 @pytest.mark.parametrize("origin", [None, ORIGIN])
-def test_symbols_survive_their_file_and_are_polygons(tmp_path: Path, origin: GeodeticOrigin | None) -> None:
+def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
     outline = np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]])
     symbols = (
         Symbol("parking_t", outline, 5, 0.013, np.array([0.1, 0.2, 0.3])),
@@ -72,7 +80,7 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path: Path, origin: Geo
 
 
 @pytest.mark.parametrize("ending", ["csv", "gpkg", "dxf", "osm"])
-def test_every_format_holds_a_symbol_of_three_corners(tmp_path: Path, ending: str) -> None:
+def test_every_format_holds_a_symbol_of_three_corners(tmp_path, ending):
     symbol = Symbol("parking_t", np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]]), 5, 0.013)
     hd_map = HdMap((), (), ORIGIN, (symbol,))
     file_format = {"osm": "lanelet2"}.get(ending, ending)
@@ -88,19 +96,19 @@ def test_every_format_holds_a_symbol_of_three_corners(tmp_path: Path, ending: st
 
 
 @pytest.mark.parametrize("origin", [None, ORIGIN])
-def test_a_map_survives_its_file_to_the_last_bit(tmp_path: Path, origin: GeodeticOrigin | None) -> None:
+def test_a_map_survives_its_file_to_the_last_bit(tmp_path, origin):
     hd_map = HdMap(make_map().markings, make_map().lanes, origin)
     write_geojson(hd_map, tmp_path / "map.geojson")
     assert_same(read_geojson(tmp_path / "map.geojson"), hd_map)
 
 
-def test_an_empty_map_is_a_map(tmp_path: Path) -> None:
+def test_an_empty_map_is_a_map(tmp_path):
     write_geojson(HdMap(()), tmp_path / "map.geojson")
     assert_same(read_geojson(tmp_path / "map.geojson"), HdMap(()))
 
 
 @pytest.mark.parametrize("turn", [1, -1])
-def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path: Path, turn: int) -> None:
+def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path, turn):
     corners = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])[::turn]
     write_geojson(HdMap((Marking("diamond", corners, 3),), (), ORIGIN), tmp_path / "map.geojson")
     geometry = json.loads((tmp_path / "map.geojson").read_text())["features"][0]["geometry"]
@@ -112,7 +120,7 @@ def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path
     assert x[:-1] @ y[1:] - y[:-1] @ x[1:] > 0
 
 
-def test_coordinates_are_longitude_and_latitude_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
+def test_coordinates_are_longitude_and_latitude_to_a_tenth_of_a_millimetre(tmp_path):
     write_geojson(make_map(), tmp_path / "map.geojson")
     feature = json.loads((tmp_path / "map.geojson").read_text())["features"][-1]
     lon, lat, height_m = np.array(feature["geometry"]["coordinates"]).T
@@ -122,9 +130,7 @@ def test_coordinates_are_longitude_and_latitude_to_a_tenth_of_a_millimetre(tmp_p
 
 
 @pytest.mark.parametrize(("origin", "above_m"), [(None, 0.0), (ORIGIN, ORIGIN.altitude_m)])
-def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(
-    tmp_path: Path, origin: GeodeticOrigin | None, above_m: float
-) -> None:
+def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(tmp_path, origin, above_m):
     stations = np.column_stack([np.arange(-20.0, 21.0), np.zeros(41)])
     road = Road(stations, 2.0 + 0.05 * stations[:, 0], np.tile([0.05, 0.02], (41, 1)))
     corners = np.array([[0.0, 1.0], [0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])
@@ -143,12 +149,12 @@ def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(
     assert_same(read_geojson(tmp_path / "map.geojson"), hd_map)
 
 
-def test_local_metres_say_that_they_are_not_degrees(tmp_path: Path) -> None:
+def test_local_metres_say_that_they_are_not_degrees(tmp_path):
     write_geojson(HdMap(make_map().markings), tmp_path / "map.geojson")
     assert "metres" in json.loads((tmp_path / "map.geojson").read_text())["v2hdm"]["coordinates"]
 
 
-def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path):
     path = tmp_path / "map.geojson"
     write_geojson(make_map(), path)
     broken = HdMap((Marking("diamond", np.full((4, 2), np.nan), 3),))
@@ -158,7 +164,7 @@ def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.geojson"]
 
 
-def damaged_map(origin: object = None, **properties: object) -> str:
+def damaged_map(origin=None, **properties):
     """A map of one marking with properties that are wrong."""
     right = {"class": "diamond", "sightings": 3, "corners_map": [[0, 0], [1, 0], [1, 1], [0, 1]]}
     features = [{"properties": right | properties}]
@@ -174,10 +180,7 @@ def damaged_map(origin: object = None, **properties: object) -> str:
         ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither a geometry nor 'corn"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
-        (
-            damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}),
-            "origin, latitude_deg",
-        ),
+        (damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}), "origin, latitude"),
         (damaged_map(origin={"latitude_deg": 91, "longitude_deg": 1, "altitude_m": 1}), "latitude must lie"),
         (damaged_map(heights_m=[1.0, 2.0]), "feature 0, heights_m"),
         (damaged_map(sightings=1.5), "feature 0, sightings: expected a whole number"),
@@ -195,19 +198,19 @@ def damaged_map(origin: object = None, **properties: object) -> str:
         ),
     ],
 )
-def test_a_damaged_map_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_a_damaged_map_is_refused(tmp_path, text, message):
     (tmp_path / "map.geojson").write_text(text)
     with pytest.raises(MapFileError, match=message):
         read_geojson(tmp_path / "map.geojson")
 
 
-def test_a_missing_map_is_named(tmp_path: Path) -> None:
+def test_a_missing_map_is_named(tmp_path):
     with pytest.raises(MapFileError, match="no such file"):
         read_geojson(tmp_path / "map.geojson")
 
 
 @pytest.mark.parametrize("with_covariance", [True, False])
-def test_a_calibration_survives_its_file(tmp_path: Path, with_covariance: bool) -> None:
+def test_a_calibration_survives_its_file(tmp_path, with_covariance):
     half = np.random.default_rng(2).normal(size=(6, 6))
     written = Calibration(camera_info(), looking_forward(), half @ half.T if with_covariance else None)
     write_calibration(written, tmp_path / "front.yaml")
@@ -220,7 +223,7 @@ def test_a_calibration_survives_its_file(tmp_path: Path, with_covariance: bool) 
         np.testing.assert_array_equal(got.covariance, half @ half.T)
 
 
-def test_sigmas_are_written_in_metres_and_degrees(tmp_path: Path) -> None:
+def test_sigmas_are_written_in_metres_and_degrees(tmp_path):
     covariance = np.diag(np.square([0.01, 0.02, 0.03, *np.radians([0.1, 0.2, 0.3])]))
     write_calibration(Calibration(camera_info(), looking_forward(), covariance), tmp_path / "front.yaml")
     text = (tmp_path / "front.yaml").read_text()
@@ -228,7 +231,7 @@ def test_sigmas_are_written_in_metres_and_degrees(tmp_path: Path) -> None:
     assert "rotation_sigma_deg: [0.1" in text
 
 
-def test_a_calibration_with_a_typo_is_refused(tmp_path: Path) -> None:
+def test_a_calibration_with_a_typo_is_refused(tmp_path):
     write_calibration(Calibration(camera_info(), looking_forward()), tmp_path / "front.yaml")
     text = (tmp_path / "front.yaml").read_text().replace("camera_matrix", "camera_matriks")
     (tmp_path / "front.yaml").write_text(text)
@@ -241,7 +244,7 @@ def test_a_calibration_with_a_typo_is_refused(tmp_path: Path) -> None:
     [-np.eye(6), np.eye(6) + np.eye(6, k=1) / 2, np.eye(6) + 2 * (np.eye(6, k=1) + np.eye(6, k=-1))],
     ids=["negative", "not symmetric", "correlated by more than 1"],
 )
-def test_what_is_no_covariance_is_refused(tmp_path: Path, wrong: np.ndarray) -> None:
+def test_what_is_no_covariance_is_refused(tmp_path, wrong):
     path = tmp_path / "front.yaml"
     write_calibration(Calibration(camera_info(), looking_forward(), np.eye(6)), path)
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -261,12 +264,111 @@ def test_what_is_no_covariance_is_refused(tmp_path: Path, wrong: np.ndarray) -> 
         ("distortion_coefficients", [-0.9, 0, 0, 0, 0], "this lens folds over itself"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_by_name(
-    tmp_path: Path, key: str, wrong: object, message: str
-) -> None:
+def test_a_camera_that_cannot_be_is_refused_by_name(tmp_path, key, wrong, message):
     path = tmp_path / "front.yaml"
     write_calibration(Calibration(camera_info(), looking_forward()), path)
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     path.write_text(yaml.safe_dump(content | {key: wrong}), encoding="utf-8")
     with pytest.raises(MapFileError, match=f"front.yaml: .*{message}"):
         read_calibration(path)
+
+
+def some_residuals():
+    random = np.random.default_rng(4)
+    return Residuals(
+        image=("front/a, b.png", 'rear/"c".png'),
+        camera=("front", "rear"),
+        taken_s=np.array([10.25, 11.5]),
+        row_image=np.array([0, 0, 1]),
+        marking=np.array([3, 0, 12]),
+        corner=np.array([0, 3, 1]),
+        is_point=np.array([True, False, True]),
+        observed_px=np.round(random.uniform(0, 1000, (3, 2)), 3),
+        residual_px=np.round(random.normal(0, 0.3, (3, 2)), 4),
+        distance_sigma=np.array([0.5, 1.25, 2.0]),
+    )
+
+
+def test_residuals_are_read_back_as_written(tmp_path):
+    written = some_residuals()
+    write_residuals(written, tmp_path / "residuals.csv")
+    read = read_residuals(tmp_path / "residuals.csv")
+    for name, value in vars(written).items():
+        np.testing.assert_array_equal(getattr(read, name), value, err_msg=name)
+    assert len(read) == 3
+
+
+@pytest.mark.parametrize("line", ["front/x.png,front,1.0,2,1", "front/x.png,front,late,2,1,1,0,0,0,0,0"])
+def test_a_damaged_line_is_named(line, tmp_path):
+    path = tmp_path / "residuals.csv"
+    write_residuals(some_residuals(), path)
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(MapFileError, match="line 5"):
+        read_residuals(path)
+
+
+@pytest.mark.parametrize("origin", [None, GeodeticOrigin(53.5, 9.9, 40.0)])
+def test_exclusions_are_read_back_as_written(origin, tmp_path):
+    written = [ExcludedMarking("diamond", np.array([1.25, -3.5]), 4, "its position is too uncertain", "both")]
+    write_exclusions(written, tmp_path / "excluded.geojson", origin, None)
+    (read,) = read_exclusions(tmp_path / "excluded.geojson")
+    np.testing.assert_array_equal(read.position_map, written[0].position_map)
+    assert (read.kind, read.sightings, read.reason, read.cameras) == (
+        "diamond", 4, "its position is too uncertain", "both",
+    )  # fmt: skip
+
+
+def test_exclusions_without_a_place_are_refused(tmp_path):
+    (tmp_path / "excluded.geojson").write_text('{"features": [{"properties": {"class": "diamond"}}]}')
+    with pytest.raises(MapFileError, match="feature 0"):
+        read_exclusions(tmp_path / "excluded.geojson")
+
+
+VERDICT = {"status": "WARN", "findings": [{"check": "clock", "says": "late"}], "passed": []}
+MAP = HdMap((Marking("diamond", np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 3),))
+CALIBRATION = Calibration(CameraInfo("front", 640, 480, np.diag([500.0, 500.0, 1.0])), np.eye(4))
+
+
+def test_a_map_keeps_the_verdict_on_it(tmp_path):
+    write_geojson(MAP, tmp_path / "map.geojson", VERDICT)
+    assert read_verdict(tmp_path / "map.geojson") == VERDICT
+    np.testing.assert_array_equal(
+        read_geojson(tmp_path / "map.geojson").markings[0].corners_map, MAP.markings[0].corners_map
+    )
+
+
+def test_a_map_without_a_verdict_has_none(tmp_path):
+    write_geojson(MAP, tmp_path / "map.geojson")
+    assert read_verdict(tmp_path / "map.geojson") is None
+
+
+@pytest.mark.parametrize(("sigma_s", "known"), [(0.001, True), (float("inf"), False)])
+def test_a_calibration_says_the_clock_and_the_verdict(tmp_path, sigma_s, known):
+    calibration = Calibration(CALIBRATION.info, _looking_down())
+    path = tmp_path / "front.yaml"
+    write_calibration(calibration, path, clock_s=(0.06, sigma_s), verdict=VERDICT)
+    content = load_yaml(path, MapFileError)
+    assert content["clock_offset_s"] == 0.06
+    assert ("clock_sigma_s" in content) is known
+    assert content["verdict"] == VERDICT
+    np.testing.assert_allclose(read_calibration(path).cam_from_vehicle, _looking_down())
+
+
+def test_what_was_left_out_is_a_point_with_its_reason(tmp_path):
+    one = ExcludedMarking("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
+    road = Road(np.array([[3.0, 4.0]]), np.array([46.2]), np.zeros((1, 2)))
+    write_exclusions([one], tmp_path / "excluded.geojson", None, road)
+    (feature,) = json.loads((tmp_path / "excluded.geojson").read_text())["features"]
+    assert feature["geometry"] == {"type": "Point", "coordinates": [3.0, 4.0, 46.2]}
+    assert feature["properties"]["reason"] == "seen once"
+    assert feature["properties"]["cameras"] == "front"
+    write_exclusions([one], tmp_path / "wgs.geojson", GeodeticOrigin(48.0, 11.0, 500.0), None)
+    (feature,) = json.loads((tmp_path / "wgs.geojson").read_text())["features"]
+    assert feature["geometry"]["coordinates"][:2] == pytest.approx([11.0, 48.0], abs=1e-3)
+
+
+def _looking_down():
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+    matrix[2, 3] = 2.0
+    return matrix

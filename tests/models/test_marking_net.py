@@ -1,17 +1,15 @@
 """The network's shapes and the exact rearrangements inside it."""
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from models import MarkingNet, NetConfig
-from models.marking_net import _channels_last_tiles, _depth_to_space, _space_to_depth
 from v2hdm.catalogue import PAINT_CLASSES
 
 
 @pytest.fixture(scope="module")
-def net() -> MarkingNet:
+def net():
     """A network whose normalisations have seen something."""
     torch.manual_seed(0)
     net = MarkingNet(NetConfig(widths=[16, 16, 16, 16]))
@@ -22,14 +20,12 @@ def net() -> MarkingNet:
     return net.eval()
 
 
-def random_images(*shape: int) -> torch.Tensor:
+def random_images(*shape):
     return torch.randint(0, 256, (*shape, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
 
 
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 16, 16), (2, 48, 80), (1, 208, 1232)])
-def test_every_output_covers_the_image_at_its_stride(
-    net: MarkingNet, batch: int, height: int, width: int
-) -> None:
+def test_every_output_covers_the_image_at_its_stride(net, batch, height, width):
     with torch.inference_mode():
         paint, kinds, lanes = net(random_images(batch, height, width))
     assert paint.shape == (batch, 1, height // 2, width // 2)
@@ -39,7 +35,7 @@ def test_every_output_covers_the_image_at_its_stride(
 
 
 @pytest.mark.parametrize("config", [NetConfig(separable=True), NetConfig(lanes=False)])
-def test_the_switches_leave_the_outputs_as_they_are_shaped(config: NetConfig) -> None:
+def test_the_switches_leave_the_outputs_as_they_are_shaped(config):
     with torch.inference_mode():
         prediction = MarkingNet(config).eval()(random_images(1, 32, 48))
     assert prediction.lanes.shape == (1, 2, 4, 6)
@@ -47,7 +43,7 @@ def test_the_switches_leave_the_outputs_as_they_are_shaped(config: NetConfig) ->
         assert (prediction.lanes < 0).all(), "a network without lanes finds none"
 
 
-def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
+def test_folding_the_normalisations_leaves_the_function_as_it_is():
     torch.manual_seed(3)
     net = MarkingNet()
     net.train()
@@ -62,29 +58,7 @@ def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
 
 
-def test_the_stem_keeps_every_pixel_of_a_tile_as_a_channel() -> None:
-    image = random_images(2, 8, 12)
-    channels = _space_to_depth(image) * 64.0 + 112.0
-    for row, column, colour in ((0, 0, 0), (3, 1, 2), (2, 3, 1)):
-        channel = (row * 4 + column) * 3 + colour
-        np.testing.assert_allclose(
-            channels[:, channel], image[:, row::4, column::4, colour].float(), atol=1e-4
-        )
-
-
-def test_the_tiles_of_a_training_are_those_of_the_vehicle() -> None:
-    image = random_images(2, 8, 12)
-    tiles = _channels_last_tiles(image)
-    torch.testing.assert_close(tiles, _space_to_depth(image))
-    assert tiles.is_contiguous(memory_format=torch.channels_last)
-
-
-def test_depth_to_space_is_pixel_shuffle() -> None:
-    x = torch.randn(2, 12, 3, 5)
-    assert torch.equal(_depth_to_space(x), torch.pixel_shuffle(x, 2))
-
-
-def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net: MarkingNet) -> None:
+def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net):
     images = random_images(2, 32, 32)
     changed = images.clone()
     changed[1] = 255 - changed[1]

@@ -3,14 +3,13 @@
 The images are made pixel by pixel from the ground, the other way round than the mosaic is.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px, ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse
@@ -52,12 +51,7 @@ SQUARES = [
 
 def cam_from_vehicle() -> FloatArray:
     """The camera 2.2 m above the ground, 1.5 m ahead of the axle, 20 degrees down."""
-    tilt = np.radians(20.0)
-    forward, down = np.array([np.cos(tilt), 0, -np.sin(tilt)]), np.array([-np.sin(tilt), 0, -np.cos(tilt)])
-    rotation = np.stack([[0, -1, 0], down, forward])
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, -rotation @ [1.5, 0.1, 2.2]
-    return out
+    return mounted([1.5, 0.1, 2.2], pitch_deg=20)
 
 
 def waves(points_map: FloatArray) -> FloatArray:

@@ -1,9 +1,6 @@
 """The mosaic shows the ground as it is, however large, and its edges as sharp as they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,26 +13,26 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.mosaic import blend as module
 from v2hdm.mosaic.blend import WARP_ERROR_PX, Tiling, whole
 from v2hdm.mosaic.sharpness import edge_widths_m, measure_edges, paint_sides
-from v2hdm.mosaic.shots import FEATHER, Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
-from v2hdm.records import Calibration, Drive, HdMap, Marking
+from v2hdm.mosaic.shots import FEATHER, Canvas, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.records import Calibration, HdMap, Marking
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def drive(tmp_path_factory):
     return scene.drive_of(tmp_path_factory.mktemp("drive"), scene.waves)
 
 
-def lenses(drive: Drive) -> dict[str, Lens]:
+def lenses(drive):
     return {"front": lens_of(drive.cameras["front"], scene.cam_from_vehicle())}
 
 
-def points_of(canvas: Canvas) -> np.ndarray:
+def points_of(canvas):
     at = np.stack(np.meshgrid(np.arange(canvas.columns), np.arange(canvas.rows)), axis=-1).astype(float)
     return apply_homography(canvas.map_from_canvas, at.reshape(-1, 2)).reshape(at.shape)
 
 
 @pytest.mark.parametrize("right", [(1.0, 0.0), (0.6, -0.8)])
-def test_a_mosaic_shows_the_ground_where_it_lies(drive: Drive, right: tuple[float, float]) -> None:
+def test_a_mosaic_shows_the_ground_where_it_lies(drive, right):
     """Lens, mounting, pose, axes and weights in one: images made from the ground give that ground back."""
     canvas = Canvas(np.array([6.5, 2.5]), 0.02, 220, 240, right)
     rgba = whole(canvas, recorded_shots(drive), lenses(drive))
@@ -46,9 +43,7 @@ def test_a_mosaic_shows_the_ground_where_it_lies(drive: Drive, right: tuple[floa
     assert off.max() < 6.0
 
 
-def test_the_result_does_not_depend_on_the_size_of_sheets(
-    drive: Drive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_result_does_not_depend_on_the_size_of_sheets(drive, monkeypatch):
     canvas = Canvas(np.array([5.0, 3.0]), 0.02, 300, 400)
     at_once = whole(canvas, recorded_shots(drive), lenses(drive))
     monkeypatch.setattr(module, "SHEET_PX", 128)
@@ -57,7 +52,7 @@ def test_the_result_does_not_depend_on_the_size_of_sheets(
     assert np.abs(at_once.astype(int) - in_sheets).max() <= 1
 
 
-def test_images_count_with_the_number_of_pixels_that_they_show_ground_with(tmp_path: Path) -> None:
+def test_images_count_with_the_number_of_pixels_that_they_show_ground_with(tmp_path):
     """Two images of one grey each, one from nearer: the density by finite differences gives the mixture."""
     drive = scene.drive_of(tmp_path, lambda points: np.full(points.shape[:-1], 100.0))
     cv2.imwrite(str(drive.images[4].path), np.full((270, 480, 3), 200, np.uint8))
@@ -79,7 +74,7 @@ def test_images_count_with_the_number_of_pixels_that_they_show_ground_with(tmp_p
     assert whole(canvas, two, lens)[0, 0, 0] == pytest.approx(expected, abs=1)
 
 
-def test_the_own_vehicle_and_what_lies_outside_of_the_roi_are_left_out(drive: Drive) -> None:
+def test_the_own_vehicle_and_what_lies_outside_of_the_roi_are_left_out(drive):
     mask = np.zeros((270, 480), dtype=bool)
     mask[:, :240] = True
     camera = replace(drive.cameras["front"], own_vehicle=mask)
@@ -93,7 +88,7 @@ def test_the_own_vehicle_and_what_lies_outside_of_the_roi_are_left_out(drive: Dr
     assert points[seen][:, 0].max() < 11.2  # a pixel shows 10 cm of ground there
 
 
-def test_trust_rises_from_the_edge_of_the_roi_over_the_feather(drive: Drive) -> None:
+def test_trust_rises_from_the_edge_of_the_roi_over_the_feather(drive):
     trust = lenses(drive)["front"].trust
     edge = np.flatnonzero(trust[:, 240])
     feather_px = round(FEATHER * 270)
@@ -101,7 +96,7 @@ def test_trust_rises_from_the_edge_of_the_roi_over_the_feather(drive: Drive) -> 
     np.testing.assert_allclose(rise, 1 / feather_px, rtol=0.05)
 
 
-def test_tiles_are_as_large_as_the_warp_stays_exact_and_a_coarse_canvas_is_refused(drive: Drive) -> None:
+def test_tiles_are_as_large_as_the_warp_stays_exact_and_a_coarse_canvas_is_refused(drive):
     shots, lens = recorded_shots(drive), lenses(drive)
     fine, coarse = (Canvas(np.zeros(2), cell, 9, 9) for cell in (0.01, 0.04))
     sides = [Tiling.of(canvas, shots, lens).side_px for canvas in (fine, coarse)]
@@ -112,20 +107,7 @@ def test_tiles_are_as_large_as_the_warp_stays_exact_and_a_coarse_canvas_is_refus
         Tiling.of(Canvas(np.zeros(2), 1.0, 9, 9), shots, lens)
 
 
-def test_tiles_under_a_polygon_are_all_that_it_touches_and_few_else() -> None:
-    generator = np.random.default_rng(3)
-    for _ in range(20):
-        points = generator.uniform(0, 900, (5, 2)).astype(np.float32)
-        polygon = cv2.convexHull(points)[:, 0].astype(float)
-        found = {tuple(tile) for tile in module._tiles_under(polygon, np.array([8, 8]), 128)}
-        weights = generator.dirichlet(np.ones(len(polygon)), 4000)
-        touched = {tuple(t) for t in np.floor((weights @ polygon + 0.5) / 128).astype(int)}
-        assert {t for t in touched if max(t) < 8} <= found
-        box = np.floor(polygon.min(axis=0) / 128), np.floor(polygon.max(axis=0) / 128)
-        assert all((t >= box[0] - 1).all() and (t <= box[1] + 1).all() for t in map(np.array, found))
-
-
-def test_a_sloping_road_is_undone_and_clocks_are_kept(drive: Drive) -> None:
+def test_a_sloping_road_is_undone_and_clocks_are_kept(drive):
     """Poses written in the recorded frame come back to the flat one, at the time that the image was taken."""
     up = np.eye(4)
     up[2, 3] = 3.0
@@ -140,7 +122,7 @@ def test_a_sloping_road_is_undone_and_clocks_are_kept(drive: Drive) -> None:
         np.testing.assert_allclose(later[k].pinhole_px_from_map, flat[k + 1].pinhole_px_from_map, atol=1e-6)
 
 
-def test_an_image_of_another_size_is_named(drive: Drive, tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_named(drive, tmp_path):
     path = tmp_path / "small.png"
     cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
     shot = Shot(path, "front", recorded_shots(drive)[0].pinhole_px_from_map)
@@ -153,7 +135,7 @@ SQUARE = np.array([[2.0, 2.0], [4.0, 2.0], [4.0, 4.0], [2.0, 4.0]])
 SIDES = paint_sides(HdMap((Marking("diamond", SQUARE, 3),))).ends_map
 
 
-def painted(width_m: float, shift_m: float = 0.0) -> np.ndarray:
+def painted(width_m, shift_m=0.0):
     """A square whose edges rise over ``width_m``, out of place by ``shift_m`` in x and y."""
     across = (np.arange(300) + 0.5) * 0.02 - 3 - shift_m
     rise = np.clip((1 - np.abs(across)) / width_m + 0.5, 0, 1)
@@ -161,31 +143,31 @@ def painted(width_m: float, shift_m: float = 0.0) -> np.ndarray:
     return np.dstack([grey, grey, grey, np.full_like(grey, 255)]).round().astype(np.uint8)
 
 
-def median_widths(*mosaics: np.ndarray) -> list[float]:
+def median_widths(*mosaics):
     edges = [measure_edges(rgba, CANVAS, SIDES) for rgba in mosaics]
     return [float(np.median(widths)) for widths in edge_widths_m(edges)]
 
 
 @pytest.mark.parametrize("width_m", [0.06, 0.1, 0.3])
 @pytest.mark.parametrize("shift_m", [0.0, 0.3])
-def test_a_ramp_is_as_wide_as_it_was_drawn_though_out_of_place(width_m: float, shift_m: float) -> None:
+def test_a_ramp_is_as_wide_as_it_was_drawn_though_out_of_place(width_m, shift_m):
     assert median_widths(painted(width_m, shift_m))[0] == pytest.approx(width_m, rel=0.05)
 
 
-def test_paint_that_appears_twice_has_edges_twice_as_wide() -> None:
+def test_paint_that_appears_twice_has_edges_twice_as_wide():
     once = painted(0.06)
     twice = (once.astype(float) / 2 + painted(0.06, 0.4).astype(float) / 2).round().astype(np.uint8)
     doubled, sharp = median_widths(twice, once)
     assert doubled == pytest.approx(2 * sharp, rel=0.1)
 
 
-def test_edges_that_a_mosaic_does_not_show_whole_are_left_out_of_all() -> None:
+def test_edges_that_a_mosaic_does_not_show_whole_are_left_out_of_all():
     half = painted(0.06)
     half[:, :150, 3] = 0
     before, after = edge_widths_m([measure_edges(one, CANVAS, SIDES) for one in (half, painted(0.06))])
     assert len(before) == len(after) == 1
 
 
-def test_short_sides_are_no_edges() -> None:
+def test_short_sides_are_no_edges():
     assert not len(paint_sides(HdMap((Marking("diamond", 0.1 * SQUARE, 3),))).ends_map)
     assert not len(paint_sides(HdMap(())).sightings)

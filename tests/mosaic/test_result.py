@@ -1,11 +1,8 @@
 """From a result folder to files that a GIS reads and a person looks at."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,25 +20,25 @@ from v2hdm.mosaic.shots import Canvas
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(tmp_path_factory):
     """Of a drive over squares whose recorded poses are 20 cm off to and fro."""
     folder = tmp_path_factory.mktemp("squares")
     return scene.result_of(folder, scene.drive_of(folder / "drive", scene.squares, 0.2))
 
 
 @pytest.fixture(scope="module")
-def told(result: Path) -> dict:
+def told(result):
     assert run(["mosaic", str(result)]) == 0
     return json.loads((result / "mosaic.json").read_text())
 
 
-def test_paint_is_sharper_after_the_optimisation(told: dict) -> None:
+def test_paint_is_sharper_after_the_optimisation(told):
     assert told["sharpness"]["edges"] >= 8
     assert told["sharpness"]["edge_width_after_m"] < 0.08
     assert told["sharpness"]["after_over_before"] > 1.7
 
 
-def test_the_geotiff_has_the_ground_where_it_lies(told: dict, result: Path) -> None:
+def test_the_geotiff_has_the_ground_where_it_lies(told, result):
     with rasterio.open(result / "mosaic.tif") as file:
         assert file.res == (0.02, 0.02)
         assert file.overviews(1)
@@ -53,7 +50,7 @@ def test_the_geotiff_has_the_ground_where_it_lies(told: dict, result: Path) -> N
         assert file.dataset_mask()[0, 0] == 0
 
 
-def test_the_picture_covers_the_bounds_and_is_clear_where_nothing_was_seen(told: dict, result: Path) -> None:
+def test_the_picture_covers_the_bounds_and_is_clear_where_nothing_was_seen(told, result):
     picture = cv2.imread(str(result / told["image"]), cv2.IMREAD_UNCHANGED)
     west, south, east, north = told["bounds_m"]
     rows, columns = picture.shape[:2]
@@ -66,7 +63,7 @@ def test_the_picture_covers_the_bounds_and_is_clear_where_nothing_was_seen(told:
     assert cv2.imread(str(result / "mosaic_before_after.png")).shape[1] > 800
 
 
-def test_the_projection_agrees_with_the_tangent_plane_to_a_millimetre() -> None:
+def test_the_projection_agrees_with_the_tangent_plane_to_a_millimetre():
     points = np.array([[x, y, 0.0] for x in (-2000, 0, 700, 2000) for y in (-2000, 0, 2000)], dtype=float)
     geodetic = geodetic_from_enu(scene.ORIGIN, points)
     to_grid = pyproj.Transformer.from_crs("EPSG:4326", crs_of(scene.ORIGIN), always_xy=True)
@@ -75,17 +72,17 @@ def test_the_projection_agrees_with_the_tangent_plane_to_a_millimetre() -> None:
     assert np.abs(found - points[:, :2])[near].max() < 1e-3
 
 
-def test_without_an_origin_the_geotiff_says_that_it_belongs_nowhere_on_the_earth(tmp_path: Path) -> None:
+def test_without_an_origin_the_geotiff_says_that_it_belongs_nowhere_on_the_earth(tmp_path):
     canvas = Canvas(np.array([0.0, 5.12]), 0.02, 256, 256)
-    with geotiff(tmp_path / "mosaic.tif", canvas, None) as file:
-        file.put(Sheet(0, 0, np.full((256, 256, 4), 255, dtype=np.uint8)))
+    with geotiff(tmp_path / "mosaic.tif", canvas, None) as put:
+        put(Sheet(0, 0, np.full((256, 256, 4), 255, dtype=np.uint8)))
     with rasterio.open(tmp_path / "mosaic.tif") as file:
         assert not file.crs.is_geographic
         assert not file.crs.is_projected
         assert "V2HDM map frame" in file.crs.to_wkt()
 
 
-def test_a_picture_is_reduced_until_it_can_be_drawn_and_keeps_its_colours() -> None:
+def test_a_picture_is_reduced_until_it_can_be_drawn_and_keeps_its_colours():
     picture = Picture(Canvas(np.zeros(2), 0.02, 512, 10240))
     assert picture.resolution_m == pytest.approx(0.04)
     rgba = np.zeros((512, 2048, 4), dtype=np.uint8)
@@ -95,7 +92,7 @@ def test_a_picture_is_reduced_until_it_can_be_drawn_and_keeps_its_colours() -> N
     assert not picture._rgba[:, :1024].any()
 
 
-def said_of_drive(folder: Path, **values: object) -> None:
+def said_of_drive(folder, **values):
     """Change what a result says of its drive."""
     content = json.loads((folder / METRICS).read_text())
     content["drive"] |= values
@@ -115,9 +112,7 @@ def said_of_drive(folder: Path, **values: object) -> None:
         (shutil.rmtree, "no such folder"),
     ],
 )
-def test_what_is_no_result_ends_in_one_line(
-    spoil, says: str, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_result_ends_in_one_line(spoil, says, result, tmp_path, capsys):
     folder = tmp_path / "result"
     shutil.copytree(result, folder)
     spoil(folder)
@@ -128,19 +123,12 @@ def test_what_is_no_result_ends_in_one_line(
 
 
 @pytest.mark.parametrize("resolution", ["0", "-1", "2"])
-def test_a_resolution_that_makes_no_mosaic_is_one_line(
-    resolution: str, result: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_resolution_that_makes_no_mosaic_is_one_line(resolution, result, capsys):
     assert run(["mosaic", str(result), f"--resolution={resolution}"]) == 2
     assert "resolution of" in capsys.readouterr().err
 
 
-def test_without_rasterio_the_picture_is_made_and_the_extra_is_named(
-    result: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_without_rasterio_the_picture_is_made_and_the_extra_is_named(result, tmp_path, monkeypatch, caplog):
     folder = tmp_path / "result"
     shutil.copytree(result, folder, ignore=shutil.ignore_patterns("mosaic*"))
     monkeypatch.setitem(sys.modules, "rasterio", None)

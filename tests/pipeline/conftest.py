@@ -1,4 +1,3 @@
 """The stores that these tests work on."""
 
 from tests.stores import memory as memory
-from tests.stores import quick as quick

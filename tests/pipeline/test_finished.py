@@ -1,7 +1,5 @@
 """Runs from and to object stores are those of folders: finished ones are kept, none is half there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,38 +10,34 @@ import pytest
 from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import finished
 from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
-from v2hdm.pipeline.finished import RunResult, note_finished, take_or_make
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
-from v2hdm.store.cache import StageCache, code_key, key_of
+from v2hdm.pipeline.run import RunResult, note_finished, take_or_make
+from v2hdm.store import remote
+from v2hdm.store.cache import code_key, key_of
 from v2hdm.store.remote import RemoteFolder, download
 from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
 
-pytestmark = pytest.mark.usefixtures("quick")
 
-
-def quiet(*_: object) -> None:
+def quiet(*_):
     pass
 
 
 @pytest.fixture
-def config(memory: RemoteFolder, tmp_path: Path) -> RunConfig:
+def config(memory, tmp_path):
     make_drive(tmp_path / "drive")
     drive = DriveConfig(path=str(tmp_path / "drive"))
-    return RunConfig(
-        drive=drive, output=f"{memory}/results", cache=f"{memory}/cache", local_cache=str(tmp_path / "local")
-    )
+    return RunConfig(drive=drive, output=f"{memory}/results", cache=str(tmp_path / "local"))
 
 
 class Work:
     """Writes a result of one file, of the range that is set; counts how often."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.done: list[RunConfig] = []
 
-    def __call__(self, config: RunConfig, cache: StageCache) -> RunResult:
+    def __call__(self, config, cache):
         self.done.append(config)
         drives = read_drives(config, config.drive.paths)
         folder = Path(config.output) / run_name(config)
@@ -56,16 +50,14 @@ class Work:
         return result
 
 
-def test_a_result_goes_to_its_place_and_is_kept_there(
-    config: RunConfig, memory: RemoteFolder, tmp_path: Path
-) -> None:
+def test_a_result_goes_to_its_place_and_is_kept_there(config, memory, tmp_path):
     work = Work()
     made, kept = take_or_make(config, work, True, quiet)
     assert (made.place, kept) == (f"{memory}/results/example", False)
     there = memory.below("results/example")
     assert there.read("maps/map.geojson") == str(config.mapping.max_range_m).encode()
     assert not (tmp_path / "local" / "uploads").exists()
-    elsewhere = replace(config, local_cache=str(tmp_path / "other machine"))
+    elsewhere = replace(config, cache=str(tmp_path / "other machine"))
     taken, kept = take_or_make(elsewhere, work, True, quiet)
     assert kept
     assert (taken.place, taken.metrics, taken.verdict) == (made.place, made.metrics, made.verdict)
@@ -76,16 +68,14 @@ def test_a_result_goes_to_its_place_and_is_kept_there(
     assert not take_or_make(nearer, work, False, quiet)[1]
 
 
-def test_a_result_whose_upload_failed_is_not_made_again(
-    config: RunConfig, memory: RemoteFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_whose_upload_failed_is_not_made_again(config, memory, monkeypatch):
     work = Work()
 
-    def gone(*_: object) -> None:
+    def gone(*_):
         raise ConfigError("no network")
 
     with monkeypatch.context() as patch:
-        patch.setattr(finished, "upload", gone)
+        patch.setattr(remote, "upload", gone)
         with pytest.raises(ConfigError, match="no network"):
             take_or_make(config, work, True, quiet)
     assert not memory.below("results").listed()
@@ -94,11 +84,11 @@ def test_a_result_whose_upload_failed_is_not_made_again(
     assert memory.below("results/example").read("maps/map.geojson")
 
 
-def test_what_another_finishes_meanwhile_is_taken(config: RunConfig, tmp_path: Path) -> None:
+def test_what_another_finishes_meanwhile_is_taken(config, tmp_path):
     first, second = Work(), Work()
 
-    def after_another(local: RunConfig, cache: StageCache) -> RunResult:
-        elsewhere = replace(config, local_cache=str(tmp_path / "other machine"))
+    def after_another(local, cache):
+        elsewhere = replace(config, cache=str(tmp_path / "other machine"))
         assert not take_or_make(elsewhere, first, True, quiet)[1]
         return second(local, cache)
 
@@ -108,23 +98,21 @@ def test_what_another_finishes_meanwhile_is_taken(config: RunConfig, tmp_path: P
     assert not (tmp_path / "local" / "uploads").exists()
 
 
-def test_two_processes_of_a_machine_do_not_upload_one_result_at_once(
-    config: RunConfig, memory: RemoteFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    upload = finished.upload
+def test_two_processes_of_a_machine_do_not_upload_one_result_at_once(config, memory, monkeypatch):
+    upload = remote.upload
 
-    def slowly(*arguments: Any) -> None:
-        monkeypatch.setattr(finished, "upload", upload)
+    def slowly(*arguments):
+        monkeypatch.setattr(remote, "upload", upload)
         with pytest.raises(ConfigError, match="is being written by process"):
             take_or_make(config, Work(), True, quiet)
         upload(*arguments)
 
-    monkeypatch.setattr(finished, "upload", slowly)
+    monkeypatch.setattr(remote, "upload", slowly)
     assert not take_or_make(config, Work(), True, quiet)[1]
     assert memory.below("results/example").read("maps/map.geojson")
 
 
-def test_what_is_not_ours_is_reported_before_any_work(config: RunConfig, memory: RemoteFolder) -> None:
+def test_what_is_not_ours_is_reported_before_any_work(config, memory):
     memory.write("results/example/notes", b"mine")
     work = Work()
     with pytest.raises(ConfigError, match="no results of ours"):
@@ -132,7 +120,12 @@ def test_what_is_not_ours_is_reported_before_any_work(config: RunConfig, memory:
     assert not work.done
 
 
-def test_a_folder_named_by_a_url_is_that_folder(config: RunConfig, tmp_path: Path) -> None:
+def test_a_cache_at_a_store_is_refused(config, memory):
+    with pytest.raises(ConfigError, match=r"cache=memory.*: is a URL; give a folder"):
+        take_or_make(replace(config, cache=f"{memory}/cache"), Work(), True, quiet)
+
+
+def test_a_folder_named_by_a_url_is_that_folder(config, tmp_path):
     local = replace(config, output=f"file://{tmp_path}/out", cache=f"file://{tmp_path}/kept")
     work = Work()
     assert take_or_make(local, work, True, quiet)[0].place == str(tmp_path / "out" / "example")
@@ -142,16 +135,14 @@ def test_a_folder_named_by_a_url_is_that_folder(config: RunConfig, tmp_path: Pat
     assert (work.done[0].cache, work.done[0].output) == (str(tmp_path / "kept"), str(tmp_path / "out"))
 
 
-def uploaded(folder: Path, place: RemoteFolder) -> RemoteFolder:
+def uploaded(folder, place):
     for path in folder.rglob("*"):
         if path.is_file():
             place.write(path.relative_to(folder).as_posix(), path)
     return place
 
 
-def test_a_drive_at_a_store_is_copied_once_for_each_content(
-    config: RunConfig, memory: RemoteFolder, tmp_path: Path
-) -> None:
+def test_a_drive_at_a_store_is_copied_once_for_each_content(config, memory, tmp_path):
     place = uploaded(tmp_path / "drive", memory.below("drives/monday"))
     told: list[tuple[int, int]] = []
     copy = download(place, tmp_path / "cache", lambda *at: told.append(at))
@@ -182,9 +173,7 @@ def test_a_drive_at_a_store_is_copied_once_for_each_content(
         (["..\\escape"], "is none of a file in a folder"),
     ],
 )
-def test_a_drive_that_leads_out_of_its_folder_is_refused(
-    names: list[str], says: str, memory: RemoteFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_that_leads_out_of_its_folder_is_refused(names, says, memory, tmp_path, monkeypatch):
     listed: Callable[..., Any] = RemoteFolder.listed
     memory.write("drive/x", b"x")
     thing = listed(memory)["drive/x"]
@@ -194,12 +183,10 @@ def test_a_drive_that_leads_out_of_its_folder_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_copy_that_failed_leaves_nothing(
-    memory: RemoteFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_copy_that_failed_leaves_nothing(memory, tmp_path, monkeypatch):
     memory.write("drive/x", b"x")
 
-    def gone(*_: object) -> None:
+    def gone(*_):
         raise ConfigError("no network")
 
     monkeypatch.setattr(RemoteFolder, "fetch", gone)

@@ -1,20 +1,16 @@
 """docs/living-map.md does what it says: its commands run on two drives through a made-up yard."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys
 from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.docs.blocks import blocks, document
-from tests.mapping.scene import Scene, SceneOptions, make_scene, repainted
+from tests.mapping.scene import SceneOptions, make_scene, repainted
 from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive
@@ -23,12 +19,12 @@ from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.base import check_together, read_base
-from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
+from v2hdm.records import Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
 
 BOTH, LATER = (" ".join(block.lines) for block in blocks("docs/living-map.md", "sh"))
 
 
-def write_scene(scene: Scene, folder: Path) -> None:
+def write_scene(scene, folder):
     """The drive of a scene as a folder, all of whose images are grey."""
     _, grey = cv2.imencode(".jpg", np.full((720, 1280, 3), 90, dtype=np.uint8))
     images = []
@@ -45,7 +41,7 @@ def write_scene(scene: Scene, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """``outputs`` after Monday's map, and after the document's two commands."""
     folder = tmp_path_factory.mktemp("living")
     options = SceneOptions(length_m=40.0, cameras=("front",), seed=21)
@@ -53,7 +49,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, scene in scenes.items():
         write_scene(scene, folder / "drives" / name)
 
-    def detected(drive: Drive, *_: Any) -> list[ImageDetections]:
+    def detected(drive, *_):
         out: list[ImageDetections] = []
         for visit in drive.visits:
             found = scenes[visit.root.name].detections
@@ -71,7 +67,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "outputs"
 
 
-def test_drives_are_mapped_together_each_with_its_trajectory(results: Path) -> None:
+def test_drives_are_mapped_together_each_with_its_trajectory(results):
     metrics = json.loads((results / "both" / "metrics.json").read_text())
     assert (results / "both" / "trajectory_monday.tum").is_file()
     assert (results / "both" / "trajectory_friday.tum").is_file()
@@ -82,7 +78,7 @@ def test_drives_are_mapped_together_each_with_its_trajectory(results: Path) -> N
     assert sigma[0] < sigma[1]
 
 
-def test_a_later_drive_lists_what_changed(results: Path) -> None:
+def test_a_later_drive_lists_what_changed(results):
     changes = json.loads((results / "friday" / "metrics.json").read_text())["changes"]
     fates = [one["fate"] for one in changes["listed"]]
     assert {Fate.MOVED.value, Fate.VANISHED.value} <= set(fates)
@@ -95,12 +91,12 @@ def test_a_later_drive_lists_what_changed(results: Path) -> None:
     assert after.largest_id >= before.largest_id
 
 
-def test_the_document_names_every_fate() -> None:
+def test_the_document_names_every_fate():
     for fate in Fate:
         assert f"| `{fate.value}` |" in document("docs/living-map.md")
 
 
-def test_a_base_that_nothing_can_be_built_on_is_refused(results: Path, tmp_path: Path) -> None:
+def test_a_base_that_nothing_can_be_built_on_is_refused(results, tmp_path):
     with pytest.raises(MapFileError, match=r"nowhere\.geojson"):
         read_base(tmp_path / "nowhere.geojson")
     hd_map = read_geojson(results / "monday" / "map.geojson")
@@ -115,7 +111,7 @@ def test_a_base_that_nothing_can_be_built_on_is_refused(results: Path, tmp_path:
             read_base(tmp_path)
 
 
-def test_a_base_of_another_frame_or_site_is_refused(results: Path) -> None:
+def test_a_base_of_another_frame_or_site_is_refused(results):
     base = read_base(results / "monday")
     drive = read_drive(results.parent / "drives" / "friday", ReadOptions())
     check_together(base, drive, "monday")

@@ -1,7 +1,5 @@
 """The main job on a short rendered drive: images and poses in, map and calibrations out."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -12,9 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.drive.example import description
 from tests.ports import run_config, short_port
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
+from v2hdm.errors import ConfigError, DetectorError, DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.calibration import CALIBRATION_FORMATS, read_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
@@ -23,22 +22,24 @@ from v2hdm.io.maps.evidence import read_residuals
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.result import write_trajectories
 from v2hdm.pipeline.run import run
-from v2hdm.records import Trajectory
+from v2hdm.records import Drive, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.verdict import Status
 
 
 @pytest.fixture(scope="module")
-def result(short_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(short_drive, tmp_path_factory):
     output = tmp_path_factory.mktemp("outputs")
     return run(run_config(short_drive, output, export=list(FORMATS), mosaic=True)).folder
 
 
 @pytest.mark.slow
-def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
+def test_every_method_is_judged_on_every_camera_set(result):
     metrics = json.loads((result / "metrics.json").read_text())
     assert set(metrics["results"]) == {"front", "rear", "both"}
     for methods in metrics["results"].values():
@@ -49,7 +50,7 @@ def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
     assert metrics["disturbances"]
 
 
-def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
+def test_a_good_drive_passes_and_every_file_says_so(result):
     verdict = json.loads((result / "metrics.json").read_text())["verdict"]
     assert verdict["status"] == "PASS", verdict["findings"]
     assert {"heading", "clock", "ground match"} <= {
@@ -60,12 +61,8 @@ def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
     assert "verdict: PASS" in (result / "run.log").read_text()
 
 
-@pytest.mark.slow
-def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
-    short_drive: Path, tmp_path: Path
-) -> None:
-    drive = tmp_path / "north"
-    shutil.copytree(short_drive, drive)
+def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(small_drive, tmp_path):
+    drive = blind_copy(small_drive, tmp_path / "north")
     recorded = read_tum(drive / "poses.tum")
     poses = recorded.map_from_vehicle.copy()
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
@@ -79,7 +76,7 @@ def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
     assert metrics["verdict"]["status"] == "FAIL"
 
 
-def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> None:
+def test_the_optimisation_repairs_another_vehicles_calibration(result):
     metrics = json.loads((result / "metrics.json").read_text())
     both = metrics["results"]["both"]
     assert both["ENI"]["corner_rmse_m"] > 0.2
@@ -90,7 +87,7 @@ def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> 
         assert metrics["extrinsics"][camera]["rotation_error_deg"] < 0.2
 
 
-def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
+def test_the_files_of_a_result_can_be_read_back(result):
     hd_map = read_geojson(result / "map.geojson")
     metrics = json.loads((result / "metrics.json").read_text())
     assert len(hd_map.markings) == metrics["results"]["both"]["Opt"]["markings"]
@@ -99,8 +96,8 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
         calibration = read_calibration(result / f"calibration_{camera}.yaml")
         assert calibration.covariance is not None
         assert np.linalg.det(calibration.cam_from_vehicle[:3, :3]) == pytest.approx(1.0)
-        for form in CALIBRATION_FORMATS.values():
-            text = (result / f"calibration_{camera}" / f"{camera}_{form.ending}").read_text()
+        for ending, _ in CALIBRATION_FORMATS.values():
+            text = (result / f"calibration_{camera}" / f"{camera}_{ending}").read_text()
             assert "# drive: short\n# date: " in text
     for one in FORMATS.values():
         assert (result / one.file.format(name="map")).stat().st_size > 1000
@@ -118,7 +115,7 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
     assert "detected" in (result / "run.log").read_text()
 
 
-def test_paint_seen_from_above_is_sharp_after_the_optimisation(result: Path) -> None:
+def test_paint_seen_from_above_is_sharp_after_the_optimisation(result):
     sharpness = json.loads((result / "mosaic.json").read_text())["sharpness"]
     assert sharpness["edges"] > 20
     assert sharpness["edge_width_after_m"] < 0.08
@@ -126,7 +123,7 @@ def test_paint_seen_from_above_is_sharp_after_the_optimisation(result: Path) -> 
     assert cv2.imread(str(result / "mosaic_before_after.png")) is not None
 
 
-def test_lane_lines_run_as_the_drive_passed_them(result: Path, short_drive: Path) -> None:
+def test_lane_lines_run_as_the_drive_passed_them(result, short_drive):
     poses = np.array([image.map_from_vehicle for image in read_drive(short_drive).images])
     lanes = read_geojson(result / "map.geojson").lanes
     assert lanes
@@ -137,78 +134,37 @@ def test_lane_lines_run_as_the_drive_passed_them(result: Path, short_drive: Path
         assert (steps * headings).sum() > 0
 
 
-@pytest.mark.slow
-def test_two_processes_find_the_same_map_to_the_byte_without_the_truth(
-    result: Path, short_drive: Path, tmp_path: Path
-) -> None:
-    blind = tmp_path / "short"
-    shutil.copytree(short_drive, blind)
-    shutil.rmtree(blind / "truth")
-    description = blind / "drive.yaml"
-    lines = description.read_text().splitlines(keepends=True)
-    description.write_text("".join(line for line in lines if not line.startswith("truth:")))
-    again = run(run_config(blind, tmp_path / "outputs", workers=2)).folder
-    for name in ("map.geojson", "calibration_front.yaml", "calibration_rear.yaml"):
-        assert (again / name).read_bytes() == (result / name).read_bytes()
-
-
-def small_copy(short_drive: Path, target: Path) -> Path:
-    """The first three time stamps of the drive."""
-    shutil.copytree(short_drive, target, ignore=shutil.ignore_patterns("truth", "*.jpg"))
-    for camera in ("front", "rear"):
-        listing = target / camera / "images.txt"
-        kept = [line for line in listing.read_text().splitlines() if line and not line.startswith("#")][:3]
-        listing.write_text("\n".join(kept) + "\n")
-        for line in kept:
-            name = Path(line.split()[1])
-            source = next((short_drive / camera).rglob(name.name))
-            destination = target / source.relative_to(short_drive)
-            destination.parent.mkdir(exist_ok=True)
-            shutil.copy(source, destination)
-    description = target / "drive.yaml"
-    lines = description.read_text().splitlines(keepends=True)
-    description.write_text("".join(line for line in lines if not line.startswith("truth:")))
+def blind_copy(drive, target):
+    """The drive, whose truth nobody knows."""
+    shutil.copytree(drive, target, ignore=shutil.ignore_patterns("truth"))
+    with description(target) as content:
+        content.pop("truth")
     return target
 
 
-def fails(drive: Path, output: Path, kind: type[V2hdmError]) -> str:
-    with pytest.raises(kind) as caught:
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (Path.unlink, ""),
+        (lambda image: image.write_bytes(image.read_bytes()[:-2000]), ""),
+        (lambda image: cv2.imwrite(str(image), np.zeros((480, 320, 3), np.uint8)), "320 x 480.*640 x 360"),
+    ],
+    ids=["missing", "truncated", "of another size"],
+)
+def test_a_wrong_image_is_named_and_leaves_nothing_behind(spoil, says, small_drive, tmp_path):
+    drive, output = blind_copy(small_drive, tmp_path / "drive"), tmp_path / "out"
+    image = sorted(drive.rglob("*.jpg"))[2]
+    spoil(image)
+    with pytest.raises(DriveError, match=f"{image.name}.*{says}") as caught:
         run(run_config(drive, output))
     assert "\n" not in str(caught.value)
     assert not output.exists() or not any(output.iterdir())
-    return str(caught.value)
 
 
-def test_a_missing_image_is_named_and_leaves_nothing_behind(short_drive: Path, tmp_path: Path) -> None:
-    drive = small_copy(short_drive, tmp_path / "drive")
-    image = sorted((drive / "rear").rglob("*.jpg"))[1]
-    image.unlink()
-    assert image.name in fails(drive, tmp_path / "out", DriveError)
-
-
-def test_a_truncated_image_is_named(short_drive: Path, tmp_path: Path) -> None:
-    drive = small_copy(short_drive, tmp_path / "drive")
-    image = sorted((drive / "front").rglob("*.jpg"))[2]
-    image.write_bytes(image.read_bytes()[:-2000])
-    assert image.name in fails(drive, tmp_path / "out", DriveError)
-
-
-def test_an_image_of_another_size_is_named_with_both_sizes(short_drive: Path, tmp_path: Path) -> None:
-    drive = small_copy(short_drive, tmp_path / "drive")
-    image = sorted((drive / "front").rglob("*.jpg"))[0]
-    cv2.imwrite(str(image), np.zeros((480, 640, 3), np.uint8))
-    message = fails(drive, tmp_path / "out", DriveError)
-    assert image.name in message
-    assert "640" in message
-    assert "1280" in message
-
-
-def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
-    short_drive: Path, tmp_path: Path
-) -> None:
-    drive = small_copy(short_drive, tmp_path / "drive")
+def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(small_drive, tmp_path):
+    drive = blind_copy(small_drive, tmp_path / "drive")
     for image in drive.rglob("*.jpg"):
-        cv2.imwrite(str(image), np.full((720, 1280, 3), 90, np.uint8))
+        cv2.imwrite(str(image), np.full((360, 640, 3), 90, np.uint8))
     outcome = run(run_config(drive, tmp_path / "out"))
     assert outcome.verdict.status is Status.FAIL
     assert any("no marking was found" in finding.says for finding in outcome.verdict.raised)
@@ -226,10 +182,7 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
         ({"mapping": MappingOptions(max_range_m=float("nan"))}, "mapping.max_range_m is nan"),
         ({"mapping": MappingOptions(loss="square")}, "mapping.loss is 'square'"),
         ({"mapping": MappingOptions(model_floor_px=-0.1)}, "mapping.model_floor_px is -0.1"),
-        (
-            {"mapping": MappingOptions(lanes=LaneOptions(max_range_m=float("nan")))},
-            "mapping.lanes.max_range_m is nan",
-        ),
+        ({"mapping": MappingOptions(lanes=LaneOptions(max_range_m=float("nan")))}, "mapping.lanes.max_range"),
         (
             {"mapping": MappingOptions(acceptance=AcceptanceOptions(min_probability=50))},
             "mapping.acceptance.min_probability is 50",
@@ -238,30 +191,56 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
         ({"export": ["geojson", "shp"]}, "export: unknown format 'shp'"),
     ],
 )
-def test_what_cannot_work_is_refused_before_anything_is_read(
-    tmp_path: Path, changes: dict[str, object], named: str
-) -> None:
+def test_what_cannot_work_is_refused_before_anything_is_read(tmp_path, changes, named):
     with pytest.raises((ConfigError, DetectorError), match=re.escape(named)):
         run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_a_name_has_that_of_its_drive(short_drive: Path, tmp_path: Path) -> None:
-    drive = small_copy(short_drive, tmp_path / "folder")
-    assert run_name(run_config(drive, tmp_path, name=None)) == "short"
-    description = drive / "drive.yaml"
-    lines = description.read_text().splitlines(keepends=True)
-    description.write_text("".join(line for line in lines if not line.startswith("name:")))
+def test_a_run_without_a_name_has_that_of_its_drive(small_drive, tmp_path):
+    drive = blind_copy(small_drive, tmp_path / "folder")
+    assert run_name(run_config(drive, tmp_path, name=None)) == "small"
+    with description(drive) as content:
+        content.pop("name")
     assert run_name(run_config(drive, tmp_path, name=None)) == "folder"
     assert run_name(run_config(drive, tmp_path, name="given")) == "given"
 
 
-def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:
+def test_a_run_that_both_renders_and_reads_is_refused(tmp_path):
     config = run_config(tmp_path, tmp_path / "out", simulate=short_port())
     with pytest.raises(ConfigError, match=r"drive\.path"):
         run(config)
 
 
-def test_a_single_camera_is_one_set_and_two_are_three(short_drive: Path) -> None:
+def test_a_single_camera_is_one_set_and_two_are_three(short_drive):
     assert list(camera_sets(read_drive(short_drive))) == ["front", "rear", "both"]
     assert list(camera_sets(read_drive(short_drive, ReadOptions(cameras=["rear"])))) == ["rear"]
+
+
+def poses(height_m=0.0, pitch_rad=0.0, forward_m=0.0):
+    """Three poses a metre apart, moved along themselves by ``forward_m``."""
+    out = np.tile(np.eye(4), (3, 1, 1))
+    zero = np.zeros(3)
+    out[:, :3, :3] = rotation_from_euler(zero, np.full(3, pitch_rad), zero)
+    out[:, :3, 3] = np.column_stack([np.arange(3.0), zero, np.full(3, height_m)])
+    moved = np.eye(4)
+    moved[0, 3] = forward_m
+    return np.asarray(out @ moved)
+
+
+def test_poses_that_were_laid_flat_are_written_at_their_recorded_height(tmp_path):
+    stamp_s = np.array([10.0, 10.5, 11.0])
+    recorded = Trajectory(stamp_s, poses(46.2, 0.02))
+    drive = Drive("d", tmp_path, {}, (), recorded=recorded)
+    sigma = np.tile([0.01, 0.02, 0.003, 1e-4, 2e-4, 3e-4], (3, 1))
+    seen = np.array([True, False, True])
+    visit = np.zeros(len(stamp_s), dtype=np.int64)
+    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {}, visit)
+    write_trajectories(adjusted, drive, tmp_path)
+    got = read_tum(tmp_path / "trajectory.tum")
+    np.testing.assert_allclose(got.stamp_s, stamp_s)
+    np.testing.assert_allclose(got.map_from_vehicle, poses(46.2, 0.02, 0.05), atol=1e-8)
+    header, first, second, _ = (tmp_path / "trajectory_sigma.csv").read_text().splitlines()
+    assert header == "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
+    assert first == "10.000000000,1,0.01,0.02,0.003,0.0001,0.0002,0.0003"
+    assert second.split(",")[1] == "0"

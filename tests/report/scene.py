@@ -1,7 +1,5 @@
 """A hand-checkable truth: two diamonds and a straight lane, one camera, three images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

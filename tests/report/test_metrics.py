@@ -1,13 +1,20 @@
-"""Metrics against a truth, and dashes on rows, whose figures can be worked out by hand."""
+"""Metrics, figures and check points of a report, worked out by hand."""
 
-from __future__ import annotations
+import csv
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.report.scene import diamond_at, make_truth
+from tests.report.yard import OWN_M, SHARED_M, SURVEY_M, checked, point, yard
+from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
+from v2hdm.report import figures, style
+from v2hdm.report.check_points import COLUMNS, write_check_points
+from v2hdm.report.figures import save_birdseye, save_growth
 from v2hdm.report.metrics import (
     corner_errors,
     dash_spacing,
@@ -16,24 +23,26 @@ from v2hdm.report.metrics import (
     lane_metrics,
     marking_metrics,
 )
+from v2hdm.report.photos import save_overlay
+from v2hdm.report.terminal import METHODS, results_table
 
 
-def test_only_the_marking_inside_the_region_of_interest_counts_as_driven_past() -> None:
+def test_only_the_marking_inside_the_region_of_interest_counts_as_driven_past():
     drive, truth = make_truth()
     assert driven_past(drive, truth, ["front"]).tolist() == [True, False]
 
 
-def test_an_occluded_marking_is_not_expected() -> None:
+def test_an_occluded_marking_is_not_expected():
     drive, truth = make_truth(visibility=0.5)
     assert not driven_past(drive, truth, ["front"]).any()
 
 
-def test_another_camera_saw_nothing() -> None:
+def test_another_camera_saw_nothing():
     drive, truth = make_truth()
     assert not driven_past(drive, truth, ["rear"]).any()
 
 
-def test_a_shift_of_three_and_four_centimetres_is_an_error_and_a_bias_of_five() -> None:
+def test_a_shift_of_three_and_four_centimetres_is_an_error_and_a_bias_of_five():
     _, truth = make_truth()
     result = marking_metrics(HdMap((diamond_at(10.03, 0.04),)), truth, np.array([True, False]))
     assert result.corner_rmse_m == pytest.approx(0.05)
@@ -41,13 +50,13 @@ def test_a_shift_of_three_and_four_centimetres_is_an_error_and_a_bias_of_five() 
     assert (result.markings, result.false_markings, result.expected, result.recall) == (1, 0, 1, 1.0)
 
 
-def test_the_cyclic_start_of_the_corners_does_not_matter() -> None:
+def test_the_cyclic_start_of_the_corners_does_not_matter():
     mapped = diamond_at(10, 0)
     rolled = Marking(DIAMOND, np.roll(mapped.corners_map, 3, axis=0), 3)
     assert np.abs(corner_errors([rolled], [mapped])).max() == 0.0
 
 
-def test_a_duplicate_and_a_wrong_class_are_false_and_opposite_errors_have_no_bias() -> None:
+def test_a_duplicate_and_a_wrong_class_are_false_and_opposite_errors_have_no_bias():
     _, truth = make_truth()
     duplicate = diamond_at(10.2, 0)
     wrong_class = Marking(LANE_DASH, diamond_at(10, 40).corners_map, 3)
@@ -61,14 +70,14 @@ def test_a_duplicate_and_a_wrong_class_are_false_and_opposite_errors_have_no_bia
     assert pair.corner_bias_m == pytest.approx(0.0, abs=1e-12)
 
 
-def test_an_empty_map_has_no_recall_and_no_error() -> None:
+def test_an_empty_map_has_no_recall_and_no_error():
     _, truth = make_truth()
     result = marking_metrics(HdMap(()), truth, np.array([True, False]))
     assert result.recall == 0.0
     assert np.isnan(result.corner_rmse_m)
 
 
-def test_extrinsic_error_is_the_angle_and_the_distance_of_the_centres() -> None:
+def test_extrinsic_error_is_the_angle_and_the_distance_of_the_centres():
     rotation = Rotation.from_euler("y", 2.0, degrees=True).as_matrix()
     true, estimate = np.eye(4), np.eye(4)
     estimate[:3, :3] = rotation
@@ -78,7 +87,7 @@ def test_extrinsic_error_is_the_angle_and_the_distance_of_the_centres() -> None:
     assert result.translation_error_m == pytest.approx(0.05)
 
 
-def test_a_lane_five_centimetres_aside_over_the_visible_half_is_all_of_what_was_visible() -> None:
+def test_a_lane_five_centimetres_aside_over_the_visible_half_is_all_of_what_was_visible():
     _, truth = make_truth()
     lane = Lane("lane_line", np.array([[0.0, 2.05], [10.0, 2.05]]), 5)
     result = lane_metrics([lane], truth)
@@ -87,7 +96,7 @@ def test_a_lane_five_centimetres_aside_over_the_visible_half_is_all_of_what_was_
     assert result.false_length_m == 0.0
 
 
-def test_a_lane_where_there_is_none_is_false_length() -> None:
+def test_a_lane_where_there_is_none_is_false_length():
     _, truth = make_truth()
     result = lane_metrics([Lane("lane_line", np.array([[0.0, -5.0], [10.0, -5.0]]), 5)], truth)
     assert result.false_length_m == pytest.approx(10.1)
@@ -95,13 +104,13 @@ def test_a_lane_where_there_is_none_is_false_length() -> None:
     assert np.isnan(result.mean_lateral_error_m)
 
 
-def dash(along_m: float, across_m: float, heading_rad: float = 0.7) -> Marking:
+def dash(along_m, across_m, heading_rad=0.7):
     local = np.array([[1.5, 0.07], [-1.5, 0.07], [-1.5, -0.07], [1.5, -0.07]]) + np.array([along_m, across_m])
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     return Marking(LANE_DASH, local @ np.array([[c, s], [-s, c]]), 5)
 
 
-def test_two_rows_three_metres_apart_give_the_cycle_of_each() -> None:
+def test_two_rows_three_metres_apart_give_the_cycle_of_each():
     rows = [dash(6.05 * n, y) for n in range(5) for y in (0.0, 3.0)]
     spacing = dash_spacing(HdMap(tuple(rows)))
     assert spacing.pairs == 8
@@ -109,12 +118,152 @@ def test_two_rows_three_metres_apart_give_the_cycle_of_each() -> None:
     assert spacing.deviation_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_missing_dash_does_not_move_the_median() -> None:
+def test_a_missing_dash_does_not_move_the_median():
     rows = [dash(6.0 * n, 0.0, heading_rad=2.3) for n in (0, 1, 2, 4, 5, 6)]
     assert dash_spacing(HdMap(tuple(rows))).median_m == pytest.approx(6.0)
 
 
-def test_a_single_dash_has_no_spacing() -> None:
+def test_a_single_dash_has_no_spacing():
     spacing = dash_spacing(HdMap((dash(0.0, 0.0),)))
     assert spacing.pairs == 0
     assert np.isnan(spacing.median_m)
+
+
+def test_the_birds_eye_view_is_drawn_with_and_without_truth(tmp_path):
+    _, truth = make_truth()
+    maps = {"CNI": HdMap((diamond_at(10.1, 0),)), "Opt": HdMap((diamond_at(10, 0),), truth.map.lanes)}
+    route = truth.map_from_vehicle[:, :2, 3]
+    for name, known in (("with.png", truth), ("without.png", None)):
+        save_birdseye(tmp_path / name, maps, "Opt", route, known)
+        image = cv2.imread(str(tmp_path / name))
+        assert image.std() > 5.0
+
+
+def test_no_unfinished_figure_stays_behind(tmp_path):
+    save_growth(tmp_path / "growth.png", {"CNI": [(1, 0.2), (10, 0.1)], "Opt": [(1, 0.1), (10, 0.02)]})
+    assert [p.name for p in tmp_path.iterdir()] == ["growth.png"]
+
+
+def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path):
+    drive, _ = make_truth()
+    info = drive.cameras["front"].info
+    # 2 m above the ground, optical axis level and forward: ground at (10, 0) projects to v = 240 + 100.
+    cam_from_vehicle = np.array([[0.0, -1, 0, 0], [0, 0, -1, 2.0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    views = {"Opt": np.linalg.inv(ipm_from_extrinsic(info, cam_from_vehicle))}
+    black = np.zeros((480, 640, 3), np.uint8)
+    save_overlay(tmp_path / "overlay.png", black, info, HdMap((diamond_at(10, 0),)), np.zeros(2), views)
+    drawn = cv2.imread(str(tmp_path / "overlay.png"))
+    assert len(drawn) > 480  # the legend stands below
+    drawn = drawn[:480].any(axis=2)
+    rows, columns = np.nonzero(drawn)
+    assert abs(columns.mean() - 320) < 2
+    assert 240 + 1000 / 10.5 - 3 <= rows.min() <= rows.max() <= 240 + 1000 / 9.5 + 3
+
+
+def test_before_and_after_differ_in_dashes_and_not_in_colour_alone(tmp_path):
+    drive, truth = make_truth()
+    info = drive.cameras["front"].info
+    cam_from_vehicle = np.array([[0.0, -1, 0, 0], [0, 0, -1, 2.0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    lane = HdMap((), truth.map.lanes)
+    view = np.linalg.inv(ipm_from_extrinsic(info, cam_from_vehicle))
+    covered = {}
+    for name in ("ENI", "Opt"):
+        black = np.zeros((480, 640, 3), np.uint8)
+        save_overlay(tmp_path / "a.png", black, info, lane, np.zeros(2), {name: view})
+        covered[name] = np.count_nonzero(cv2.imread(str(tmp_path / "a.png"))[:480].max(axis=2) > 60)
+    assert 0.3 < covered["ENI"] / covered["Opt"] < 0.85
+
+
+def test_every_method_has_a_line_style_and_a_marker_of_its_own():
+    for look in (style.LINE, style.MARKER, style.METHOD):
+        assert set(look) == set(METHODS)
+        assert len({str(one) for one in look.values()}) == len(METHODS)
+
+
+def test_the_close_up_cuts_no_marking_off():
+    centre = np.zeros(2)
+    inside, across = diamond_at(3, 0), diamond_at(5.3, 0)
+    assert len(figures._wholly_near(HdMap((inside, across)), centre)) == 1
+
+
+def test_the_table_shows_every_method_and_camera_set_once():
+    row = {"markings": 3, "recall": 1.0, "false_markings": 0, "corner_rmse_m": 0.0123, "corner_bias_m": 0.001}
+    table = results_table("t", {"front": {"Opt": row, "CNI": row}, "both": {"Opt": row}})
+    assert list(table.columns[0].cells) == ["CNI", "Opt", "Opt"]
+    assert list(table.columns[5].cells) == ["1.2", "1.2", "1.2"]
+
+
+def test_a_check_point_is_of_the_nearest_corner_within_reach_and_the_others_say_why_not():
+    table = checked(yard(), point(5.98, 0.06, "A"), point(6.2, 0.0, "B"), point(20.5, 7.0, "C"))
+    (one,) = table.compared
+    assert (one.point.id, one.marking, one.marking_id, one.corner) == ("A", 1, 2, 1)
+    np.testing.assert_allclose(one.off_m, [0.02, -0.06], atol=1e-12)
+    reasons = {which.id: why for which, why in table.unmatched}
+    assert reasons["B"] == "A fits the only corner within reach better, of diamond 2"
+    assert reasons["C"].startswith(
+        "no corner within 0.25 m: the nearest, of diamond 5, is 6.02 m away, the route"
+    )
+    assert table.figures()["unmatched"] == reasons
+
+
+def test_figures_are_those_of_map_minus_survey():
+    table = checked(yard(), point(0.02, 0.01, "A"), point(5.0, 0.03, "B"))
+    figures = table.figures()
+    assert figures["rmse_m"] == pytest.approx(np.sqrt((0.02**2 + 0.01**2 + 0.03**2) / 2))
+    assert (figures["mean_x_m"], figures["mean_y_m"]) == pytest.approx((-0.01, -0.02))
+    assert figures["degrees_of_freedom"] == 4
+    one = table.compared[0]
+    sigma_m = np.sqrt(OWN_M**2 + SHARED_M**2 + SURVEY_M**2)
+    assert one.normalised == pytest.approx(np.hypot(0.02, 0.01) / sigma_m)
+    assert one.is_inside
+    assert "2 of 2 compared, RMSE 2.6 cm, mean -1.0 cm in x and -2.0 cm in y" in table.headline
+
+
+def test_differences_as_large_as_stated_have_a_nees_of_one_however_much_they_share():
+    rng, truth, nees, unlikely = np.random.default_rng(3), yard(), [], []
+    for _ in range(200):
+        points = [
+            point(*(truth.markings[k].corners_map[k % 4] + SURVEY_M * rng.standard_normal(2)), f"P{k}")
+            for k in range(12)
+        ]
+        figures = checked(yard(rng), *points).figures()
+        nees.append(figures["nees"])
+        unlikely.append(figures["probability"] < 0.05)
+    # 24 degrees of freedom, 200 times: the mean has a standard deviation of .02, the share one of .015.
+    assert np.mean(nees) == pytest.approx(1.0, abs=0.08)
+    assert np.mean(unlikely) == pytest.approx(0.05, abs=0.05)
+
+
+def test_heights_are_compared_where_both_have_them_and_said_not_to_be_otherwise():
+    flat = yard()
+    lifted = replace(flat, markings=tuple(replace(m, heights_m=np.full(4, 2.0)) for m in flat.markings))
+    table = checked(lifted, point(0.0, 0.0, "A", height_m=1.9), point(5.0, 0.0, "B"))
+    assert [one.off_height_m for one in table.compared] == [pytest.approx(0.1), None]
+    assert table.figures()["height"] == {
+        "compared": 1,
+        "mean_z_m": pytest.approx(0.1),
+        "rmse_z_m": pytest.approx(0.1),
+    }
+    assert checked(flat, point(0.0, 0.0, "A", height_m=1.9)).figures()["height"]["compared"] == 0
+
+
+def test_the_table_of_a_customer_holds_every_point_once_and_reads_back(tmp_path):
+    table = checked(yard(), point(5.98, 0.06, "A"), point(99.0, 0.0, "C"))
+    write_check_points(table, tmp_path / "check_points.csv")
+    with (tmp_path / "check_points.csv").open(newline="") as file:
+        first, second = list(csv.DictReader(file))
+    assert set(first) == set(COLUMNS)
+    assert (first["id"], first["marking"], first["class"], first["corner"]) == ("A", "2", "diamond", "2")
+    assert float(first["distance_m"]) == pytest.approx(np.hypot(0.02, 0.06), abs=1e-4)
+    assert (float(first["map_sigma_x_m"]), first["inside_95_percent"]) == (
+        pytest.approx(0.0316, abs=1e-4),
+        "yes",
+    )
+    assert (second["id"], second["dx_m"]) == ("C", "")
+    assert second["not_compared_because"].startswith("no corner within 0.25 m")
+
+
+def test_nothing_within_reach_is_a_table_without_figures():
+    table = checked(yard(), point(500.0, 0.0))
+    assert table.headline == "check points: none of 1 has a corner of the map within reach"
+    assert "rmse_m" not in table.figures()

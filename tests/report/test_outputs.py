@@ -1,7 +1,5 @@
 """A result folder is whole or absent, belongs to one process, and keeps what is the user's."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -21,17 +19,17 @@ from v2hdm.store.results import added_to, files_of_result, growing_folder, resul
 ROOT = Path(__file__).parents[2]
 
 
-def write(target: Path, **files: str) -> None:
+def write(target, **files):
     with result_folder(target) as folder:
         for name, text in files.items():
             (folder / name).write_text(text)
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.name != LIST)
 
 
-def test_a_failed_run_leaves_the_earlier_result_untouched(tmp_path: Path) -> None:
+def test_a_failed_run_leaves_the_earlier_result_untouched(tmp_path):
     target = tmp_path / "run"
     write(target, config="first")
     with pytest.raises(ZeroDivisionError), result_folder(target) as folder:
@@ -40,19 +38,19 @@ def test_a_failed_run_leaves_the_earlier_result_untouched(tmp_path: Path) -> Non
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_failed_first_run_leaves_no_folder_that_it_made(tmp_path: Path) -> None:
+def test_a_failed_first_run_leaves_no_folder_that_it_made(tmp_path):
     with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "outputs" / "run"):
         print(1 / 0)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_second_run_replaces_the_first_whole(tmp_path: Path) -> None:
+def test_a_second_run_replaces_the_first_whole(tmp_path):
     write(tmp_path / "run", config="first", first="")
     write(tmp_path / "run", config="second", second="")
     assert names(tmp_path / "run") == ["config", "second"]
 
 
-def test_notes_of_the_user_survive_a_rerun(tmp_path: Path) -> None:
+def test_notes_of_the_user_survive_a_rerun(tmp_path):
     target = tmp_path / "run"
     write(target, config="first")
     (target / "notes.md").write_text("mine")
@@ -69,7 +67,7 @@ def test_notes_of_the_user_survive_a_rerun(tmp_path: Path) -> None:
     assert (target / "link").is_symlink()
 
 
-def test_a_file_of_the_users_that_we_write_too_is_kept_beside_ours(tmp_path: Path) -> None:
+def test_a_file_of_the_users_that_we_write_too_is_kept_beside_ours(tmp_path):
     target = tmp_path / "run"
     write(target, config="first")
     (target / "figure.png").write_text("mine")
@@ -78,7 +76,7 @@ def test_a_file_of_the_users_that_we_write_too_is_kept_beside_ours(tmp_path: Pat
     assert (target / "figure.kept.png").read_text() == "mine"
 
 
-def test_a_result_that_was_edited_is_not_replaced(tmp_path: Path) -> None:
+def test_a_result_that_was_edited_is_not_replaced(tmp_path):
     write(tmp_path / "run", map="first")
     (tmp_path / "run" / "map").write_text("edited")
     with pytest.raises(ConfigError, match="was changed after we wrote it"):
@@ -87,7 +85,7 @@ def test_a_result_that_was_edited_is_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["thesis.tex", "config.yaml", "drive.yaml"])
-def test_somebody_elses_folder_is_not_replaced(tmp_path: Path, name: str) -> None:
+def test_somebody_elses_folder_is_not_replaced(tmp_path, name):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / name).touch()
     with pytest.raises(ConfigError, match="output="):
@@ -95,7 +93,7 @@ def test_somebody_elses_folder_is_not_replaced(tmp_path: Path, name: str) -> Non
     assert names(tmp_path) == ["thesis", f"thesis/{name}"]
 
 
-def test_a_link_to_a_result_goes_on_leading_there(tmp_path: Path) -> None:
+def test_a_link_to_a_result_goes_on_leading_there(tmp_path):
     write(tmp_path / "run", config="first")
     (tmp_path / "latest").symlink_to("run")
     write(tmp_path / "latest", config="second")
@@ -103,20 +101,20 @@ def test_a_link_to_a_result_goes_on_leading_there(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "config").read_text() == "second"
 
 
-def test_a_file_where_the_folder_is_to_be_is_one_line(tmp_path: Path) -> None:
+def test_a_file_where_the_folder_is_to_be_is_one_line(tmp_path):
     (tmp_path / "run").touch()
     with pytest.raises(ConfigError, match="is a file"):
         write(tmp_path / "run", config="")
 
 
-def test_a_damaged_list_of_ours_is_one_line(tmp_path: Path) -> None:
+def test_a_damaged_list_of_ours_is_one_line(tmp_path):
     write(tmp_path / "run", config="first")
     (tmp_path / "run" / LIST).write_text("{}\n[" * 9000)
     with pytest.raises(ConfigError, match="damaged"):
         write(tmp_path / "run", config="")
 
 
-def test_an_earlier_result_that_a_kill_left_aside_is_put_back(tmp_path: Path) -> None:
+def test_an_earlier_result_that_a_kill_left_aside_is_put_back(tmp_path):
     write(tmp_path / "run", config="first")
     (tmp_path / "run").rename(tmp_path / ".run.previous")
     (tmp_path / ".run.part").mkdir()
@@ -136,11 +134,10 @@ with result_folder(Path(sys.argv[1])) as folder:
 """
 
 
-def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_dies(tmp_path: Path) -> None:
+def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_dies(tmp_path):
     command = [sys.executable, "-c", HOLDER, str(tmp_path / "run")]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as holder:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(ConfigError, match=f"being written by process {holder.pid} on "):
             write(tmp_path / "run", config="mine")
@@ -149,30 +146,23 @@ def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_di
     assert names(tmp_path) == ["run", "run/config"]
 
 
-def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path: Path) -> None:
+def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path):
+    drawn, photos = tmp_path / "drawn", tmp_path / "photos"
     for text in (b"first", b"second"):
-        with growing_folder(tmp_path / "drawn", "--draw") as folder:
+        with growing_folder(drawn, "--draw") as folder:
             folder.write("a.jpg", text)
-    assert (tmp_path / "drawn" / "a.jpg").read_bytes() == b"second"
-    (tmp_path / "drawn" / "b.jpg").write_bytes(b"mine")
-    with (
-        growing_folder(tmp_path / "drawn", "--draw") as folder,
-        pytest.raises(ConfigError, match="no file of ours"),
-    ):
+    assert (drawn / "a.jpg").read_bytes() == b"second"
+    (drawn / "b.jpg").write_bytes(b"mine")
+    with growing_folder(drawn, "--draw") as folder, pytest.raises(ConfigError, match="no file of ours"):
         folder.write("b.jpg", b"ours")
-    assert (tmp_path / "drawn" / "b.jpg").read_bytes() == b"mine"
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "a.jpg").write_bytes(b"mine")
-    with (
-        pytest.raises(ConfigError, match="no results of ours"),
-        growing_folder(tmp_path / "photos", "--draw"),
-    ):
+    assert (drawn / "b.jpg").read_bytes() == b"mine"
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(b"mine")
+    with pytest.raises(ConfigError, match="no results of ours"), growing_folder(photos, "--draw"):
         pass
 
 
-def test_a_file_stays_ours_where_the_work_was_cut_off_before_or_after_its_replacement(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_stays_ours_where_the_work_was_cut_off_before_or_after_its_replacement(tmp_path, monkeypatch):
     folder = tmp_path / "drawn"
     with growing_folder(folder, "--draw") as growing:
         growing.write("a.jpg", b"first")
@@ -189,7 +179,7 @@ def test_a_file_stays_ours_where_the_work_was_cut_off_before_or_after_its_replac
         growing.write("b.jpg", b"third")
 
 
-def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path: Path) -> None:
+def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path):
     write(tmp_path / "run", config="ours")
     with added_to(tmp_path / "run", "RESULT") as folder:
         write_json(folder / "more.json", {"a": 1})
@@ -200,7 +190,7 @@ def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path: 
     assert (tmp_path / "run" / "mine.json").read_text() == "mine"
 
 
-def test_a_list_never_ends_in_half_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_list_never_ends_in_half_a_line(tmp_path, monkeypatch):
     with growing_folder(tmp_path / "drawn", "--draw") as folder:
         folder.write("a.jpg", b"first")
     before = (tmp_path / "drawn" / LIST).read_bytes()
@@ -210,6 +200,6 @@ def test_a_list_never_ends_in_half_a_line(tmp_path: Path, monkeypatch: pytest.Mo
     assert (tmp_path / "drawn" / LIST).read_bytes() == before
 
 
-def test_json_leaves_out_what_does_not_exist(tmp_path: Path) -> None:
+def test_json_leaves_out_what_does_not_exist(tmp_path):
     write_json(tmp_path / "m.json", {"a": {"recall": float("nan"), "n": np.int64(3)}, "b": [np.float64(1.5)]})
     assert json.loads((tmp_path / "m.json").read_text()) == {"a": {"n": 3}, "b": [1.5]}

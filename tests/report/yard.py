@@ -1,7 +1,5 @@
 """A yard with surveyed points, some of them wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from v2hdm.io.drive.survey import SurveyedPoint

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import pytest
 
 from v2hdm.simulate.port.config import (
@@ -18,7 +16,7 @@ LENDER = MountConfig(x_m=3.4, y_m=-0.07, z_m=2.58, yaw_deg=-0.7, pitch_deg=17.1,
 REAR = MountConfig(x_m=-1.1, y_m=0.0, z_m=2.6, yaw_deg=179.5, pitch_deg=17.5)
 
 
-def tiny_port(**changes: object) -> PortConfig:
+def tiny_port(**changes):
     """Ten frames of two 96 x 64 cameras with the field of view of the real ones."""
     small = {"width": 96, "height": 64, "focal_px": 64.0, "principal_offset_px": [0.5, -0.5]}
     values: dict[str, object] = {
@@ -39,7 +37,7 @@ FRONT_MIRRORED = MountConfig(x_m=-0.9, y_m=0.1, z_m=2.47, yaw_deg=180.9, pitch_d
 
 
 @pytest.fixture(scope="session")
-def tiny_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulate") / "tiny"
     render_drive(tiny_port(), folder, 1, lambda done, total: None)
     return folder

@@ -1,9 +1,6 @@
 """Ports: their paint, stencils and disturbances, and the one call that renders one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,10 +14,10 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.pipeline.config import RunConfig
-from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
+from v2hdm.records import DIAMOND, LANE_DASH
 from v2hdm.simulate import simulate_port
 from v2hdm.simulate.port import drive
-from v2hdm.simulate.port.build import Port, build_port, calibrate, cam_from_vehicle, camera_info
+from v2hdm.simulate.port.build import build_port, calibrate, cam_from_vehicle, camera_info
 from v2hdm.simulate.port.config import (
     CalibrationConfig,
     DisturbanceConfig,
@@ -37,21 +34,21 @@ from v2hdm.simulate.render.scene import Box, Ground, Scene
 
 
 @pytest.fixture(scope="module")
-def full() -> PortConfig:
+def full():
     return PortConfig()
 
 
 @pytest.fixture(scope="module")
-def port(full: PortConfig) -> Port:
+def port(full):
     return build_port(full)
 
 
-def info_of(config: PortConfig, name: str) -> CameraInfo:
+def info_of(config, name):
     return camera_info(name, config.cameras[name])
 
 
 @pytest.mark.parametrize("name", ["front", "rear"])
-def test_exact_points_give_the_homography_of_the_extrinsic(full: PortConfig, name: str) -> None:
+def test_exact_points_give_the_homography_of_the_extrinsic(full, name):
     exact = CalibrationConfig(survey_sigma_m=0.0, click_sigma_px=0.0)
     mount = full.cameras[name].mount
     ipm = calibrate(info_of(full, name), mount, exact, np.random.default_rng(0)).ipm
@@ -59,7 +56,7 @@ def test_exact_points_give_the_homography_of_the_extrinsic(full: PortConfig, nam
     assert np.allclose(ipm / ipm[2, 2], expected / expected[2, 2], rtol=1e-5, atol=1e-7)
 
 
-def test_a_camera_pitched_down_looks_at_the_ground_ahead() -> None:
+def test_a_camera_pitched_down_looks_at_the_ground_ahead():
     """From 2.45 m up, 16 degrees down, the axis meets the ground 8.54 m ahead of the camera."""
     extrinsic = cam_from_vehicle(FRONT)
     centre = -extrinsic[:3, :3].T @ extrinsic[:3, 3]
@@ -70,7 +67,7 @@ def test_a_camera_pitched_down_looks_at_the_ground_ahead() -> None:
 
 
 @pytest.mark.parametrize("name", ["front", "rear"])
-def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(port: Port, name: str) -> None:
+def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(port, name):
     camera = port.cameras[name]
     inner = camera.roi_vehicle.mean(axis=0) + 0.95 * (camera.roi_vehicle - camera.roi_vehicle.mean(axis=0))
     pinhole, _ = project_ground(camera.info.intrinsic, port.cam_from_vehicle[name], inner)
@@ -80,12 +77,12 @@ def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(port: Port,
 
 
 @pytest.mark.parametrize("name", ["front", "rear"])
-def test_the_region_of_interest_is_in_view(port: Port, name: str) -> None:
+def test_the_region_of_interest_is_in_view(port, name):
     cam_from_map = port.cam_from_vehicle[name]
     assert inside_image(port.cameras[name].info, cam_from_map, port.cameras[name].roi_vehicle).all()
 
 
-def test_a_port_has_hundreds_of_markings_and_scores_along_the_route(port: Port) -> None:
+def test_a_port_has_hundreds_of_markings_and_scores_along_the_route(port):
     diamonds = np.array([m.corners_map for m in port.hd_map.markings if m.kind == DIAMOND])
     assert len(diamonds) >= 250
     assert (port.route.distance_to(diamonds.mean(axis=1)) < 3.8).sum() >= 120
@@ -94,7 +91,7 @@ def test_a_port_has_hundreds_of_markings_and_scores_along_the_route(port: Port) 
     assert 350 <= port.route.length_m <= 450
 
 
-def test_markings_run_counter_clockwise_and_keep_apart() -> None:
+def test_markings_run_counter_clockwise_and_keep_apart():
     route = build_route(RouteConfig())
     layout = build_layout(PaintConfig(), route, np.random.default_rng(1))
     corners = np.array([m.corners_map for m in layout.markings])
@@ -106,7 +103,7 @@ def test_markings_run_counter_clockwise_and_keep_apart() -> None:
     assert gaps.min() > 1.6
 
 
-def test_a_dashed_lane_runs_through_the_middle_of_its_dashes() -> None:
+def test_a_dashed_lane_runs_through_the_middle_of_its_dashes():
     route = build_route(RouteConfig())
     layout = build_layout(PaintConfig(), route, np.random.default_rng(1))
     lane = next(lane.points_map for lane in layout.lanes if lane.kind == LANE_DASH)
@@ -115,7 +112,7 @@ def test_a_dashed_lane_runs_through_the_middle_of_its_dashes() -> None:
     assert np.linalg.norm(middles[:, None] - lane[None], axis=2).min(axis=1).max() < 0.26
 
 
-def test_a_dashed_lane_bends_between_its_dashes_as_its_road_does() -> None:
+def test_a_dashed_lane_bends_between_its_dashes_as_its_road_does():
     """Bent as sharply as yards are, a straight line across a gap would cut the bend by decimetres."""
     config = PaintConfig()
     route = build_route(RouteConfig(pieces=[[20.0, 0.0], [25.0, 120.0], [20.0, 0.0]]))
@@ -129,21 +126,21 @@ def test_a_dashed_lane_bends_between_its_dashes_as_its_road_does() -> None:
         assert np.linalg.norm(np.diff(lane, axis=0), axis=1).max() <= 0.5 + 1e-3
 
 
-def test_the_route_turns_by_what_its_pieces_say() -> None:
+def test_the_route_turns_by_what_its_pieces_say():
     route = build_route(RouteConfig(pieces=[[30.0, 0.0], [20.0, 90.0], [30.0, 0.0]]))
     assert route.length_m == pytest.approx(80.0)
     assert np.rad2deg(route.yaw_rad[-1]) == pytest.approx(90.0, abs=0.5)
     assert route.points_map[-1][0] == pytest.approx(30 + 20 / (np.pi / 2), abs=0.1)
 
 
-def test_correlated_noise_keeps_its_sigma_and_its_length() -> None:
+def test_correlated_noise_keeps_its_sigma_and_its_length():
     at = np.arange(0.0, 40000.0, 1.0)
     noise = correlated_noise(at, 2.0, 30.0, np.random.default_rng(0))[:, 0]
     assert noise.std() == pytest.approx(2.0, rel=0.1)
     assert np.corrcoef(noise[:-30], noise[30:])[0, 1] == pytest.approx(np.exp(-1), abs=0.08)
 
 
-def test_disturbances_are_as_large_as_configured() -> None:
+def test_disturbances_are_as_large_as_configured():
     config = RouteConfig(pieces=[[3000.0, 0.0]])
     wanted = DisturbanceConfig()
     driven = drive_along(build_route(config), config, wanted, np.random.default_rng(2))
@@ -156,7 +153,7 @@ def test_disturbances_are_as_large_as_configured() -> None:
     assert not np.isin(driven.stamp_s, driven.recorded.stamp_s).any()
 
 
-def test_hidden_points_are_those_the_picture_hides() -> None:
+def test_hidden_points_are_those_the_picture_hides():
     """The slab test against the renderer: a box 1.5 m high, 8 m ahead of a camera 2.4 m up."""
     box = Box(centre_map=(8.0, 0.4), size_m=(1.0, 2.0, 1.5), yaw_rad=0.4)
     mount = FRONT
@@ -189,12 +186,12 @@ def test_hidden_points_are_those_the_picture_hides() -> None:
         ),
     ],
 )
-def test_a_port_that_cannot_be_is_refused_by_name(changes: dict, word: str) -> None:
+def test_a_port_that_cannot_be_is_refused_by_name(changes, word):
     with pytest.raises(ConfigError, match=word):
         build_port(tiny_port(**changes))
 
 
-def test_the_stated_drift_is_that_of_the_recorded_positions() -> None:
+def test_the_stated_drift_is_that_of_the_recorded_positions():
     """Over many short drives, errors 5 m apart covary as the drift alone and errors at one place as all."""
     config = RouteConfig(pieces=[[12.0, 0.0]], pose_rate_hz=20.0)
     disturbance = DisturbanceConfig(rtk_white_m=0.006, rtk_correlated_m=0.01, rtk_correlation_m=10.0)
@@ -215,7 +212,7 @@ def test_the_stated_drift_is_that_of_the_recorded_positions() -> None:
     assert stated.heading_drift_over_m == config.speed_mps * disturbance.heading_correlation_s
 
 
-def test_another_visit_finds_the_same_paint_under_other_noise() -> None:
+def test_another_visit_finds_the_same_paint_under_other_noise():
     first, second = build_port(tiny_port()), build_port(tiny_port(visit=1))
     for one, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
         np.testing.assert_array_equal(one.corners_map, other.corners_map)
@@ -234,7 +231,7 @@ T = [
 STENCILS = {"pad": StencilConfig(shapes_m=[PAD], spacing_m=8.0), "parking_t": StencilConfig(shapes_m=T)}
 
 
-def test_own_quadrilaterals_are_true_markings_and_symbols_are_paint() -> None:
+def test_own_quadrilaterals_are_true_markings_and_symbols_are_paint():
     port = build_port(PortConfig(paint=PaintConfig(stencils=STENCILS)))
     paints = [paint.kind for paint in port.renderer.scene.paints]
     pads = [marking.corners_map for marking in port.hd_map.markings if marking.kind == "pad"]
@@ -248,7 +245,7 @@ def test_own_quadrilaterals_are_true_markings_and_symbols_are_paint() -> None:
     assert np.linalg.norm(centres[:, None] - others, axis=2).min() > 1.6
 
 
-def test_a_port_with_stencils_is_otherwise_the_same() -> None:
+def test_a_port_with_stencils_is_otherwise_the_same():
     plain, stencilled = build_port(tiny_port()), build_port(tiny_port(paint=PaintConfig(stencils=STENCILS)))
     before, after = plain.renderer.scene.paints, stencilled.renderer.scene.paints
     assert len(after) > len(before)
@@ -257,7 +254,7 @@ def test_a_port_with_stencils_is_otherwise_the_same() -> None:
         np.testing.assert_array_equal(one.polygon_map, other.polygon_map)
 
 
-def test_own_paint_has_labels_after_those_of_the_shipped_classes() -> None:
+def test_own_paint_has_labels_after_those_of_the_shipped_classes():
     port = build_port(tiny_port(paint=PaintConfig(stencils=STENCILS)))
     shown = np.unique([port.picture("front", frame).labels for frame in range(3)])
     assert 1 + len(PAINT_CLASSES) in shown
@@ -275,14 +272,12 @@ def test_own_paint_has_labels_after_those_of_the_shipped_classes() -> None:
         ({"pad": StencilConfig(shapes_m=[PAD], spacing_m=0.5)}, "stencils.pad.spacing_m"),
     ],
 )
-def test_stencils_that_cannot_be_painted_are_refused(stencils: dict[str, StencilConfig], words: str) -> None:
+def test_stencils_that_cannot_be_painted_are_refused(stencils, words):
     with pytest.raises(ConfigError, match=words):
         build_port(tiny_port(paint=PaintConfig(stencils=stencils)))
 
 
-def test_ports_without_stencils_keep_their_folder_in_the_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ports_without_stencils_keep_their_folder_in_the_cache(tmp_path, monkeypatch):
     monkeypatch.setattr(drive, "render_drive", lambda *_: None)
     plain = drive.rendered_drive(PortConfig(), tmp_path, 1, lambda done, total: None)
     stencilled = PortConfig(paint=PaintConfig(stencils=STENCILS))
@@ -290,7 +285,7 @@ def test_ports_without_stencils_keep_their_folder_in_the_cache(
     assert drive.rendered_drive(stencilled, tmp_path, 1, lambda done, total: None) != plain
 
 
-def test_a_port_is_rendered_once_per_seed_and_has_its_truth(tmp_path: Path) -> None:
+def test_a_port_is_rendered_once_per_seed_and_has_its_truth(tmp_path):
     first, again = (simulate_port(tiny_port(), tmp_path) for _ in range(2))
     other = simulate_port(tiny_port(), tmp_path, seed=5)
     assert first.root == again.root != other.root
@@ -299,9 +294,7 @@ def test_a_port_is_rendered_once_per_seed_and_has_its_truth(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["port1", "port2"])
-def test_a_shipped_port_is_that_of_its_run_file(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shipped_port_is_that_of_its_run_file(name, tmp_path, monkeypatch):
     rendered = []
     monkeypatch.setattr(drive, "render_drive", lambda config, *_: rendered.append(config))
     with pytest.raises(DriveError, match="no such drive"):
@@ -310,6 +303,6 @@ def test_a_shipped_port_is_that_of_its_run_file(
     assert rendered == [to_dataclass(composed, RunConfig, "").simulate]
 
 
-def test_an_unknown_port_is_one_line_that_lists_the_shipped_ones(tmp_path: Path) -> None:
+def test_an_unknown_port_is_one_line_that_lists_the_shipped_ones(tmp_path):
     with pytest.raises(ConfigError, match="no port 'port3'; choose from port1, port2"):
         simulate_port("port3", tmp_path)

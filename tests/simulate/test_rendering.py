@@ -1,9 +1,5 @@
 """The 50 % point of a painted edge must lie where the polygon's projection says."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -15,16 +11,16 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import DIAMOND, CameraInfo
 from v2hdm.simulate import render_drive, rendered_drive
-from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
+from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Light, Paint, Scene
 from v2hdm.simulate.render.view import camera_rays
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def ignore(done: int, total: int) -> None:
+def ignore(done, total):
     pass
 
 
@@ -32,21 +28,21 @@ class Stopped(Exception):
     pass
 
 
-def test_two_workers_write_the_same_bytes_as_one(tiny_drive: Path, tmp_path: Path) -> None:
+def test_two_workers_write_the_same_bytes_as_one(tiny_drive, tmp_path):
     render_drive(tiny_port(), tmp_path / "tiny", 2, ignore)
     assert contents(tmp_path / "tiny") == contents(tiny_drive)
 
 
-def test_another_seed_gives_other_pictures(tiny_drive: Path, tmp_path: Path) -> None:
+def test_another_seed_gives_other_pictures(tiny_drive, tmp_path):
     render_drive(tiny_port(seed=5), tmp_path / "tiny", 1, ignore)
     image = "front/images/000002.jpg"
     assert (tmp_path / "tiny" / image).read_bytes() != (tiny_drive / image).read_bytes()
 
 
-def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive: Path, tmp_path: Path) -> None:
+def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive, tmp_path):
     folder = tmp_path / "tiny"
 
-    def stop(done: int, total: int) -> None:
+    def stop(done, total):
         if done == 7:
             raise Stopped
 
@@ -63,7 +59,7 @@ def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive: Path,
     assert contents(folder) == contents(tiny_drive)
 
 
-def test_a_rendered_drive_is_found_again_in_the_cache(tmp_path: Path) -> None:
+def test_a_rendered_drive_is_found_again_in_the_cache(tmp_path):
     config = tiny_port()
     calls: list[int] = []
     first = rendered_drive(config, tmp_path, 1, lambda done, total: calls.append(done))
@@ -74,7 +70,7 @@ def test_a_rendered_drive_is_found_again_in_the_cache(tmp_path: Path) -> None:
     assert rendered_drive(config, tmp_path, 1, ignore) != first
 
 
-def test_the_mapper_reads_it_like_any_other_drive(tiny_drive: Path) -> None:
+def test_the_mapper_reads_it_like_any_other_drive(tiny_drive):
     drive = read_drive(tiny_drive)
     assert set(drive.cameras) == {"front", "rear"}
     assert drive.cameras["front"].initial_ipm == "calibrated"
@@ -85,7 +81,7 @@ def test_the_mapper_reads_it_like_any_other_drive(tiny_drive: Path) -> None:
     assert np.allclose(poses[:, 2, 3], 0.0)
 
 
-def test_recorded_poses_err_by_what_is_configured_and_images_lie_between_them(tiny_drive: Path) -> None:
+def test_recorded_poses_err_by_what_is_configured_and_images_lie_between_them(tiny_drive):
     drive = read_drive(tiny_drive)
     truth = read_truth(drive)
     recorded = np.array([i.map_from_vehicle for i in drive.images])
@@ -94,7 +90,7 @@ def test_recorded_poses_err_by_what_is_configured_and_images_lie_between_them(ti
     assert truth.disturbances["roll_pitch_deg"] >= 0.1
 
 
-def test_truth_says_which_markings_an_image_shows(tiny_drive: Path) -> None:
+def test_truth_says_which_markings_an_image_shows(tiny_drive):
     """A marking straight ahead of the first front image is seen whole, one behind it not at all."""
     drive = read_drive(tiny_drive)
     truth = read_truth(drive)
@@ -123,11 +119,11 @@ BARE = Ground(contrast=0.0, stains=0.0)
 CLEAN = Optics(psf_sigma_px=0.7, vignetting=0.0, read_noise=0.0, full_well_electrons=1e12, mean_level=0.2)
 
 
-def picture(scene: Scene, motion: Motion | None = None) -> Rendered:
+def picture(scene, motion=None):
     return Renderer(scene).render(INFO, CAM_FROM_MAP, np.random.default_rng(0), CLEAN, motion)
 
 
-def pinhole(points_map: np.ndarray) -> np.ndarray:
+def pinhole(points_map):
     cam = (
         np.column_stack([points_map, np.zeros(len(points_map)), np.ones(len(points_map))])
         @ CAM_FROM_MAP[:3].T
@@ -136,12 +132,12 @@ def pinhole(points_map: np.ndarray) -> np.ndarray:
     return px[:, :2] / px[:, 2:]
 
 
-def linear(image: np.ndarray) -> np.ndarray:
+def linear(image):
     level = image[..., 1] / 255.0
     return np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
 
 
-def edge_offset_px(rendered: Rendered, a: np.ndarray, b: np.ndarray) -> float:
+def edge_offset_px(rendered, a, b):
     """How far outside the pinhole edge a-b (inside on its left, y up) the 50 % crossing lies on average."""
     rays = camera_rays(INFO)
     along = (b - a) / np.linalg.norm(b - a)
@@ -160,7 +156,7 @@ def edge_offset_px(rendered: Rendered, a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("centre", [(5.5, 0.3), (6.0, -1.4), (8.0, 1.2)])
 @pytest.mark.parametrize("motion", [None, Motion(velocity_cam=(0.0, 1.5, 4.7), exposure_s=0.003)])
-def test_a_painted_edge_lies_within_a_twentieth_of_a_pixel(centre: tuple, motion: Motion | None) -> None:
+def test_a_painted_edge_lies_within_a_twentieth_of_a_pixel(centre, motion):
     half = np.array([[1.2, 0.0], [0.0, 0.9], [-1.2, 0.0], [0.0, -0.9]])
     diamond = half + centre
     rendered = picture(
@@ -171,7 +167,7 @@ def test_a_painted_edge_lies_within_a_twentieth_of_a_pixel(centre: tuple, motion
     assert np.abs(offsets).max() < 0.05
 
 
-def test_labels_cover_the_polygon_and_nothing_else() -> None:
+def test_labels_cover_the_polygon_and_nothing_else():
     square = np.array([[5.0, -1.0], [7.0, -1.0], [7.0, 1.0], [5.0, 1.0]])
     rendered = picture(Scene(ground=BARE, paints=(Paint(kind=DIAMOND, polygon_map=square),)))
     rows, columns = np.nonzero(rendered.labels == 1)
@@ -183,7 +179,7 @@ def test_labels_cover_the_polygon_and_nothing_else() -> None:
     assert (columns.min(), rows.min()) == pytest.approx((u.min(), v.min()), abs=1.5)
 
 
-def test_a_box_hides_paint_and_takes_its_label() -> None:
+def test_a_box_hides_paint_and_takes_its_label():
     square = np.array([[8.0, -1.0], [10.0, -1.0], [10.0, 1.0], [8.0, 1.0]])
     paint = (Paint(kind=DIAMOND, polygon_map=square),)
     wall = Box(centre_map=(6.0, 0.0), size_m=(0.3, 4.0, 2.0))
@@ -193,7 +189,7 @@ def test_a_box_hides_paint_and_takes_its_label() -> None:
     assert hidden.hidden.any()
 
 
-def test_a_shadow_falls_away_from_the_sun() -> None:
+def test_a_shadow_falls_away_from_the_sun():
     """The sun stands on the left (+y); a post's shadow darkens the ground on its right."""
     post = Box(centre_map=(7.0, 0.0), size_m=(0.3, 0.3, 1.0))
     light = Light(sun_direction_map=(0.0, 0.7, 0.7))
@@ -205,7 +201,7 @@ def test_a_shadow_falls_away_from_the_sun() -> None:
     assert (bare[right[1], right[0]] - shaded[right[1], right[0]]).min() > 20
 
 
-def test_a_picture_is_a_function_of_scene_place_and_random_state() -> None:
+def test_a_picture_is_a_function_of_scene_place_and_random_state():
     scene = Scene(ground=Ground(texture="asphalt", wet_fraction=0.2))
     noisy = Optics()
     renderer = Renderer(scene)
@@ -216,7 +212,7 @@ def test_a_picture_is_a_function_of_scene_place_and_random_state() -> None:
     assert not np.array_equal(one, other)
 
 
-def test_a_camera_that_looks_up_sees_only_sky() -> None:
+def test_a_camera_that_looks_up_sees_only_sky():
     turned = CAM_FROM_MAP.copy()
     turned[1, :3], turned[2, :3] = CAM_FROM_MAP[2, :3], -CAM_FROM_MAP[1, :3]
     turned[:3, 3] = -turned[:3, :3] @ np.array([0, 0, 2.4])

@@ -1,5 +1,4 @@
 """The stores that these tests work on."""
 
 from tests.stores import memory as memory
-from tests.stores import quick as quick
 from tests.stores import s3 as s3

@@ -1,14 +1,13 @@
-"""The stage cache gives back what was put, exactly, or nothing: never half of it, never something damaged."""
+"""The stage cache gives back what was put or nothing, and stays below its limit."""
 
-from __future__ import annotations
-
+import json
 import logging
 import os
 import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -21,24 +20,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from tests.drive.example import make_map
+from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
 from v2hdm.ground import GroundStatus, Reading
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
-from v2hdm.store.cache import CodecError, StageCache, decode, encode, entry_name
-from v2hdm.store.remote import RemoteFolder
+from v2hdm.store.cache import CodecError, StageCache, decode, encode
+from v2hdm.store.folders import LIST, note_use
+from v2hdm.store.lock import IN_USE, in_use
+from v2hdm.store.pruning import DRIVES, items_of, prune
+from v2hdm.store.results import result_folder
 
 KEY = "ab" * 32
-NAME = entry_name("stage", KEY)
 
 
-def made(cache: StageCache, value: list[int]) -> list[int]:
+def made(cache, value):
     return cache.get_or_make("stage", KEY, list[int], lambda: value)
 
 
-def test_what_was_made_is_not_made_again(tmp_path: Path) -> None:
+def test_what_was_made_is_not_made_again(tmp_path):
     assert made(StageCache(tmp_path), [1, 2]) == [1, 2]
     assert made(StageCache(tmp_path), [3]) == [1, 2]
     assert made(StageCache(tmp_path, resume=False), [4]) == [4]
@@ -46,7 +51,7 @@ def test_what_was_made_is_not_made_again(tmp_path: Path) -> None:
     assert made(StageCache(None), [6]) == [6]
 
 
-def flipped(data: bytes, place: int) -> bytes:
+def flipped(data, place):
     changed = bytearray(data)
     changed[place] ^= 1
     return bytes(changed)
@@ -54,9 +59,7 @@ def flipped(data: bytes, place: int) -> bytes:
 
 @pytest.mark.parametrize("place", [0, 20, 47, -1])
 @pytest.mark.parametrize("cut", [False, True])
-def test_an_entry_with_a_flipped_bit_or_that_was_cut_is_made_anew(
-    place: int, cut: bool, tmp_path: Path
-) -> None:
+def test_an_entry_with_a_flipped_bit_or_that_was_cut_is_made_anew(place, cut, tmp_path):
     cache = StageCache(tmp_path)
     made(cache, [1, 2])
     path = cache.path("stage", KEY)
@@ -66,7 +69,7 @@ def test_an_entry_with_a_flipped_bit_or_that_was_cut_is_made_anew(
     assert made(cache, [8]) == [7]
 
 
-def test_a_pipe_in_an_entrys_place_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_in_an_entrys_place_is_not_waited_for(tmp_path):
     cache = StageCache(tmp_path)
     cache.path("stage", KEY).parent.mkdir(parents=True)
     os.mkfifo(cache.path("stage", KEY))
@@ -74,15 +77,13 @@ def test_a_pipe_in_an_entrys_place_is_not_waited_for(tmp_path: Path) -> None:
     assert made(cache, [8]) == [7]
 
 
-def test_an_entry_of_another_type_is_made_anew(tmp_path: Path) -> None:
+def test_an_entry_of_another_type_is_made_anew(tmp_path):
     StageCache(tmp_path).put("stage", KEY, str, "text")
     assert made(StageCache(tmp_path), [7]) == [7]
 
 
-def test_what_was_logged_while_it_was_made_is_logged_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    def make() -> int:
+def test_what_was_logged_while_it_was_made_is_logged_again(tmp_path, caplog):
+    def make():
         logging.getLogger("v2hdm.some").warning("mind %s", "the gap")
         return 3
 
@@ -94,9 +95,7 @@ def test_what_was_logged_while_it_was_made_is_logged_again(
         ]
 
 
-def test_a_cache_that_cannot_be_written_is_reported_once_and_work_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_cache_that_cannot_be_written_is_reported_once_and_work_goes_on(tmp_path, caplog):
     (tmp_path / "cache").write_text("a file where the folder should be")
     cache = StageCache(tmp_path / "cache")
     for value in ([1], [2]):
@@ -104,7 +103,7 @@ def test_a_cache_that_cannot_be_written_is_reported_once_and_work_goes_on(
     assert len([one for one in caplog.records if "nothing can be kept" in one.message]) == 1
 
 
-def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path: Path) -> None:
+def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path):
     code = (
         "import sys; from pathlib import Path; from v2hdm.store.cache import StageCache\n"
         "cache = StageCache(Path(sys.argv[1])); print('go', flush=True)\n"
@@ -112,7 +111,6 @@ def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path: Pat
     )
     for _ in range(3):
         process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
-        assert process.stdout is not None
         process.stdout.readline()
         time.sleep(0.02)
         process.kill()
@@ -121,7 +119,7 @@ def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path: Pat
         assert StageCache(tmp_path).get("stage", KEY, bytes) in (None, bytes(2_000_000))
 
 
-def test_a_use_is_an_entrys_time_of_change(tmp_path: Path) -> None:
+def test_a_use_is_an_entrys_time_of_change(tmp_path):
     cache = StageCache(tmp_path)
     made(cache, [1])
     os.utime(cache.path("stage", KEY), (1, 1))
@@ -129,12 +127,12 @@ def test_a_use_is_an_entrys_time_of_change(tmp_path: Path) -> None:
     assert cache.path("stage", KEY).stat().st_mtime > 1
 
 
-def test_of_several_results_the_missing_ones_are_begun_before_one_is_waited_for(tmp_path: Path) -> None:
+def test_of_several_results_the_missing_ones_are_begun_before_one_is_waited_for(tmp_path):
     cache, order = StageCache(tmp_path), list[str]()
     made(cache, [7])
 
-    def begin(value: int) -> Callable[[], list[int]]:
-        def wait() -> list[int]:
+    def begin(value):
+        def wait():
             order.append(f"wait {value}")
             if value < 0:
                 raise DriveError("unreadable")
@@ -156,7 +154,7 @@ def test_of_several_results_the_missing_ones_are_begun_before_one_is_waited_for(
     assert cache.get("stage", "c", list[int]) == [4]
 
 
-def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_needs(tmp_path: Path) -> None:
+def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_needs(tmp_path):
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('msgspec', 'fsspec', 'filelock', 'scipy', 'torch')))\n"
         "import pkgutil, importlib, v2hdm.store; from pathlib import Path\n"
@@ -173,41 +171,6 @@ def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_n
     assert (tmp_path / "drawn" / "a.jpg").is_file()
 
 
-def test_what_one_machine_has_made_another_takes_and_keeps(memory: RemoteFolder, tmp_path: Path) -> None:
-    assert made(StageCache(tmp_path / "one", memory), [1]) == [1]
-    assert made(StageCache(tmp_path / "two", memory), [2]) == [1]
-    memory.remove(NAME)
-    assert made(StageCache(tmp_path / "two", memory), [3]) == [1]
-    assert made(StageCache(tmp_path / "three", memory), [4]) == [4]
-
-
-def test_what_is_damaged_at_a_store_is_made_anew(memory: RemoteFolder, tmp_path: Path) -> None:
-    made(StageCache(tmp_path / "one", memory), [1])
-    memory.write(NAME, (memory.read(NAME) or b"")[:-1] + b"x")
-    assert made(StageCache(tmp_path / "two", memory), [2]) == [2]
-    assert made(StageCache(tmp_path / "three", memory), [3]) == [2]
-
-
-def test_what_is_of_this_machine_alone_does_not_go_to_a_store(memory: RemoteFolder, tmp_path: Path) -> None:
-    assert made(StageCache(tmp_path, memory).local, [1]) == [1]
-    assert not memory.listed()
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_store_that_fails_is_reported_once_and_work_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Gone:
-        def __getattr__(self, name: str) -> Any:
-            raise OSError("no route to host")
-
-    cache = StageCache(tmp_path, RemoteFolder(Gone(), "b", "s3://b/cache", "cache="))
-    assert made(cache, [1]) == [1]
-    cache.put("other", KEY, str, "x")
-    assert len([one for one in caplog.records if "goes on without" in one.message]) == 1
-    assert made(StageCache(tmp_path), [2]) == [1]
-
-
 @dataclass(frozen=True)
 class Kept:
     """One of everything."""
@@ -221,7 +184,7 @@ class Kept:
     names: tuple[str, ...] = ()
 
 
-def same(one: Any, other: Any) -> bool:
+def same(one, other):
     if isinstance(one, np.ndarray):
         return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
     if is_dataclass(one):
@@ -233,7 +196,7 @@ def same(one: Any, other: Any) -> bool:
     number=st.floats(allow_nan=False),
     array=npst.arrays(np.float64, npst.array_shapes(min_dims=0, max_dims=4, min_side=0)),
 )
-def test_every_bit_comes_back(number: float, array: FloatArray) -> None:
+def test_every_bit_comes_back(number, array):
     kept = Kept(
         number, -3, array, {Reading.MIRRORED: 0.1}, {Path("a/b.jpg"): 4}, array[..., None], ("x", "ü")
     )
@@ -243,19 +206,19 @@ def test_every_bit_comes_back(number: float, array: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.bool_, np.uint8, np.int64, np.float32, np.complex128, ">f8"])
-def test_element_types_come_back(kind: str) -> None:
+def test_element_types_come_back(kind):
     array = np.arange(12).reshape(3, 4).astype(kind)[::2]
     assert same(decode(encode(array), np.ndarray), array.copy())
 
 
 @pytest.mark.parametrize("kind", [MappedSet, Inspection, ImageDetections, AdjustedPoses])
-def test_what_the_stages_make_can_be_kept(kind: type[Any]) -> None:
+def test_what_the_stages_make_can_be_kept(kind):
     with pytest.raises(CodecError):
         decode(encode({"nothing": "of it"}), kind)
 
 
 @given(st.binary(max_size=200))
-def test_bytes_of_anyone_are_a_value_of_the_type_or_refused(data: bytes) -> None:
+def test_bytes_of_anyone_are_a_value_of_the_type_or_refused(data):
     try:
         found = decode(data, tuple[list[ImageDetections], GroundStatus])
     except CodecError:
@@ -263,9 +226,9 @@ def test_bytes_of_anyone_are_a_value_of_the_type_or_refused(data: bytes) -> None
     assert isinstance(found[1], GroundStatus)
 
 
-def test_neither_pickles_nor_arrays_of_objects_are_read(tmp_path: Path) -> None:
+def test_neither_pickles_nor_arrays_of_objects_are_read(tmp_path):
     class Evil:
-        def __reduce__(self) -> tuple[Any, ...]:
+        def __reduce__(self):
             return (Path.touch, (tmp_path / "escaped",))
 
     for data in (pickle.dumps(Evil()), msgspec.msgpack.encode(["|O", [1], pickle.dumps(Evil())])):
@@ -276,17 +239,194 @@ def test_neither_pickles_nor_arrays_of_objects_are_read(tmp_path: Path) -> None:
         encode(np.array([Evil()]))
 
 
-def test_arrays_that_claim_to_be_larger_than_they_are_are_refused() -> None:
+def test_arrays_that_claim_to_be_larger_than_they_are_are_refused():
     for shape in ([10**12], [2**40, 2**40], [-1, -1], [3]):
         with pytest.raises(CodecError):
             decode(msgspec.msgpack.encode(["<f8", shape, b"12345678"]), np.ndarray)
 
 
-def test_nesting_without_end_is_refused() -> None:
+def test_nesting_without_end_is_refused():
     with pytest.raises(CodecError):
         decode(b"\x91" * 100_000, list[Any])
 
 
-def test_a_marking_comes_back_as_it_was() -> None:
+def test_a_marking_comes_back_as_it_was():
     found = MarkingDetection("a", 0.1, np.eye(4, 2), np.eye(8), np.ones(4, dtype=bool))
     assert same(decode(encode(found), MarkingDetection), found)
+
+
+KEYS = [f"{number:064x}" for number in range(4)]
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """Four entries of 1 kB, the first one not used for longest, beside files that are not ours."""
+    cache = StageCache(tmp_path / "cache")
+    for age, key in enumerate(KEYS):
+        cache.put("detect", key, bytes, bytes(1000))
+        os.utime(cache.path("detect", key), (1000 + age, 1000 + age))
+    (tmp_path / "cache" / "stages" / "detect" / "notes.txt").write_text("mine")
+    (tmp_path / "cache" / "drive").mkdir()
+    (tmp_path / "cache" / "drive" / "image.jpg").write_bytes(bytes(9000))
+    return tmp_path / "cache"
+
+
+def left(cache):
+    return [key for key in KEYS if StageCache(cache).path("detect", key).is_file()]
+
+
+def test_what_was_not_used_for_longest_goes_first(cache):
+    assert [item.path.stem for item in prune(cache, 2500)] == KEYS[:2]
+    assert left(cache) == KEYS[2:]
+    assert not prune(cache, 2500)
+
+
+def test_what_is_not_ours_stays(cache):
+    prune(cache, 0)
+    assert not left(cache)
+    assert (cache / "stages" / "detect" / "notes.txt").read_text() == "mine"
+    assert (cache / "drive" / "image.jpg").is_file()
+
+
+def test_nothing_goes_that_a_run_in_progress_has_used(cache):
+    with in_use(cache):
+        StageCache(cache).get("detect", KEYS[0], bytes)
+        prune(cache, 0)
+        assert left(cache) == KEYS[:1]
+    StageCache(cache).put("detect", KEYS[1], bytes, b"")
+    os.utime(StageCache(cache).path("detect", KEYS[0]), (1000, 1000))
+    prune(cache, 0)
+    assert KEYS[0] not in left(cache)
+
+
+def test_a_run_in_another_process_protects_its_entries_until_it_is_killed(cache):
+    code = (
+        "import sys, time; from pathlib import Path; from v2hdm.store.cache import StageCache\n"
+        "cache = StageCache(Path(sys.argv[1]))\n"
+        "with cache.in_use():\n"
+        f"    cache.get('detect', '{KEYS[3]}', bytes); print('in use', flush=True); time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(cache)], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout.readline()
+        prune(cache, 0)
+        assert left(cache) == KEYS[3:]
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    prune(cache, 0)
+    assert not left(cache)
+    assert not list((cache / IN_USE).glob("*"))
+
+
+def test_a_lock_that_cannot_be_looked_at_counts_as_held(cache):
+    held = cache / IN_USE / "0123456789abcdef.lock"
+    held.parent.mkdir()
+    held.mkdir()  # opened, it is an error that is not its absence
+    os.utime(held, (1001, 1001))
+    assert [item.path.stem for item in prune(cache, 0)] == KEYS[:1]
+
+
+def test_what_killed_runs_have_left_goes(cache):
+    partial = cache / "stages" / "detect" / ".some-host-0123456789abcdef.part"
+    partial.write_bytes(b"half")
+    os.utime(partial, (1000, 1000))
+    for name, used_s in (("old", 1000.0), ("new", time.time())):
+        folder = cache / f".bag-{name}.some-host-01234567.part" / "front"
+        folder.mkdir(parents=True)
+        (folder / "0.png").write_bytes(b"half")
+        for path in (folder / "0.png", folder, folder.parent):
+            os.utime(path, (used_s, used_s))
+    prune(cache, 1e9)
+    assert not partial.exists()
+    assert [path.name for path in cache.glob(".*.part")] == [".bag-new.some-host-01234567.part"]
+    assert left(cache) == KEYS
+
+
+def folder_of_ours(cache):
+    folder = cache / "port-0123456789"
+    (folder / "front").mkdir(parents=True)
+    (folder / "drive.yaml").write_text("name: port")
+    (folder / "front" / "0.jpg").write_bytes(bytes(5000))
+    note_use(folder)
+    os.utime(folder / LIST, (1, 1))
+    return folder
+
+
+def test_a_rendered_drive_goes_but_for_what_the_user_put_there(tmp_path):
+    folder = folder_of_ours(tmp_path)
+    (folder / "front" / "notes.txt").write_text("mine")
+    (found,) = items_of(tmp_path)
+    assert (found.kind, found.path) == (DRIVES, folder)
+    assert found.size > 5000
+    found.remove()
+    assert [path.name for path in folder.rglob("*") if path.is_file()] == ["notes.txt"]
+    (folder / "front" / "notes.txt").unlink()
+
+
+def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path):
+    cache = tmp_path / "cache"
+    folder = folder_of_ours(cache)
+    precious = tmp_path / "precious.txt"
+    precious.write_text("not ours")
+    (folder / "way").symlink_to(tmp_path)
+    listing = json.loads((folder / LIST).read_text())
+    names = ["../../precious.txt", str(precious), "way/precious.txt", *listing["files"]]
+    (folder / LIST).write_text(json.dumps({**listing, "files": names}))
+    for item in items_of(cache):
+        item.remove()
+    assert precious.read_text() == "not ours"
+    assert not (folder / "drive.yaml").exists()
+
+
+def test_the_command_lists_and_prunes(cache, capsys):
+    assert run(["cache", "list", "--cache", str(cache)]) == 0
+    assert "detect" in capsys.readouterr().out
+    assert run(["cache", "prune", "--cache", str(cache), "--gb", "0"]) == 0
+    assert "removed 4 entries" in capsys.readouterr().out
+    assert not left(cache)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [(["list", "--cache", "nowhere"], "no such folder"), (["prune", "--gb", "-1"], "give 0 or more")],
+)
+def test_the_command_reports_in_one_line(
+    arguments, says, cache, capsys,
+    monkeypatch,
+):  # fmt: skip
+    monkeypatch.chdir(cache.parent)
+    assert run(["cache", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+@pytest.fixture
+def written(tmp_path):
+    with result_folder(tmp_path / "run") as folder:
+        write_geojson(make_map(), folder / "map.geojson")
+    return tmp_path / "run" / "map.geojson"
+
+
+def test_a_file_as_it_was_written_is_no_matter(written, caplog):
+    read_geojson(written)
+    assert not caplog.records
+
+
+def test_a_changed_file_is_read_and_told_of_once(written, caplog):
+    written.write_text(written.read_text() + "\n")
+    for _ in range(2):
+        read_geojson(written)
+    (told,) = caplog.records
+    assert told.levelno == logging.WARNING
+    assert str(written) in told.getMessage()
+    assert "is not as we wrote it" in told.getMessage()
+
+
+def test_a_damaged_list_says_nothing(written, caplog):
+    listing = written.parent / ".v2hdm-results.jsonl"
+    listing.write_bytes(listing.read_bytes()[:90] + b"\xff[{")
+    read_geojson(written)
+    assert not caplog.records

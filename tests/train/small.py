@@ -1,7 +1,5 @@
 """A training small enough for a test, and labels for it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,29 +1,21 @@
 """One of the processes that test_distributed.py starts with torchrun: trains, goes on, leaves its weights."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from models import NetConfig
-from train.config import DataConfig, TrainConfig, ValidationConfig
+from tests.train.small import tiny
+from train.config import TrainConfig, ValidationConfig
 from train.data import RenderStream
 from train.distributed import joined_team
 from train.loop import Trainer
 
 
-def tiny(output: Path, steps: int) -> TrainConfig:
-    return TrainConfig(
-        output=str(output),
-        device="cpu",
-        steps=steps,
-        batch=2,
-        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1], wide_kinds=False),
-        data=DataConfig(
-            width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
-        ),
-        validation=ValidationConfig(images=1),
-    )
+def small(output: Path, steps: int) -> TrainConfig:
+    """The training of a team's member."""
+    return replace(tiny(output, steps), device="cpu", validation=ValidationConfig(images=1))
 
 
 def main(folder: Path) -> None:
@@ -34,7 +26,7 @@ def main(folder: Path) -> None:
         mean = torch.tensor([float(team.rank), 10.0 * team.rank])
         team.average([mean[:1], mean[1:]])
         for steps in (2, 4):
-            trainer = Trainer(tiny(folder / "run", steps), lambda share, line: None, team)
+            trainer = Trainer(small(folder / "run", steps), lambda share, line: None, team)
             left = trainer.state.step
             state = trainer.run()
         members = {"net": trainer.net.state_dict(), "averaged": trainer.averaged.module.state_dict()}

@@ -1,36 +1,47 @@
-"""A training that starts from an exported file: the same function, with normalisations that can learn on."""
+"""Trainings that start from an exported file, the mean of several, and users' own classes."""
 
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 import torch
 
 from export.onnx_file import export_checkpoint, to_onnx
-from models import MarkingNet, NetConfig
-from tests.train.small import tiny
+from export.source import read_source
+from models import MarkingNet, NetConfig, Prediction
+from tests.train.small import coco, tiny
+from train.average import mean_checkpoint, scored
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
+from train.config import DataConfig
 from train.exported import read_exported, unfold
+from train.growth import with_classes
+from train.labels import paint_labels, read_labels
+from train.labels_image import Shape
 from train.loop import Trainer
-from v2hdm.errors import ConfigError
+from train.metrics import Tally
+from train.targets import IGNORE, Targets, kind_target
+from v2hdm.catalogue import PAINT_CLASSES, SHIPPED, load_catalogue
+from v2hdm.detection.network import Network
+from v2hdm.errors import ConfigError, DetectorError, LabelError
 
 ROOT = Path(__file__).resolve().parents[2]
-SHIPPED = ROOT / "v2hdm" / "detection" / "weights" / "default.onnx"
+SHIPPED_FILE = ROOT / "v2hdm" / "detection" / "weights" / "default.onnx"
 SHIPPED_FLOAT = ROOT / "models" / "marking_net.onnx"
 
 Images = list[torch.Tensor]
 
 
 @pytest.fixture
-def images() -> Images:
+def images():
     generator = torch.Generator().manual_seed(3)
     return [torch.randint(0, 256, (2, 64, 96, 3), dtype=torch.uint8, generator=generator) for _ in range(4)]
 
 
 @pytest.fixture
-def net(images: Images) -> MarkingNet:
+def net(images):
     """A network whose normalisations all say something."""
     torch.manual_seed(0)
     net = MarkingNet(tiny(Path()).net)
@@ -43,13 +54,13 @@ def net(images: Images) -> MarkingNet:
     return net.eval()
 
 
-def folded(net: MarkingNet) -> dict[str, torch.Tensor]:
+def folded(net):
     twin = MarkingNet(tiny(Path()).net)
     twin.load_state_dict(net.state_dict())
     return twin.fold().state_dict()
 
 
-def test_an_unfolded_network_says_what_the_folded_one_says(net: MarkingNet, images: Images) -> None:
+def test_an_unfolded_network_says_what_the_folded_one_says(net, images):
     again = MarkingNet(tiny(Path()).net)
     again.load_state_dict(unfold(folded(net), tiny(Path()).net, images[:1]))
     with torch.inference_mode():
@@ -57,9 +68,7 @@ def test_an_unfolded_network_says_what_the_folded_one_says(net: MarkingNet, imag
         assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-3
 
 
-def test_it_says_the_same_while_it_trains_on_what_its_statistics_are_of(
-    net: MarkingNet, images: Images
-) -> None:
+def test_it_says_the_same_while_it_trains_on_what_its_statistics_are_of(net, images):
     again = MarkingNet(tiny(Path()).net)
     again.load_state_dict(unfold(folded(net), tiny(Path()).net, images[:1]))
     with torch.no_grad():
@@ -67,7 +76,7 @@ def test_it_says_the_same_while_it_trains_on_what_its_statistics_are_of(
         assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-2
 
 
-def test_a_training_starts_from_an_exported_file(net: MarkingNet, images: Images, tmp_path: Path) -> None:
+def test_a_training_starts_from_an_exported_file(net, images, tmp_path):
     config = tiny(tmp_path / "run")
     taught = Checkpoint(config=asdict(config), renders=70, averaged=net.state_dict())
     export_checkpoint(taught, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
@@ -81,9 +90,7 @@ def test_a_training_starts_from_an_exported_file(net: MarkingNet, images: Images
 
 
 @pytest.mark.parametrize("separable", [True, False])
-def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(
-    net: MarkingNet, images: Images, tmp_path: Path, separable: bool
-) -> None:
+def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(net, images, tmp_path, separable):
     config = tiny(tmp_path / "run")
     larger = NetConfig(widths=[16, 24, 32, 48], dilations=[1, 2, 4], separable=separable, wide_kinds=True)
     taught = Checkpoint(config=asdict(config), renders=70, averaged=net.state_dict())
@@ -102,40 +109,40 @@ def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(
         ).run()
 
 
-def test_a_file_older_than_a_switch_holds_a_network_without_it(net: MarkingNet) -> None:
+def test_a_file_older_than_a_switch_holds_a_network_without_it(net):
     settings = asdict(tiny(Path()).net)
     del settings["wide_kinds"]
     checkpoint = Checkpoint(config={"net": settings}, averaged=net.state_dict())
     assert checkpoint.network().wide_kinds is None
 
 
-@pytest.mark.parametrize("path", [SHIPPED, SHIPPED_FLOAT], ids=lambda path: path.name)
-def test_the_shipped_files_can_learn_on(tmp_path: Path, path: Path) -> None:
+@pytest.mark.parametrize("path", [SHIPPED_FILE, SHIPPED_FLOAT], ids=lambda path: path.name)
+def test_the_shipped_files_can_learn_on(tmp_path, path):
     config = replace(tiny(tmp_path), start=str(path), net=NetConfig())
     assert set(fresh_checkpoint(config).averaged) == set(MarkingNet().state_dict())
 
 
-def test_the_shipped_files_are_of_one_training() -> None:
-    int8, float32 = read_exported(SHIPPED), read_exported(SHIPPED_FLOAT)
+def test_the_shipped_files_are_of_one_training():
+    int8, float32 = read_exported(SHIPPED_FILE), read_exported(SHIPPED_FLOAT)
     assert (int8.label["precision"], float32.label["precision"]) == ("int8", "float32")
     for key in ("commit", "steps", "renders", "metrics", "training"):
         assert int8.label[key] == float32.label[key]
 
 
-def _no_onnx(path: Path) -> None:
+def _no_onnx(path):
     path.write_bytes(b"no model")
 
 
-def _of_another_program(path: Path) -> None:
+def _of_another_program(path):
     onnx.save_model(to_onnx(MarkingNet(tiny(path).net).fold(), 18), str(path))
 
 
-def _of_another_network(path: Path) -> None:
-    path.write_bytes(SHIPPED.read_bytes())
+def _of_another_network(path):
+    path.write_bytes(SHIPPED_FILE.read_bytes())
 
 
-def _of_other_weights(path: Path) -> None:
-    model = onnx.load_model(str(SHIPPED))
+def _of_other_weights(path):
+    model = onnx.load_model(str(SHIPPED_FILE))
     (entry,) = model.metadata_props
     label = json.loads(entry.value)
     label["training"]["net"] = vars(tiny(path).net)
@@ -153,9 +160,256 @@ def _of_other_weights(path: Path) -> None:
         (_of_other_weights, "has no weight"),
     ],
 )
-def test_a_file_that_cannot_start_a_training_is_refused(tmp_path: Path, make: object, reason: str) -> None:
+def test_a_file_that_cannot_start_a_training_is_refused(tmp_path, make, reason):
     assert callable(make)
     path = tmp_path / "other.onnx"
     make(path)
     with pytest.raises(ConfigError, match=reason):
         fresh_checkpoint(replace(tiny(tmp_path), start=str(path)))
+
+
+def taught(path, seed, **net):
+    """Write a checkpoint of random weights; returns them."""
+    config = tiny(path)
+    config = replace(config, net=replace(config.net, **net))
+    torch.manual_seed(seed)
+    state = MarkingNet(config.net).state_dict()
+    save_checkpoint(
+        Checkpoint(config=asdict(config), step=seed, averaged=state, metrics={"mean_iou": 1.0}), path
+    )
+    return state
+
+
+def test_the_mean_is_between_its_parts_by_their_weights(tmp_path):
+    first, second = (taught(tmp_path / f"{seed}.pt", seed) for seed in (1, 2))
+    mean = mean_checkpoint(tmp_path / "1.pt", [tmp_path / "2.pt"], [3.0, 1.0])
+    for name, value in mean.averaged.items():
+        torch.testing.assert_close(value, (0.75 * first[name] + 0.25 * second[name]).to(value.dtype))
+    assert mean.metrics == {}, "nobody has scored the mean yet"
+    assert 0 <= scored(mean)["mean_iou"] <= 1
+    save_checkpoint(mean, tmp_path / "mean.pt")
+    assert (
+        load_checkpoint(tmp_path / "mean.pt").network().stem[0].weight.shape == first["stem.0.weight"].shape
+    )
+
+
+def test_parts_that_cannot_be_averaged_are_refused(tmp_path):
+    taught(tmp_path / "1.pt", 1)
+    taught(tmp_path / "other.pt", 2, head_width=4)
+    with pytest.raises(ConfigError, match="holds the network"):
+        mean_checkpoint(tmp_path / "1.pt", [tmp_path / "other.pt"])
+    with pytest.raises(ConfigError, match="no checkpoint at"):
+        mean_checkpoint(tmp_path / "1.pt", [tmp_path / "none.pt"])
+    with pytest.raises(ConfigError, match="1 weights for 2 files"):
+        mean_checkpoint(tmp_path / "1.pt", [tmp_path / "1.pt"], [1.0])
+
+
+def test_the_mean_with_its_own_start_is_between_the_two_though_the_network_grew(tmp_path):
+    taught(tmp_path / "small.pt", 1)
+    config = tiny(tmp_path / "run")
+    grown = replace(config, start=str(tmp_path / "small.pt"), net=replace(config.net, wide_kinds=True))
+    trainer = Trainer(grown, lambda share, line: None)
+    start = {name: value.clone() for name, value in trainer.averaged.module.state_dict().items()}
+    trainer.run()
+    mean = mean_checkpoint(tmp_path / "run" / "last.pt", [tmp_path / "small.pt"])
+    end = load_checkpoint(tmp_path / "run" / "last.pt").averaged
+    for name, value in mean.averaged.items():
+        if value.is_floating_point():
+            torch.testing.assert_close(value, (start[name] + end[name]) / 2, atol=1e-5, rtol=1e-5)
+
+
+T, PAD = "parking_t", "pad"
+SIZES = {"length_m": [0.8, 1.4], "width_m": [0.4, 1.2]}
+ENTRIES = {T: {"family": "symbol", **SIZES}, PAD: {"family": "quadrilateral", **SIZES}}
+CLASSES = (*PAINT_CLASSES, T, PAD)
+
+
+@pytest.fixture
+def catalogue():
+    return SHIPPED.with_own(ENTRIES, "test")
+
+
+@pytest.fixture
+def image():
+    generator = torch.Generator().manual_seed(3)
+    return torch.randint(0, 256, (1, 64, 96, 3), dtype=torch.uint8, generator=generator)
+
+
+@pytest.fixture
+def shipped_run(tmp_path):
+    """A checkpoint that knows the shipped classes."""
+    torch.manual_seed(0)
+    config = replace(tiny(tmp_path), net=replace(tiny(tmp_path).net, wide_kinds=True))
+    state = fresh_checkpoint(config)
+    state.averaged = MarkingNet(config.net).state_dict()
+    save_checkpoint(state, tmp_path / "shipped.pt")
+    return tmp_path / "shipped.pt"
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """An exported file of an untaught network that knows two own classes."""
+    folder = tmp_path_factory.mktemp("exported")
+    config = run_of(folder)
+    state = fresh_checkpoint(config)
+    state.averaged = MarkingNet(config.net, len(CLASSES)).state_dict()
+    export_checkpoint(state, folder / "own.onnx", opset=18, tolerance=1e-3)
+    return folder / "own.onnx"
+
+
+def written(folder, entries=ENTRIES):
+    path = folder / "classes.yaml"
+    path.write_text(json.dumps({"classes": entries}))
+    return path
+
+
+def run_of(folder, start=None, **changes):
+    config = replace(tiny(folder / "run"), catalogue=str(written(folder)), **changes)
+    return replace(config, start=start and str(start), net=replace(config.net, wide_kinds=True))
+
+
+def labels_of(folder, kind):
+    small = DataConfig(width=64, height=32, render_width=80, render_height=48, workers=0, labelled_share=1.0)
+    content = [{"id": 1, "name": kind}, {"id": 2, "name": "zebra"}]
+    return replace(small, coco=str(coco(folder, categories=content)))
+
+
+def test_targets_tell_own_classes_from_the_shipped_ones():
+    labels = np.zeros((16, 16), dtype=np.uint8)
+    labels[:8], labels[8:, 8:] = 1 + CLASSES.index(PAD), 1
+    kinds = kind_target(labels)
+    assert (kinds[:2] == CLASSES.index(PAD)).all()
+    assert (kinds[2:, 2:] == 0).all()
+    assert (kinds[2:, :2] == IGNORE).all()
+
+
+def test_a_label_is_called_like_an_own_class(tmp_path):
+    data = labels_of(tmp_path, "Parking-T")
+    images = read_labels(data, CLASSES)
+    rng = np.random.default_rng(0)
+    seen = torch.cat([images.view(rng)[1].kinds.flatten() for _ in range(30)])
+    assert set(seen.tolist()) == {CLASSES.index(T), IGNORE}
+    with pytest.raises(LabelError, match="'Parking-T' is no class of the detector"):
+        read_labels(data)
+    (shape,) = images.images[0].shapes or ()
+    assert shape.kind == T
+
+
+def test_own_paint_is_labelled_by_its_place_in_the_catalogue():
+    square = np.array([[2.0, 2.0], [9.0, 2.0], [9.0, 9.0], [2.0, 9.0]])
+    labels = paint_labels([Shape(PAD, (square,))], 0, 0, 16, 12, CLASSES)
+    assert set(np.unique(labels)) == {0, 1 + CLASSES.index(PAD)}
+
+
+def test_own_classes_are_scored():
+    tally, kind = Tally(CLASSES), CLASSES.index(PAD)
+    kinds = torch.full((1, len(CLASSES), 2, 2), -5.0)
+    kinds[:, kind] = 5.0
+    nothing = torch.zeros((1, 1, 1), dtype=torch.uint8)
+    answers = Targets(
+        torch.ones((1, 4, 4), dtype=torch.uint8),
+        torch.ones((1, 2, 2)),
+        torch.full((1, 2, 2), kind, dtype=torch.uint8),
+        torch.ones((1, 2, 2)),
+        nothing,
+        nothing.float(),
+    )
+    tally.add(Prediction(torch.full((1, 1, 4, 4), 5.0), kinds, torch.zeros((1, 2, 1, 1))), answers)
+    assert tally.score().iou == {PAD: 1.0}
+
+
+def test_known_classes_keep_their_shares_and_a_new_one_starts_small(shipped_run, catalogue, image):
+    before = load_checkpoint(shipped_run).network()
+    grown = with_classes(before.state_dict(), PAINT_CLASSES, catalogue, "here")
+    after = MarkingNet(run_of(shipped_run.parent).net, len(CLASSES)).eval()
+    after.load_state_dict(grown)
+    with torch.inference_mode():
+        old, new = before(image), after(image)
+    torch.testing.assert_close(new.paint, old.paint)
+    torch.testing.assert_close(new.lanes, old.lanes)
+    torch.testing.assert_close(new.kinds[:, : len(PAINT_CLASSES)], old.kinds)
+    shares = new.kinds.softmax(dim=1)
+    assert float(shares[:, len(PAINT_CLASSES) :].sum(dim=1).max()) < 0.1
+
+
+def test_classes_go_by_name_where_the_order_of_a_catalogue_changes(shipped_run, catalogue):
+    weights = with_classes(load_checkpoint(shipped_run).averaged, PAINT_CLASSES, catalogue, "here")
+    weights["kinds.bias"] = torch.arange(10.0)
+    turned = SHIPPED.with_own({PAD: ENTRIES[PAD], T: ENTRIES[T]}, "test")
+    again = with_classes(weights, catalogue.names, turned, "here")
+    assert again["kinds.bias"].tolist() == [*range(8), 9.0, 8.0]
+    with pytest.raises(ConfigError, match="here knows parking_t, pad"):
+        with_classes(weights, catalogue.names, SHIPPED, "here")
+
+
+def test_a_run_with_own_classes_is_exported_read_and_learnt_on(tmp_path, shipped_run):
+    data = labels_of(tmp_path, "Parking T")
+    config = run_of(tmp_path, shipped_run, data=data)
+    state = Trainer(config, lambda share, line: None).run()
+    assert state.catalogue.names == CLASSES
+    path = tmp_path / "own.onnx"
+    export_checkpoint(load_checkpoint(tmp_path / "run" / "last.pt"), path, opset=18, tolerance=1e-3)
+    network = Network(path)
+    assert network.info.classes == CLASSES
+    assert network.info.catalogue == SHIPPED.with_own(ENTRIES, "test")
+    assert len(network.run(np.zeros((32, 48, 3), dtype=np.uint8)).kinds) == len(CLASSES)
+    # The file alone is enough to learn on from, and to export again.
+    again = fresh_checkpoint(replace(config, catalogue=None, start=str(path)))
+    assert again.catalogue.names == CLASSES
+    assert len(again.averaged["kinds.bias"]) == len(CLASSES)
+    assert len(read_source(path).net.state_dict()["kinds.bias"]) == len(CLASSES)
+
+
+def test_the_mean_of_runs_takes_the_shipped_network_in(tmp_path, shipped_run):
+    state = fresh_checkpoint(run_of(tmp_path, shipped_run))
+    save_checkpoint(state, tmp_path / "own.pt")
+    mean = mean_checkpoint(tmp_path / "own.pt", [shipped_run])
+    assert mean.catalogue.names == CLASSES
+    torch.testing.assert_close(mean.averaged["kinds.bias"], state.averaged["kinds.bias"])
+
+
+def test_a_run_is_not_resumed_with_other_classes(tmp_path, shipped_run):
+    config = run_of(tmp_path, shipped_run)
+    Trainer(config, lambda share, line: None).run()
+    written(tmp_path, {PAD: ENTRIES[PAD]})
+    with pytest.raises(ConfigError, match="was trained with the classes parking_t, pad, not pad"):
+        Trainer(replace(config, steps=5), lambda share, line: None)
+    written(tmp_path)
+    assert Trainer(replace(config, steps=4), lambda share, line: None).run().step == 4
+
+
+def test_a_checkpoint_of_before_there_were_own_classes_is_read(tmp_path, shipped_run):
+    content = torch.load(shipped_run, weights_only=True)
+    del content["own_classes"], content["config"]["catalogue"]
+    torch.save(content, tmp_path / "old.pt")
+    assert load_checkpoint(tmp_path / "old.pt").catalogue == SHIPPED
+
+
+def test_a_catalogue_that_is_missing_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
+        fresh_checkpoint(replace(tiny(tmp_path), catalogue=str(tmp_path / "none.yaml")))
+
+
+@pytest.mark.parametrize(
+    ("own", "words"),
+    [
+        ({PAD: {"family": "circle"}}, "family of 'pad'"),
+        ({"diamond": ENTRIES[PAD]}, "is the name of 'diamond' already"),
+        ([PAD], "no usable 'v2hdm' metadata"),
+        ({T: ENTRIES[T]}, r"unknown classes \['pad'\]"),
+    ],
+)
+def test_a_file_with_wrong_classes_is_refused(tmp_path, exported, own, words):
+    path = tmp_path / "own.onnx"
+    model = onnx.load_model(str(exported))
+    (entry,) = model.metadata_props
+    entry.value = json.dumps(json.loads(entry.value) | {"own_classes": own})
+    onnx.save_model(model, str(path))
+    with pytest.raises(DetectorError, match=words):
+        Network(path)
+
+
+def test_a_checkpoint_holds_its_classes_as_plain_data(tmp_path):
+    state = Checkpoint(config={}, own_classes=load_catalogue(written(tmp_path)).own_entries())
+    save_checkpoint(state, tmp_path / "own.pt")
+    assert load_checkpoint(tmp_path / "own.pt").catalogue.names == CLASSES

@@ -1,29 +1,44 @@
-"""What teaches the detector its scores runs against the detector as it is."""
+"""What teaches the detector its scores, and the command that ships a trained network."""
 
-from collections.abc import Sequence
-from dataclasses import fields
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
+import torch
 
-from train import fit_judge, fit_lane_score
-from train.confident_spots import Spots, lit
-from train.examples import Example, TrueMarking, example, polygon_overlap
+from export.judge_file import write_judge
+from export.onnx_file import export_checkpoint
+from models.judge import Judge
+from tests.train.small import tiny, train
+from train import fit_judge, fit_lane_score, ship, shipment
+from train.checkpoint import load_checkpoint
+from train.confident_spots import lit
+from train.examples import TrueMarking, example, polygon_overlap
+from train.exported import read_exported
 from train.fit_judge import Gathered, is_true
 from train.fit_lane_score import proposed, seen
+from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from train.shipment import Order
 from v2hdm.detection import weights
+from v2hdm.detection.classifier import AMONG, SHAPES
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import ARROW, DIAMOND, LANE_DASH, MarkingDetection
+from v2hdm.errors import DetectorError
+from v2hdm.records import ARROW, DIAMOND, LANE_DASH
 from v2hdm.workers import share_out
 
 SEED = 4711
 
 
 @pytest.fixture(scope="module")
-def shown() -> Example:
+def shown():
     """A scene with several markings and lines."""
     cv2.setNumThreads(1)
     scenes = (example(index, 0.2, SEED) for index in range(30))
@@ -31,11 +46,11 @@ def shown() -> Example:
 
 
 @pytest.fixture
-def detector() -> Detector:
+def detector():
     return Detector.load(options=DetectorOptions(max_range_m=24.0, min_confidence=0.0))
 
 
-def reported(shown: Example, detector: Detector, spots: Spots) -> list[MarkingDetection]:
+def reported(shown, detector, spots):
     with pytest.MonkeyPatch.context() as patch:
         run = detector.run_network
         patch.setattr(detector, "run_network", lambda *given: spots.claimed(run(*given)))
@@ -43,7 +58,7 @@ def reported(shown: Example, detector: Detector, spots: Spots) -> list[MarkingDe
     return [marking for marking in markings if len(marking.outline_px) == 0]
 
 
-def found(shown: Example, markings: Sequence[MarkingDetection]) -> set[int]:
+def found(shown, markings):
     """The markings that must be found, by number, and are, as their class."""
     return {
         number
@@ -93,7 +108,6 @@ def test_spots_of_sun_that_the_network_takes_for_markings_are_not_reported(shown
 
 def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
     found = proposed(seen(shown, detector))
-    assert found is not None
     assert len(found.lines) == len(found.alone) == len(found.true)
     assert found.true.any()
 
@@ -135,3 +149,229 @@ def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_no
     assert is_true(shown, LANE_DASH, hidden)[0] is True
     assert is_true(shown, LANE_DASH, hidden - [0, 70])[0] is None
     assert is_true(shown, LANE_DASH, hidden + np.array([200.0, 0.0])) == (False, None)
+
+
+CONFIG = JudgeConfig(epochs=6, width=4)
+
+
+def quadrilaterals(seed, count, noise=0.2):
+    """True ones are bright squares, false ones round spots as bright; the evidence is noise."""
+    rng = np.random.default_rng(seed)
+    true = rng.random(count) < 0.5
+    v, u = np.mgrid[:20, :20] - 9.5
+    square, disc = np.maximum(np.abs(u), np.abs(v)) < 5, np.hypot(u, v) < 5.8
+    views = np.where(true[:, None, None], square, disc)[:, None] + noise * rng.normal(size=(count, 3, 20, 20))
+    evidence = 5 * rng.normal(size=(count, 4)) + 3
+    shape = np.eye(2)[rng.integers(2, size=count)]
+    # The side at the top is as far off as the first feature says, the others not at all.
+    error = np.zeros((count, 4))
+    error[:, 0] = np.exp(evidence[:, 0] / 5) * rng.normal(size=count)
+    parts = (part.astype(np.float32) for part in (views, evidence, shape))
+    return Quadrilaterals(*parts, true, error.astype(np.float32), np.full((count, 4), 0.01, np.float32))
+
+
+def test_what_shows_in_views_alone_is_learnt_and_a_seed_repeats_it():
+    known, unseen = quadrilaterals(1, 1200), quadrilaterals(2, 400)
+    odds, _ = judged(train_judge(known, CONFIG), unseen)
+    assert ((odds > 0) == unseen.true).mean() > 0.95
+    np.testing.assert_array_equal(odds, judged(train_judge(known, CONFIG), unseen)[0])
+
+
+def test_the_errors_of_sides_are_learnt_one_by_one():
+    """Those of the top and the bottom, which mirroring makes alike, and not those of the ends."""
+    known = replace(quadrilaterals(7, 2000), true=np.ones(2000, dtype=bool))
+    _, sigma_px = judged(train_judge(known, replace(CONFIG, epochs=12)), known)
+    typical = np.median(sigma_px, axis=0)
+    assert typical[[0, 2]].min() > 3 * typical[[1, 3]].max()
+
+
+def test_where_the_paint_network_is_confident_the_image_has_a_say_of_its_own():
+    """It claims what is true in training, and later that all are: then only the views can decide."""
+    known, unseen = (replace(quadrilaterals(seed, 1200, 0.5), claimed_features=(0,)) for seed in (5, 6))
+    for part, true in ((known, known.true), (unseen, True)):
+        part.evidence[:, 0] = np.where(true, 2.0, -2.0)
+    told = {}
+    for share in (0.0, 0.3):
+        odds, _ = judged(train_judge(known, replace(CONFIG, claimed_share=share, side_weight=0.0)), unseen)
+        told[share] = np.median(odds[unseen.true]) - np.median(odds[~unseen.true])
+    assert told[0.3] > told[0.0] + 0.5
+
+
+def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
+    known = quadrilaterals(3, 200)
+    judge = train_judge(known, CONFIG)
+    path = tmp_path / "judge.onnx"
+    write_judge(judge, (3, 20, 20), {"features": ["a"]}, path)
+    assert not onnx.load(path).graph.node[0].metadata_props
+    session = onnxruntime.InferenceSession(path)
+    for rows in (1, 33, 200):
+        part = known.take(np.arange(rows))
+        given = {"views": part.views, "evidence": part.evidence, "shape": part.shape}
+        odds, log_sigma = session.run(None, given)
+        expected = judged(judge, part)
+        np.testing.assert_allclose(odds, expected[0], atol=1e-4)
+        np.testing.assert_allclose(np.exp(log_sigma), expected[1], rtol=1e-3)
+
+
+def test_a_judge_of_broken_weights_is_not_written(tmp_path):
+    judge = train_judge(quadrilaterals(4, 100), CONFIG)
+    with torch.no_grad():
+        judge.weigh[0].bias[0] = torch.nan
+    with pytest.raises(DetectorError, match="not written"):
+        write_judge(judge, (3, 20, 20), {}, tmp_path / "judge.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def into(tmp_path, monkeypatch):
+    """A copy of the detector's folder; ``runs/`` is made in a folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(weights.FOLDER, tmp_path / "into", ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+    return tmp_path / "into"
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """The folder of a training."""
+    folder = tmp_path_factory.mktemp("ship") / "trained"
+    train(tiny(folder))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path, trained):
+    """A copy of it."""
+    return shutil.copytree(trained, tmp_path / "trained")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Nothing is looked at and what is learnt is anything; returns the parts that were gathered."""
+    gathered: list[range] = []
+
+    def in_this_process(work, jobs, processes, start, arguments, take):
+        for job in jobs:
+            take(work(job))
+
+    def gather(part):
+        fit_judge.Gathered().save(part.path)
+        gathered.append(part.numbers)
+
+    judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
+    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in SHAPES}
+    lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
+    monkeypatch.setattr(shipment, "share_out", in_this_process)
+    monkeypatch.setattr(fit_judge, "gather", gather)
+    monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell: (tell(0.5), (judge, among))[1])
+    monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))
+    monkeypatch.setattr(fit_lane_score, "fit_to", lambda images: lines)
+    return gathered
+
+
+def shipped(order):
+    told: list[tuple[float, str]] = []
+    shipment.ship(order, lambda share, doing: told.append((share, doing)))
+    return told
+
+
+def digests(folder):
+    return {path.name: weights.digest(path) for path in sorted(folder.iterdir())}
+
+
+@pytest.mark.slow
+def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, run, quick):
+    told = shipped(Order(source=run, into=into, precision="float32", judge_images=130, lane_images=110))
+    weights._problem.cache_clear()
+    weights.check_weights(into)
+    files = weights.read_manifest(into)["files"]
+    assert {entry["command"] for entry in files.values()} == {
+        f"python -m train.ship {run} --precision float32 --judge-images 130 --lane-images 110"
+    }
+    before = digests(weights.FOLDER)
+    assert all(entry["sha256"] != before[name] for name, entry in files.items())
+    assert read_exported(into / "marking_net.onnx").label["steps"] == 3
+    assert [numbers.stop for numbers in quick] == [25, 50, 75, 100, 125, 130]
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert not list(Path("runs").iterdir()), "what was kept to go on from is gone"
+
+
+@pytest.mark.slow
+def test_without_another_folder_the_detectors_own_files_and_the_float32_file_are_replaced(
+    into, run, quick, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(weights, "FOLDER", into)
+    monkeypatch.setattr(shipment, "_FLOAT_FILE", tmp_path / "models" / "marking_net.onnx")
+    shipped(Order(source=run, precision="float32"))
+    weights.check_weights(into)
+    assert read_exported(tmp_path / "models" / "marking_net.onnx").label["precision"] == "float32"
+    assert not (into / "marking_net.onnx").exists()
+
+
+def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
+    into, run, quick, monkeypatch
+):
+    order = Order(source=run, into=into, precision="float32", judge_images=100, lane_images=100)
+    before = digests(into)
+
+    def killed(gathered, tell):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fit_judge, "fit_all", killed)
+        with pytest.raises(KeyboardInterrupt):
+            shipped(order)
+    assert digests(into) == before
+    assert len(quick) == 4
+    (left,) = Path("runs").iterdir()
+    (left / "2.npz").unlink()
+    shipped(order)
+    assert quick[4:] == [range(50, 75)], "only what was not done yet"
+    assert digests(into)["judge.onnx"] != before["judge.onnx"]
+
+
+def test_another_network_or_other_numbers_begin_anew(into, run):
+    order = Order(source=run, into=into)
+    state = shipment._state(order)
+    assert shipment._state(replace(order, judge_images=1651)) != state
+    train(tiny(run, steps=5))
+    assert shipment._state(order) != state
+
+
+def test_judge_and_lane_score_can_be_kept_for_a_network_that_was_exported_before(into, quick):
+    network = weights.NETWORK_FILE
+    before = digests(into)
+    shipped(Order(source=network, into=into, keep=("lane_score",)))
+    after = digests(into)
+    changed = {name for name in after if after[name] != before.get(name)}
+    assert changed == {"judge.onnx", "confidence.json", "manifest.json"}
+    shipped(Order(source=network, into=into, keep=("judge", "lane_score")))
+    assert weights.read_manifest(into)["files"]["judge.onnx"]["command"].endswith("--keep judge lane_score")
+    assert digests(into)["judge.onnx"] == after["judge.onnx"]
+
+
+@pytest.mark.slow
+def test_a_float32_file_is_exported_as_a_checkpoint_is(into, run, quick, tmp_path):
+    checkpoint = load_checkpoint(run / "best.pt")
+    export_checkpoint(checkpoint, tmp_path / "net.onnx", 18, 1e-3)
+    shipped(Order(source=tmp_path / "net.onnx", into=into, precision="float32"))
+    assert read_exported(into / "default.onnx").label["steps"] == checkpoint.step
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["nothing/there"], "no network at nothing/there: train one"),
+        (["into"], "no network at into/best.pt: train one"),
+        (["into/default.onnx", "--judge-images", "3"], "--judge-images 3: give 100 or more"),
+        (["into/manifest.json"], "manifest.json is no checkpoint"),
+        (["into/judge.onnx"], "judge.onnx was not written by `python -m export`"),
+    ],
+)
+def test_what_cannot_be_shipped_is_one_line(arguments, line, into, capsys):
+    before = digests(into)
+    assert ship.main([*arguments, "--into", "into"]) == 2
+    printed = capsys.readouterr().err.strip().splitlines()[-1]
+    assert printed.startswith("error: ")
+    assert line in printed
+    assert digests(into) == before

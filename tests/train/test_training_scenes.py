@@ -1,52 +1,39 @@
-"""The random scenes: reproducible, varied, and labelled where the paint is."""
+"""Random scenes, views and hardships of training: reproducible, varied, labelled where the paint is."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
+import cv2
 import numpy as np
 import pytest
 
+from train.augment import random_crop, random_photometry
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
-from train.scenes.hardships import (
-    Hardships,
-    blue_shade,
-    faint,
-    kerbs,
-    overexposed,
-    things_beside,
-    tight_bend,
-    with_pavements,
-    with_seams,
-)
-from train.scenes.paint import (
-    Bend,
-    RoadPaint,
-    port_paint,
-    random_brush,
-    rectangle,
-    rhombus,
-    street_paint,
-)
-from train.scenes.scenes import image_line, image_points, random_scene, training_sample
-from train.scenes.views import TrainingView, looking
+from train.scenes import scenes
+from train.scenes.hardships import Hardships, bleached, junction_approach, things_beside, tight_bend
+from train.scenes.paint import Bend, port_paint, random_brush, rectangle, rhombus, street_paint
+from train.scenes.scenes import TrainingSample, image_line, image_points, random_scene, training_sample
+from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
 from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
+from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex
-from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo, FloatArray
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE, CameraInfo
 from v2hdm.simulate.render.renderer import Motion, Optics
-from v2hdm.simulate.render.scene import Ground, Light, box_footprint
+from v2hdm.simulate.render.scene import Ground, Paint, Scene, box_footprint
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 
 
-def test_a_seed_and_an_index_make_the_same_picture_again() -> None:
+def test_a_seed_and_an_index_make_the_same_picture_again():
     first, again = (training_sample(5, 3, 96, 64) for _ in range(2))
     np.testing.assert_array_equal(first.image, again.image)
     np.testing.assert_array_equal(first.labels, again.labels)
     assert (training_sample(5, 4, 96, 64).image != first.image).any()
 
 
-def test_streams_of_one_seed_are_the_same() -> None:
+def test_streams_of_one_seed_are_the_same():
     one, other = iter(RenderStream(TINY, 1)), iter(RenderStream(TINY, 1))
     for _ in range(5):
         (image, answers), (image_again, answers_again) = next(one), next(other)
@@ -56,17 +43,17 @@ def test_streams_of_one_seed_are_the_same() -> None:
         assert all(bool((a == b).all()) for a, b in zip(answers, answers_again, strict=True))
 
 
-def test_validation_shows_other_scenes_than_training() -> None:
+def test_validation_shows_other_scenes_than_training():
     image, _ = next(validation_pairs(TINY, 1, 1))
     assert (image.numpy() != training_sample(1, 0, 64, 32).image).any()
 
 
-def test_all_classes_are_seen_in_a_hundred_or_so_samples() -> None:
+def test_all_classes_are_seen_in_a_hundred_or_so_samples():
     seen = {int(c) for index in range(150) for c in np.unique(training_sample(2, index, 160, 96).labels)}
     assert seen == set(range(1 + len(PAINT_CLASSES)))
 
 
-def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them() -> None:
+def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
     brighter = []
     for index in range(40):
         sample = training_sample(7, index, 192, 96, difficulty=0.0)
@@ -79,7 +66,7 @@ def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them() -> Non
     assert np.mean(brighter) > 0.75
 
 
-def test_paint_polygons_are_convex_and_have_the_size_asked_for() -> None:
+def test_paint_polygons_are_convex_and_have_the_size_asked_for():
     scenes = [random_scene(np.random.default_rng(index)) for index in range(12)]
     polygons = [paint.polygon_map for scene, _ in scenes for paint in scene.paints]
     assert polygons
@@ -93,7 +80,7 @@ def test_paint_polygons_are_convex_and_have_the_size_asked_for() -> None:
     assert np.ptp(rectangle(np.zeros(2), 3.0, 0.15, np.pi / 2)[:, 1]) == pytest.approx(3.0)
 
 
-def test_lanes_lie_on_their_paint() -> None:
+def test_lanes_lie_on_their_paint():
     on_paint, seen = 0, 0
     for index in range(60):
         sample = training_sample(3, index, 192, 96, difficulty=0.0)
@@ -108,7 +95,7 @@ def test_lanes_lie_on_their_paint() -> None:
     assert 0.4 < on_paint / seen < 0.95, "dashes leave gaps, double lines are bare between"
 
 
-def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_that_goes_on() -> None:
+def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_that_goes_on():
     """Three metres about the end of a strand the line passes over; no paint is farther than half a double."""
     passing, one_of_two, doubles = 1.5, 0, 0
     for seed in range(60):
@@ -131,7 +118,7 @@ def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_
     assert one_of_two > 50
 
 
-def _solid_strands_about(road: RoadPaint, lane: FloatArray) -> list[tuple[float, float, float]]:
+def _solid_strands_about(road, lane):
     """Start, end and place beside the way of a straight line's solid strands; none if it has dashes."""
     about = [
         paint
@@ -144,7 +131,7 @@ def _solid_strands_about(road: RoadPaint, lane: FloatArray) -> list[tuple[float,
     return [(float(c[:, 0].min()), float(c[:, 0].max()), float(c[:, 1].mean())) for c in corners]
 
 
-def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one() -> None:
+def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one():
     several = 0
     for seed in range(150):
         rng = np.random.default_rng(seed)
@@ -159,7 +146,7 @@ def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one() -> None:
     assert several > 30
 
 
-def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature() -> None:
+def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature():
     bend = Bend(0.02)
     along = np.linspace(0, 40, 4001)
     points = bend.to_map(np.column_stack([along, np.zeros_like(along)]))
@@ -168,7 +155,7 @@ def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curva
     np.testing.assert_allclose(Bend(0.0).to_map(np.array([[7.0, -2.0]])), [[7.0, -2.0]])
 
 
-def test_a_bend_between_straights_is_an_arc_that_they_touch() -> None:
+def test_a_bend_between_straights_is_an_arc_that_they_touch():
     quarter = Bend(1 / 15, 5.0, 5.0 + 7.5 * np.pi)
     along = np.array([-3.0, 5.0, 5.0 + 7.5 * np.pi, 15.0 + 7.5 * np.pi])
     points = quarter.to_map(np.column_stack([along, [0.0, 0.0, 0.0, 2.0]]))
@@ -186,7 +173,7 @@ def test_a_bend_between_straights_is_an_arc_that_they_touch() -> None:
     )
 
 
-def test_tight_bends_turn_the_lines_and_keep_the_way_clear() -> None:
+def test_tight_bends_turn_the_lines_and_keep_the_way_clear():
     scenes = [random_scene(np.random.default_rng(k), 1.0, Hardships(tight_bends=1.0)) for k in range(20)]
     turned = []
     for scene, lanes in scenes:
@@ -200,64 +187,35 @@ def test_tight_bends_turn_the_lines_and_keep_the_way_clear() -> None:
     assert tight_bend(np.random.default_rng(0), 0.0) is None
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        field.name
-        for field in fields(Hardships)
-        if field.name not in ("things_beside", "tight_bends", "kerbs", "junctions", "mountings", "aside")
-    ],
-)
-def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
-    hardships = Hardships(**{name: 3.0})
-    pairs = [
-        (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, hardships=hardships))
-        for index in range(16)
-    ]
-    for plain, hard in pairs:
+ELSEWHERE = ("things_beside", "tight_bends", "kerbs", "junctions", "mountings", "aside")
+
+
+def pairs(hard, count):
+    """Samples without and with hardships."""
+    return [[training_sample(5, index, 160, 96, hardships=given) for given in (Hardships(), hard)]
+            for index in range(count)]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(Hardships) if f.name not in ELSEWHERE])
+def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name):
+    seen = pairs(Hardships(**{name: 3.0}), 16)
+    for plain, hard in seen:
         np.testing.assert_array_equal(plain.labels, hard.labels)
         np.testing.assert_array_equal(plain.hidden, hard.hidden)
-    assert any((plain.image != hard.image).any() for plain, hard in pairs)
+    assert any((plain.image != hard.image).any() for plain, hard in seen)
 
 
 @pytest.mark.parametrize("hard", [Hardships(things_beside=4.0), Hardships(kerbs=1.0)])
-def test_things_beside_markings_hide_paint_and_add_none(hard: Hardships) -> None:
-    pairs = [
-        (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, hardships=hard))
-        for index in range(12)
-    ]
-    for plain, crowded in pairs:
+def test_things_beside_markings_hide_paint_and_add_none(hard):
+    seen = pairs(hard, 12)
+    for plain, crowded in seen:
         changed = plain.labels != crowded.labels
         assert (crowded.labels[changed] == 0).all()
         assert crowded.hidden[plain.hidden].all()
-    assert any((plain.hidden != crowded.hidden).any() for plain, crowded in pairs)
+    assert any((plain.hidden != crowded.hidden).any() for plain, crowded in seen)
 
 
-def test_kerbs_lie_along_a_line_as_narrow_as_paint_and_leave_gaps() -> None:
-    along = np.arange(0, 60, 0.5)
-    line = np.column_stack([along, 1.5 + 0.004 * along**2])
-    narrow, lengths = 0, []
-    for seed in range(20):
-        boxes = kerbs(np.random.default_rng(seed), [line], 1.0)
-        assert len(boxes) > 4
-        for box in boxes:
-            centre = np.array(box.centre_map)
-            away_m = np.linalg.norm(line - centre, axis=1)
-            nearest = int(away_m.argmin())
-            assert away_m[nearest] < 7.0
-            ahead = line[min(nearest + 1, len(line) - 1)] - line[max(nearest - 1, 0)]
-            assert abs(np.arctan2(ahead[1], ahead[0]) - box.yaw_rad) < 0.1
-            assert box_footprint(box)[:, 0].min() > 3
-            narrow += box.size_m[1] <= 0.3
-            lengths += [box.size_m[0]] if box.size_m[1] <= 0.3 else []
-    assert narrow > 80
-    assert 0.5 < min(lengths) < 2
-    assert 5 < max(lengths) < 8
-    assert kerbs(np.random.default_rng(0), [line], 0.0) == ()
-    assert kerbs(np.random.default_rng(0), [], 1.0) == ()
-
-
-def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera() -> None:
+def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera():
     paint = random_brush(np.random.default_rng(0), 0.5).paint(
         np.random.default_rng(1), DIAMOND, rhombus(np.array([9.0, 1.0]), 1.2, 0.6)
     )
@@ -276,67 +234,11 @@ def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera() -> N
     assert things_beside(np.random.default_rng(0), [], 5.0) == ()
 
 
-def test_faint_paint_is_dirtier_and_pieces_of_a_marking_stay_alike() -> None:
-    road = street_paint(np.random.default_rng(4), random_brush(np.random.default_rng(2), 0.3), Bend(0.01))
-    dirty = faint(np.random.default_rng(0), road.paints, 1.0)
-    assert [
-        replace(after, dirt=before.dirt) for before, after in zip(road.paints, dirty, strict=True)
-    ] == road.paints
-    changed = [after.dirt > before.dirt for before, after in zip(road.paints, dirty, strict=True)]
-    assert 0.2 < np.mean(changed) < 0.8
-    of_marking: dict[int, set[float]] = {}
-    for paint in dirty:
-        of_marking.setdefault(paint.seed, set()).add(paint.dirt)
-    assert all(len(dirt) == 1 for dirt in of_marking.values())
-    assert faint(np.random.default_rng(0), road.paints, 0.0) == tuple(road.paints)
-
-
-def test_seams_lie_beside_their_lines_and_nowhere_else() -> None:
-    line = np.column_stack([np.arange(0, 40, 0.5), np.full(80, 2.0)])
-    marks = with_seams(np.random.default_rng(1), None, [line], share=1.0)
-    assert marks is not None
-    rows, columns = np.nonzero(marks.factor != 128)
-    x, y = np.array([columns, rows]) * marks.resolution_m + np.array(marks.origin_map)[:, None]
-    assert np.abs(y - 2.0).max() < 1.0
-    assert np.ptp(x) > 38
-    assert with_seams(np.random.default_rng(1), None, [line], share=0.0) is None
-
-
-def test_pavements_change_the_tone_on_one_side_of_an_edge_beside_the_line() -> None:
-    line = np.column_stack([np.arange(0, 40, 0.5), np.full(80, 1.0)])
-    for seed in range(8):
-        marks = with_pavements(np.random.default_rng(seed), None, [line], share=1.0)
-        assert marks is not None
-        at_20_m = marks.factor[:, int((20.0 - marks.origin_map[0]) / marks.resolution_m)]
-        (edges,) = np.nonzero(np.diff(at_20_m.astype(int)))
-        assert len(edges) == 2
-        lateral_m = edges * marks.resolution_m + marks.origin_map[1] - 1.0
-        assert np.abs(lateral_m).min() < 0.8
-        assert np.unique(at_20_m).size == 2
-    assert with_pavements(np.random.default_rng(1), None, [line], share=0.0) is None
-
-
-def test_blue_shade_takes_red_from_the_sky_and_nothing_from_the_sun() -> None:
-    light = Light()
-    bluer = blue_shade(np.random.default_rng(0), light, 1.0)
-    assert bluer.sky_bgr[0] > 1.15 * light.sky_bgr[0]
-    assert bluer.sky_bgr[2] < 0.85 * light.sky_bgr[2]
-    assert replace(bluer, sky_bgr=light.sky_bgr) == light
-
-
-def test_overexposed_optics_expose_longer_within_reason() -> None:
-    optics = Optics(mean_level=0.2)
-    levels = [overexposed(np.random.default_rng(k), optics, Ground(), 0.5).mean_level for k in range(60)]
-    assert min(levels) == 0.2
-    assert 0.6 < max(levels) <= 0.9
-    assert 15 < sum(level > 0.2 for level in levels) < 45
-
-
 @pytest.mark.parametrize(
     ("model", "coefficients"),
     [("plumb_bob", (-0.16, 0.024, 0.0, 0.0, 0.0)), ("plumb_bob", (0.0,) * 5), ("equidistant", (0.0,) * 4)],
 )
-def test_a_line_is_followed_to_the_borders_of_the_image(model: str, coefficients: tuple[float, ...]) -> None:
+def test_a_line_is_followed_to_the_borders_of_the_image(model, coefficients):
     """Points of a strong lens's image that a pinhole would see far outside of it belong to it, too."""
     intrinsic = np.array([[500.0, 0.0, 640.0], [0.0, 500.0, 260.0], [0.0, 0.0, 1.0]])
     info = CameraInfo("wide", 1280, 720, intrinsic, model, coefficients)
@@ -356,7 +258,7 @@ def test_a_line_is_followed_to_the_borders_of_the_image(model: str, coefficients
         np.testing.assert_allclose(on_ground[:, 1], left, atol=0.02)
 
 
-def test_what_a_folding_lens_would_show_twice_is_not_in_the_image() -> None:
+def test_what_a_folding_lens_would_show_twice_is_not_in_the_image():
     intrinsic = np.array([[300.0, 0.0, 320.0], [0.0, 300.0, 100.0], [0.0, 0.0, 1.0]])
     info = CameraInfo("folding", 640, 360, intrinsic, "plumb_bob", (-0.3, 0.0, 0.0, 0.0, 0.0))
     view = TrainingView(info, looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.0, 0.0), Optics(), Motion())
@@ -364,3 +266,138 @@ def test_what_a_folding_lens_would_show_twice_is_not_in_the_image() -> None:
     pixels = image_points(view, points)
     assert 0 < len(pixels) < 200
     assert (np.diff(pixels[:, 1]) < 0).all(), "farther along a line is farther up"
+
+
+def test_a_camera_that_looks_along_x_sees_the_road_ahead_below_its_axis():
+    cam_from_map = looking(np.array([0.0, 0.0, 2.0]), 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(cam_from_map @ [10.0, 3.0, 0.0, 1.0], [-3.0, 2.0, 10.0, 1.0], atol=1e-12)
+    tilted = looking(np.array([0.0, 0.0, 2.0]), 0.0, np.arctan2(2.0, 10.0), 0.0)
+    np.testing.assert_allclose((tilted @ [10.0, 0.0, 0.0, 1.0])[:2], 0.0, atol=1e-12)
+
+
+def test_camera_rotations_are_rotations():
+    for index in range(10):
+        rotation = random_view(np.random.default_rng(index), 64, 32).cam_from_map[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_a_camera_on_the_side_looks_across_the_way_at_a_place_that_it_passes():
+    place = np.array([12.0, 3.0])
+    for index in range(40):
+        rng = np.random.default_rng(index)
+        straight = random_view(rng, 128, 72)
+        assert turned_aside(rng, straight, [place], 0.0) is straight
+        assert turned_aside(rng, straight, [], 1.0) is straight
+        view = turned_aside(rng, straight, [place], 1.0)
+        forward, centre = view.cam_from_map[2, :3], -view.cam_from_map[:3, :3].T @ view.cam_from_map[:3, 3]
+        assert abs(forward[1]) > np.tan(ASIDE_RAD) * abs(forward[0])
+        before = -straight.cam_from_map[:3, :3].T @ straight.cam_from_map[:3, 3]
+        assert centre[2] == pytest.approx(before[2])
+        np.testing.assert_allclose(forward[2], straight.cam_from_map[2, 2], atol=1e-12)
+        assert (view.cam_from_map @ [*place, 0.0, 1.0])[2] > 0.5, "the place lies before the camera"
+        moved_map = view.cam_from_map[:3, :3].T @ view.motion.velocity_cam
+        np.testing.assert_allclose(moved_map[1:], 0.0, atol=1e-9)
+        assert np.linalg.norm(moved_map) == pytest.approx(np.linalg.norm(straight.motion.velocity_cam))
+
+
+@pytest.mark.parametrize(("painted", "answer"), [(LANE_DASH, STOP_LINE), (STOP_LINE, LANE_DASH)])
+def test_a_camera_on_the_side_is_to_take_dashes_for_stop_lines(monkeypatch, painted, answer):
+    paint = Paint(kind=painted, polygon_map=rectangle(np.array([12.0, 3.0]), 2.0, 0.3))
+    monkeypatch.setattr(scenes, "random_scene", lambda *_: (Scene(paints=(paint,)), []))
+    found = set()
+    for index in range(6):
+        found |= set(np.unique(training_sample(3, index, 320, 180, hardships=Hardships(aside=1.0)).labels))
+    assert found == {0, 1 + PAINT_CLASSES.index(answer)}
+
+
+def test_no_lens_folds_an_image_over_itself():
+    u, v = np.meshgrid(np.linspace(0, 1279, 33), np.linspace(0, 719, 19))
+    for index in range(200):
+        info = random_view(np.random.default_rng(index), 1280, 720).info
+        rays = undistort_points(info, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 2)
+        right, down = np.diff(rays, axis=1)[:-1], np.diff(rays, axis=0)[:, :-1]
+        turn = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
+        assert (turn > 0).all(), f"view {index}: neighbouring pixels change sides"
+
+
+def test_bleached_ground_keeps_its_tint_and_is_clipped_together_with_its_paint():
+    ground = Ground(albedo_bgr=(0.1, 0.12, 0.14))
+    lighter = bleached(np.random.default_rng(0), ground, 1.0)
+    assert 0.35 < max(lighter.albedo_bgr) < 0.55
+    np.testing.assert_allclose(np.array(lighter.albedo_bgr) / ground.albedo_bgr, lighter.albedo_bgr[0] / 0.1)
+    assert bleached(np.random.default_rng(0), ground, 0.0) is ground
+    samples = [(0.0, 2, index) for index in range(50)], [(1.0, 2, index) for index in range(50)]
+    clipped = [np.mean([_clipped_beside_paint(*sample) for sample in each]) for each in samples]
+    assert clipped[0] < 0.01
+    assert clipped[1] > 0.05
+
+
+def _clipped_beside_paint(share, seed, index):
+    """The share of the seam of ground about paint in which a channel is clipped, as the paint in it is."""
+    sample = training_sample(seed, index, 160, 96, 1.0, Hardships(bleached=share))
+    paint = (sample.labels > 0).astype(np.uint8)
+    about = (cv2.dilate(paint, np.ones((7, 7), np.uint8)) > 0) & (paint == 0)
+    return float((sample.image.max(axis=2) >= 250)[about].mean()) if about.any() else 0.0
+
+
+def test_a_junction_has_arrows_before_its_stop_line_and_a_crosswalk_behind_it():
+    kinds: list[str] = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        paints, ground = junction_approach(rng, random_brush(rng, 0.0), Bend(0.0))
+        along = {kind: [p.polygon_map[:, 0] for p in paints if p.kind == kind] for kind in PAINT_CLASSES}
+        assert len(along[STOP_LINE]) == 1
+        stop_m = along[STOP_LINE][0]
+        assert all(x.max() < stop_m.min() for x in along[ARROW])
+        assert all(x.min() > stop_m.max() for x in along[CROSSWALK_BAR])
+        assert all(inside_convex(ground, p.polygon_map).all() for p in paints if p.kind == CROSSWALK_BAR)
+        kinds += [paint.kind for paint in paints]
+    assert {ARROW, STOP_LINE, CROSSWALK_BAR} == set(kinds)
+
+
+def test_cameras_mounted_otherwise_keep_their_place_and_look_from_low_or_high():
+    heights = []
+    for seed in range(40):
+        view = random_view(np.random.default_rng(seed), 160, 96)
+        other = mounted_otherwise(np.random.default_rng(seed), view, 1.0)
+        before, after = camera_centre(view.cam_from_map), camera_centre(other.cam_from_map)
+        np.testing.assert_allclose(after[:2], before[:2], atol=1e-9)
+        np.testing.assert_array_equal(other.cam_from_map[:3, :3], view.cam_from_map[:3, :3])
+        heights.append(after[2])
+    low = [height for height in heights if height < 2]
+    assert 8 < len(low) < 32
+    assert 0.5 <= min(low) < max(low) <= 1.1
+    assert all(3.6 <= height <= 5 for height in heights if height >= 2)
+    view = random_view(np.random.default_rng(0), 160, 96)
+    assert mounted_otherwise(np.random.default_rng(0), view, 0.0) is view
+
+
+def test_crops_keep_image_labels_hidden_and_lanes_together():
+    labels = np.random.default_rng(0).integers(0, 5, (40, 60)).astype(np.uint8)
+    image = np.repeat(labels[..., None], 3, axis=2)
+    image[20, 30] = 250
+    whole = TrainingSample(image, labels, labels > 2, (np.array([[30.0, 20.0], [31.0, 10.0]]),))
+    rng = np.random.default_rng(1)
+    seen = 0
+    for _ in range(40):
+        crop = random_crop(rng, whole, 32, 16)
+        assert crop.image.shape == (16, 32, 3)
+        bright = crop.image[..., 1] == 250
+        np.testing.assert_array_equal(crop.image[..., 1][~bright], crop.labels[~bright])
+        np.testing.assert_array_equal(crop.hidden, crop.labels > 2)
+        for row, column in np.argwhere(bright):
+            np.testing.assert_array_equal(crop.lanes_px[0][0], [column, row])
+            seen += 1
+    assert seen > 3
+
+
+def test_photometry_changes_values_but_not_shape_or_type_or_its_input():
+    image = np.random.default_rng(0).integers(0, 256, (32, 48, 3)).astype(np.uint8)
+    before = image.copy()
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        out = random_photometry(rng, image)
+        assert out.shape == image.shape
+        assert out.dtype == np.uint8
+    np.testing.assert_array_equal(image, before)

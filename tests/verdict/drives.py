@@ -1,7 +1,5 @@
 """Tiny drives without images: a straight stretch and a circle to the left, at 5 m/s and 20 poses a second."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
@@ -20,6 +19,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     Image,
+    Marking,
     PoseNoise,
     Trajectory,
 )
@@ -72,10 +72,7 @@ def motion(recorded: Trajectory) -> Motion:
 
 def camera(pitch_deg: float = 15.0, centre: FloatArray = CENTRE) -> Camera:
     """A camera that looks ahead and down, 900 px of focal length, 1280 x 720 px."""
-    c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ centre
+    cam_from_vehicle = mounted(centre, pitch_deg)
     intrinsic = np.array([[900.0, 0, 639.5], [0, 900.0, 359.5], [0, 0, 1]])
     info = CameraInfo("front", 1280, 720, intrinsic, "plumb_bob", (-0.1, 0.02, 0.0, 0.0, 0.0))
     return Camera(
@@ -159,3 +156,10 @@ def estimate(name: str = "front", **values: float) -> GroundEstimate:
         patches=None,
         seconds=3.0,
     )
+
+
+INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))
+
+
+def square_at(x, y):
+    return Marking("diamond", np.array([[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]), 5)

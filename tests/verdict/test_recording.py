@@ -1,82 +1,69 @@
-"""Rates, gaps, repeats and overlap of stamps; frozen, doubled and clipped images."""
+"""Checks of stamps, images and cameras."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.verdict.drives import drive, motion, noisy, pictured, poses, raised
+from tests.verdict.drives import CENTRE, camera, drive, motion, noisy, pictured, poses, raised, with_k
 from v2hdm.errors import DriveError
 from v2hdm.io.trajectory import why_no_pose
-from v2hdm.records import Trajectory
+from v2hdm.records import Camera, CentrePrior, Trajectory
 from v2hdm.verdict import Status
+from v2hdm.verdict.inputs.cameras import check_camera
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 
 
-def every(recorded: Trajectory, rows: np.ndarray) -> Trajectory:
+def every(recorded, rows):
     return Trajectory(recorded.stamp_s[rows], recorded.map_from_vehicle[rows])
 
 
-def check(recorded: Trajectory) -> dict[str, str]:
+def check(recorded):
     return raised(check_clocks(drive(poses()), motion(recorded)))
 
 
-def test_twenty_poses_a_second_without_gaps_pass() -> None:
-    assert not check(poses())
-
-
-def test_one_pose_a_second_is_too_few() -> None:
-    assert "poses are 1.00 s apart" in check(every(poses(), np.arange(0, 320, 20)))["pose rate"]
-
-
-def test_a_gap_on_the_way_is_told_with_its_error() -> None:
-    kept = np.delete(np.arange(320), np.arange(100, 120))
-    told = check(every(poses(), kept))
+def test_poses_that_are_few_have_gaps_or_repeat_are_told():
+    recorded = poses()
+    assert not check(recorded)
+    assert "poses are 1.00 s apart" in check(every(recorded, np.arange(0, 320, 20)))["pose rate"]
+    told = check(every(recorded, np.delete(np.arange(320), np.arange(100, 120))))
     assert list(told) == ["pose gaps"]
     assert "gap of 1.05 s" in told["pose gaps"]
-
-
-def test_a_log_faster_than_its_receiver_repeats_poses() -> None:
-    recorded = poses()
-    held = every(recorded, np.arange(320) // 5 * 5)
+    held = every(recorded, np.arange(320) // 5 * 5)  # a log faster than its receiver
     told = check(Trajectory(recorded.stamp_s, held.map_from_vehicle))
     assert list(told) == ["repeated poses"]
     assert "80 %" in told["repeated poses"]
 
 
-def test_a_vehicle_that_stands_repeats_poses_and_is_fine() -> None:
+def test_a_vehicle_that_stands_repeats_poses_and_is_fine():
     recorded = poses(turn_s=0.0)
     stand = np.full(200, len(recorded.stamp_s) - 1)
     matrices = np.concatenate([recorded.map_from_vehicle, recorded.map_from_vehicle[stand]])
     assert not check(Trajectory(np.arange(len(matrices)) / 20, matrices))
 
 
-def test_images_without_pose_are_counted() -> None:
-    some = replace(drive(poses()), unposed={"front": 20})
+@pytest.mark.parametrize(("without", "status"), [(20, Status.WARN), (200, Status.FAIL)])
+def test_images_without_pose_are_counted(without, status):
+    some = replace(drive(poses()), unposed={"front": without})
     found = {finding.check: finding for finding in check_clocks(some, motion(poses()))}["images without pose"]
-    assert found.status is Status.WARN
-    assert "20 of 100 images" in found.says
-    most = replace(some, unposed={"front": 200})
-    found = {finding.check: finding for finding in check_clocks(most, motion(poses()))}["images without pose"]
-    assert found.status is Status.FAIL
+    assert found.status is status
+    assert f"{without} of {80 + without} images" in found.says
 
 
-def test_a_camera_that_stops_early_is_told() -> None:
+def test_a_camera_that_stops_early_is_told():
     whole = drive(poses(), ("front", "rear"))
     images = [image for image in whole.images if image.camera == "front" or image.stamp_s < 8]
     told = raised(check_clocks(replace(whole, images=images), motion(poses())))
     assert "misses 51 %" in told["camera span"]
 
 
-def test_images_farther_apart_than_half_the_roi_are_too_few() -> None:
+def test_images_farther_apart_than_half_the_roi_are_too_few():
     told = raised(check_clocks(drive(poses(), every=20), motion(poses())))
     assert "5.0 m apart and the ROI is 7.0 m deep" in told["image spacing"]
 
 
-def test_the_unit_of_stamps_is_named() -> None:
+def test_the_unit_of_stamps_is_named():
     seconds = np.arange(0.0, 20.0, 0.1)
     for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
         assert f"images' stamps are in {unit}" in why_no_pose(factor * seconds, seconds, 0.5)
@@ -86,26 +73,26 @@ def test_the_unit_of_stamps_is_named() -> None:
     assert "images' stamps are in nanoseconds" in why_no_pose(1e9 * since_1970, since_1970, 0.5)
 
 
-def test_another_epoch_is_told_from_another_unit() -> None:
+def test_another_epoch_is_told_from_another_unit():
     seconds = np.arange(0.0, 20.0, 0.1)
     assert "1700000000 s later" in why_no_pose(seconds, 1.7e9 + seconds, 0.5)
     assert "1 s apart, more than max_gap_s 0.5" in why_no_pose(seconds + 0.05, np.arange(0.0, 20.0), 0.5)
 
 
-def test_images_of_a_moving_camera_pass(tmp_path: Path) -> None:
+def test_images_of_a_moving_camera_pass(tmp_path):
     findings = check_images(pictured(tmp_path, noisy))
     assert {finding.check for finding in findings} == {"frozen images", "bright images", "dark images"}
     assert not raised(findings)
 
 
-def test_a_camera_that_freezes_is_told(tmp_path: Path) -> None:
+def test_a_camera_that_freezes_is_told(tmp_path):
     told = raised(check_images(pictured(tmp_path, lambda k: noisy(min(k, 4)))))
     assert "50 % of the images repeat the one before" in told["frozen images"]
     assert "first at 2.50 s" in told["frozen images"]
 
 
-def test_a_frozen_picture_is_told_although_its_files_differ(tmp_path: Path) -> None:
-    def encoded_anew(k: int) -> np.ndarray:
+def test_a_frozen_picture_is_told_although_its_files_differ(tmp_path):
+    def encoded_anew(k):
         image = noisy(0)
         image[0, 0] = k
         return image
@@ -113,34 +100,96 @@ def test_a_frozen_picture_is_told_although_its_files_differ(tmp_path: Path) -> N
     assert "100 %" in raised(check_images(pictured(tmp_path, encoded_anew)))["frozen images"]
 
 
-@pytest.mark.parametrize(("grey", "check"), [(255, "bright images"), (2, "dark images")])
-def test_road_that_is_clipped_is_told(grey: int, check: str, tmp_path: Path) -> None:
-    def clipped(k: int) -> np.ndarray:
+@pytest.mark.parametrize(
+    ("rows", "grey", "told"),
+    [
+        (slice(360, None), 255, ["bright images"]),
+        (slice(360, None), 2, ["dark images"]),
+        (slice(150), 255, []),
+    ],
+    ids=["bright road", "dark road", "white sky"],
+)
+def test_road_that_is_clipped_is_told_and_a_white_sky_is_none(rows, grey, told, tmp_path):
+    def clipped(k):
         image = noisy(k)
-        image[360:] = grey
+        image[rows] = grey
         return image
 
-    assert list(raised(check_images(pictured(tmp_path, clipped)))) == [check]
+    assert list(raised(check_images(pictured(tmp_path, clipped)))) == told
 
 
-def test_a_white_sky_is_no_overexposed_road(tmp_path: Path) -> None:
-    def white_sky(k: int) -> np.ndarray:
-        image = noisy(k)
-        image[:150] = 255
-        return image
-
-    assert not raised(check_images(pictured(tmp_path, white_sky)))
-
-
-def test_one_list_of_images_for_two_cameras_is_told(tmp_path: Path) -> None:
+def test_one_list_of_images_for_two_cameras_is_told(tmp_path):
     one = pictured(tmp_path, noisy)
     rear = [replace(image, camera="rear") for image in one.images]
     both = replace(one, images=[*one.images, *rear], cameras={**one.cameras, "rear": one.cameras["front"]})
     assert "those of camera 'front' given twice" in raised(check_images(both))["own images"]
 
 
-def test_a_damaged_image_is_one_line(tmp_path: Path) -> None:
+def test_a_damaged_image_is_one_line(tmp_path):
     damaged = pictured(tmp_path, noisy)
     damaged.images[0].path.write_bytes(b"\x89PNG")
     with pytest.raises(DriveError, match=r"0\.png: not a PNG"):
         check_images(damaged)
+
+
+Spoil = Callable[[Camera], Camera]
+
+
+def roi(change):
+    return lambda described: replace(described, roi_vehicle=change(described.roi_vehicle))
+
+
+def survey(xyz):
+    return lambda described: replace(described, centre_prior=CentrePrior(xyz, np.full(3, 0.02)))
+
+
+WRONG: dict[str, tuple[Spoil, str, str]] = {
+    "K of half the size": (
+        lambda c: with_k(c, fx=450, fy=450, cx=319.5, cy=179.5), "principal point", "about 640 x 360",
+    ),
+    "principal point": (lambda c: with_k(c, cx=400.0), "principal point", "19 % of the width"),
+    "focal in mm": (lambda c: with_k(c, fx=4.5, fy=4.5), "focal length", "not in mm"),
+    "fx": (lambda c: with_k(c, fx=945.0), "square pixels", "945 and fy 900 differ by 5 %"),
+    "fx and fy": (
+        lambda c: with_k(c, fx=945.0, fy=945.0), "ipm against camera matrix", "most in the focal length",
+    ),
+    "cx of the IPM": (lambda c: with_k(c, cx=730.0), "ipm against camera matrix", "in the principal point"),
+    "ROI behind": (roi(np.negative), "roi", "behind the camera"),
+    "ROI aside": (roi(lambda points: points + np.array([0, 30])), "roi", "only 0 % of roi_vehicle"),
+    "ROI tiny": (roi(lambda points: 0.05 * points + np.array([9, 0])), "roi", "enlarge it"),
+    "ROI far": (roi(lambda points: points * [5, 1]), "roi range", "reaches 68 m"),
+    "survey sign": (survey(CENTRE * [-1, 1, 1]), "survey against guess", "its x has the wrong sign"),
+    "survey swapped": (survey(CENTRE[[1, 0, 2]]), "survey against guess", "x and y are swapped"),
+    "survey in mm": (survey(1e3 * CENTRE), "survey against guess", "in millimetres"),
+    "survey in feet": (survey(CENTRE / 0.3048), "survey against guess", "in feet"),
+    "survey elsewhere": (survey(CENTRE + np.array([3, 0, 0])), "survey against guess", "by +3.0, "),
+}  # fmt: skip
+
+
+def test_a_good_camera_passes():
+    assert not raised(check_camera("front", camera()))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_camera_is_told(name):
+    spoil, check, says = WRONG[name]
+    told = raised(check_camera("front", spoil(camera())))
+    assert says in told[check]
+
+
+def test_a_guess_borrowed_from_a_sister_vehicle_is_fine():
+    borrowed = camera(pitch_deg=20.0, centre=CENTRE + np.array([0.3, -0.2, 0.3]))
+    assert not raised(check_camera("front", borrowed))
+
+
+@pytest.mark.parametrize(
+    ("centre", "check"), [(CENTRE * [1, 1, 20], "camera height"), (CENTRE * [1, 1, 0.05], "camera height")]
+)
+def test_a_guess_at_no_vehicle_s_height_is_told(centre, check):
+    assert check in raised(check_camera("front", camera(centre=centre)))
+
+
+def test_a_camera_without_survey_is_checked_without():
+    findings = check_camera("front", replace(camera(), centre_prior=None))
+    assert "survey against guess" not in {finding.check for finding in findings}
+    assert not raised(findings)

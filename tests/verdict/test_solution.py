@@ -1,24 +1,33 @@
-"""The checks after the solve, on evidence made up for each."""
+"""The checks after the solve, and what check points say."""
 
-from __future__ import annotations
-
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from tests.mapping.scene import SceneOptions, extrinsic, make_scene
+from tests.cameras import mounted
+from tests.mapping.scene import SceneOptions, make_scene
+from tests.report.yard import SURVEY_M, checked, point, yard
+from tests.verdict.drives import INFO, square_at
 from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
-from v2hdm.records import Calibration, CameraInfo, Drive, HdMap, Marking
+from v2hdm.records import Calibration, HdMap
 from v2hdm.site.candidates import Exclusion
-from v2hdm.verdict import Finding, Status
+from v2hdm.verdict import Status
 from v2hdm.verdict.results.solution import check_inputs, check_solution
+from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
-INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02, bias_px=0.03)
-CLOCK = Contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
-LEVER = Contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
+
+
+def contradiction(fault, cameras, axis, about, value, sigma, sigmas):
+    return Contradiction(fault, cameras, axis, about, value, sigma, 2 * norm.sf(sigmas), sigmas**2 / 2, 0.5)
+
+
+CLOCK = contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
+LEVER = contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
 FINE = SolveEvidence(
     score_tests=(CLOCK, LEVER),
     corrected=(),
@@ -28,46 +37,42 @@ FINE = SolveEvidence(
     variance_factor=0.15,
     along_route=np.array([0.15, 0.2, 0.15]),
     window_s=np.array([0.0, 5.0, 10.0]),
-    pose_innovations={"x": 0.7, "heading": 0.8},
+    pose_noise={"position_m": 0.7, "heading_rad": 0.8},
     worst_innovation=3.0,
     worst_innovation_s=4.0,
 )
 
 
 @pytest.fixture(scope="module")
-def drive() -> Drive:
+def drive():
     return make_scene(SceneOptions(length_m=20.0, turns=False)).drive
 
 
-def square_at(x: float, y: float) -> Marking:
-    return Marking("diamond", np.array([[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]), 5)
-
-
-def result(evidence: SolveEvidence = FINE, *markings: Marking, **changes: object) -> MethodResult:
+def result(evidence=FINE, *markings, **changes):
     mapped = HdMap(markings or tuple(square_at(3.0 * n, 0.0) for n in range(12)))
     return replace(MethodResult("Opt", ("front", "rear"), mapped, evidence=evidence), **changes)  # type: ignore[arg-type]
 
 
-def raised(one: MethodResult, drive: Drive) -> dict[str, Finding]:
+def raised(one, drive):
     found = check_solution(drive, {"both": {"Opt": one}})
     return {finding.check: finding for finding in found if finding.status is not Status.PASS}
 
 
-def test_a_clean_result_raises_nothing(drive: Drive) -> None:
+def test_a_clean_result_raises_nothing(drive):
     assert raised(result(), drive) == {}
 
 
-def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive: Drive) -> None:
-    dropped = replace(LEVER, value=-1.2, sigmas=70.0)
+def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
+    dropped = replace(LEVER, value=-1.2, p_value=1e-200)
     found = raised(result(replace(FINE, corrected=(dropped,))), drive)
     assert found["survey"].status is Status.WARN
     assert "antenna" in found["survey"].says
     assert "120 cm behind" in found["survey"].says
 
 
-def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive: Drive) -> None:
-    focal = Contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
-    late = replace(CLOCK, value=0.2, sigmas=20.0)
+def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive):
+    focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
+    late = replace(CLOCK, value=0.2, p_value=1e-80)
     evidence = replace(FINE, score_tests=(focal, late, LEVER), held_out={"heave": 9.0})
     found = raised(result(evidence), drive)
     assert set(found) == {"focal length", "held out"}, "the clock explains less of the same residuals"
@@ -76,19 +81,19 @@ def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(driv
     assert found["held out"].says.endswith("see focal length")
 
 
-def test_a_rival_that_explains_as_much_is_named_as_well() -> None:
-    one = Contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 41.0)
-    other = Contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 39.0)
+def test_a_rival_that_explains_as_much_is_named_as_well():
+    one = contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
+    other = contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)
     finding = check_inputs(replace(FINE, score_tests=(one, other)))[0]
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
-def test_a_small_contradiction_is_none_however_sure_it_is() -> None:
-    tiny = replace(CLOCK, value=0.0008, sigma=0.0001, sigmas=8.0)
+def test_a_small_contradiction_is_none_however_sure_it_is():
+    tiny = replace(CLOCK, value=0.0008, sigma=0.0001, p_value=1e-15)
     assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, score_tests=(tiny,))))
 
 
-def test_a_straight_drive_says_what_it_cannot_tell() -> None:
+def test_a_straight_drive_says_what_it_cannot_tell():
     unsure = (replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf")))
     untold = [f for f in check_inputs(replace(FINE, score_tests=unsure)) if f.is_unobservable]
     assert {f.check for f in untold} == {"clock", "survey"}
@@ -102,37 +107,32 @@ def test_a_straight_drive_says_what_it_cannot_tell() -> None:
         ("fit along the route", {"along_route": np.array([0.15, 3.0, 0.15])}),
         ("rejected", {"fits": {"front": replace(FIT, rejected_share=0.14)}}),
         ("held out", {"held_out": {"heave": 6.5}}),
-        ("pose noise", {"pose_innovations": {"heading": 4.0}}),
+        ("pose noise", {"pose_noise": {"heading_rad": 4.0}}),
         ("pose jump", {"worst_innovation": 20.0}),
     ],
 )
-def test_a_bad_fit_is_raised_by_its_own_check(check: str, change: dict[str, object], drive: Drive) -> None:
+def test_a_bad_fit_is_raised_by_its_own_check(check, change, drive):
     assert set(raised(result(replace(FINE, **change)), drive)) == {check}  # type: ignore[arg-type]
 
 
-def test_markings_that_overlap_are_told_with_a_place(drive: Drive) -> None:
+def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubles(drive):
     apart = [square_at(3.0 * n, 0.0) for n in range(12)]
     found = raised(result(FINE, *apart, square_at(6.4, 0.2)), drive)
     assert set(found) == {"double markings"}
     assert "(6.5, 0.5)" in found["double markings"].says
-
-
-def test_neighbours_of_another_class_or_beside_one_another_are_no_doubles(drive: Drive) -> None:
     other = replace(square_at(0.4, 0.0), kind="stop_line")
     assert raised(result(FINE, square_at(0.0, 0.0), square_at(1.0, 0.0), other), drive) == {}
-
-
-def test_a_third_of_the_candidates_left_out_is_told(drive: Drive) -> None:
     left_out = tuple(Exclusion("diamond", np.zeros(2), 3, "odd shape") for _ in range(12))
     assert set(raised(result(excluded=left_out), drive)) == {"excluded"}
 
 
-def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive: Drive) -> None:
+def calibrated(yaw_deg):
     covariance = np.diag([1e-4] * 3 + [1e-8] * 3)
-    calibrations = {
-        name: Calibration(INFO, extrinsic(yaw, 15.0, 0.0, (1.0, 0.0, 2.4)), covariance)
-        for name, yaw in (("front", 0.0), ("rear", 180.0))
-    }
+    return Calibration(INFO, mounted((1.0, 0.0, 2.4), 15.0, yaw_deg), covariance)
+
+
+def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive):
+    calibrations = {"front": calibrated(0.0), "rear": calibrated(180.0)}
     ahead = drive.images[0].map_from_vehicle[:2, 0] * 0.3
     front = tuple(square_at(3.0 * n, 0.0) for n in range(12))
     rear = tuple(replace(m, corners_map=m.corners_map + ahead) for m in front)
@@ -146,14 +146,71 @@ def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive: Driv
     assert "30 cm ahead of where front does" in found[0].says
 
 
-def test_a_mounting_that_differs_alone_and_together_is_told(drive: Drive) -> None:
-    covariance = np.diag([1e-4] * 3 + [1e-8] * 3)
-    there, turned = (
-        Calibration(INFO, extrinsic(yaw, 15.0, 0.0, (1.0, 0.0, 2.4)), covariance) for yaw in (0.0, 0.2)
-    )
+def test_a_mounting_that_differs_alone_and_together_is_told(drive):
     sets = {
-        "front": {"Opt": result(cameras=("front",), calibrations={"front": turned})},
-        "both": {"Opt": result(calibrations={"front": there})},
+        "front": {"Opt": result(cameras=("front",), calibrations={"front": calibrated(0.2)})},
+        "both": {"Opt": result(calibrations={"front": calibrated(0.0)})},
     }
     found = [f.check for f in check_solution(drive, sets) if f.status is not Status.PASS]
     assert found == ["alone and together"]
+
+
+COUNT = 12
+
+
+def found(seed, off_m):
+    """Of a map in error as it states, and check points that are off by ``off_m`` (12, 2) more than stated."""
+    rng, truth = np.random.default_rng(seed), yard()
+    points = [
+        point(*(truth.markings[k].corners_map[k % 4] + SURVEY_M * rng.standard_normal(2) + off_m[k]), f"P{k}")
+        for k in range(COUNT)
+    ]
+    return check_points(checked(yard(rng), *points))
+
+
+def test_maps_as_good_as_they_state_are_contradicted_as_seldom_as_the_test_says():
+    raised = [found(seed, np.zeros((COUNT, 2))).status is not Status.PASS for seed in range(400)]
+    assert SIGNIFICANCE * 400 < 1
+    assert sum(raised) <= 3
+
+
+ONE_OFF = np.where(np.arange(COUNT)[:, None] == 7, [0.15, 0.0], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("off_m", "status", "says"),
+    [
+        (ONE_OFF, Status.WARN, "^P7 lies .*the others where they should"),
+        (np.tile([0.15, -0.13], (COUNT, 1)), Status.FAIL, "another datum or origin"),
+        (np.random.default_rng(5).normal(0, 0.05, (COUNT, 2)), Status.FAIL, "the map is worse than it says"),
+    ],
+    ids=["one point", "all alike", "a worse map"],
+)
+def test_points_that_are_off_name_the_cause(off_m, status, says):
+    finding = found(1, off_m)
+    assert finding.status is status
+    assert re.search(says, finding.says)
+    assert finding.value > finding.limit
+
+
+def test_points_that_the_map_has_nowhere_are_told_with_the_distance():
+    (finding,) = check_frame({"": 0, "with x_m and y_m swapped": 0})
+    assert finding.status is Status.WARN
+    assert "no corner of the map has a surveyed point within reach" in finding.says
+    finding = check_points(checked(yard(), point(30.5, 8.0, "Q1")))
+    assert finding.status is Status.WARN
+    assert re.search("none of 1.*7.02 m away", finding.says)
+
+
+@pytest.mark.parametrize(
+    ("counts", "status"),
+    [
+        ({"": 9, "with x_m and y_m swapped": 1}, Status.PASS),
+        ({"": 1, "with x_m and y_m swapped": 7, "in feet": 2}, Status.WARN),
+        ({"": 3}, Status.PASS),
+    ],
+)
+def test_a_survey_that_fits_better_when_read_otherwise_is_told_how(counts, status):
+    (finding,) = check_frame(counts)
+    assert finding.status is status
+    assert ("7 would with x_m and y_m swapped" in finding.says) is (status is Status.WARN)

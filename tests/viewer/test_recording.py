@@ -1,49 +1,38 @@
 """``viewer=rerun``: a run is recorded, and the recording holds what happened."""
 
-from __future__ import annotations
-
 import json
-import os
-import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.ports import run_config
+from v2hdm.cli.main import run as run_command
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps import read_geojson
-from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.config import DriveConfig
 from v2hdm.pipeline.context import Context, Unwatched
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
 from v2hdm.pipeline.run import run
-from v2hdm.records import ImageDetections
+from v2hdm.store.cache import StageCache
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
-ROOT = Path(__file__).parents[2]
 Columns = Mapping[str, list[Any]]
 
 
-def configured(drive: Path, output: Path) -> RunConfig:
-    return RunConfig(
-        name="small",
-        drive=DriveConfig(path=str(drive)),
-        output=str(output),
-        cache=str(output / "cache"),
-        workers=1,
-    )
+def configured(drive, output):
+    return run_config(drive, output, name="small", cache=str(output / "cache"))
 
 
 @pytest.fixture(scope="module")
-def result(small_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(small_drive, tmp_path_factory):
     pytest.importorskip("rerun", reason="no rerun: pip install 'v2hdm[viewer]'")
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("DISPLAY", raising=False)
@@ -53,7 +42,7 @@ def result(small_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recorded(result: Path) -> Mapping[str, Columns]:
+def recorded(result):
     """Columns of the recording by entity, read by Rerun's own reader."""
     from rerun.chunk import RrdReader
 
@@ -65,14 +54,12 @@ def recorded(result: Path) -> Mapping[str, Columns]:
     return columns
 
 
-def only(columns: Columns, ending: str) -> list[Any]:
+def only(columns, ending):
     (found,) = [values for name, values in columns.items() if name.endswith(ending)]
     return found
 
 
-def test_every_image_is_in_the_recording_byte_for_byte(
-    recorded: Mapping[str, Columns], small_drive: Path
-) -> None:
+def test_every_image_is_in_the_recording_byte_for_byte(recorded, small_drive):
     drive = read_drive(small_drive)
     columns = recorded["/map/vehicle/front/image"]
     blobs = [bytes(one[0]) for one in only(columns, "EncodedImage:blob") if one]
@@ -81,7 +68,7 @@ def test_every_image_is_in_the_recording_byte_for_byte(
     assert sorted(frames) == list(range(len(drive.images)))
 
 
-def test_detections_lie_in_the_images(recorded: Mapping[str, Columns], small_drive: Path) -> None:
+def test_detections_lie_in_the_images(recorded, small_drive):
     columns = recorded["/map/vehicle/front/image/markings"]
     strips = [strip for one in only(columns, "LineStrips2D:strips") for strip in one or ()]
     assert len(strips) > 20
@@ -91,7 +78,7 @@ def test_detections_lie_in_the_images(recorded: Mapping[str, Columns], small_dri
     assert any(label.startswith("diamond 0.") for label in labels)
 
 
-def test_the_recorded_map_is_the_written_one(recorded: Mapping[str, Columns], result: Path) -> None:
+def test_the_recorded_map_is_the_written_one(recorded, result):
     (strips,) = only(recorded["/map/front/markings"], "LineStrips3D:strips")
     written = read_geojson(result / "map.geojson").markings
     assert len(strips) == len(written) > 5
@@ -101,7 +88,7 @@ def test_the_recorded_map_is_the_written_one(recorded: Mapping[str, Columns], re
     assert recorded["/map/front/lanes"]
 
 
-def test_the_camera_ends_where_the_calibration_has_it(recorded: Mapping[str, Columns], result: Path) -> None:
+def test_the_camera_ends_where_the_calibration_has_it(recorded, result):
     columns = recorded["/map/vehicle/front"]
     found = read_calibration(result / "calibration_front.yaml").cam_from_vehicle
     centre = -found[:3, :3].T @ found[:3, 3]
@@ -109,47 +96,43 @@ def test_the_camera_ends_where_the_calibration_has_it(recorded: Mapping[str, Col
     assert only(recorded["/map/vehicle/front/image"], "Pinhole:resolution")[0]
 
 
-def test_the_recording_belongs_to_the_result_and_the_log_says_how_to_replay_it(result: Path) -> None:
+def test_the_recording_belongs_to_the_result_and_the_log_says_how_to_replay_it(result):
     listed = [json.loads(line) for line in (result / ".v2hdm-results.jsonl").read_text().splitlines()]
     assert any(FILE in one.values() for one in listed)
     assert f"replay the run with: rerun {FILE}" in (result / "run.log").read_text()
 
 
-def test_an_unknown_viewer_is_refused() -> None:
+def test_an_unknown_viewer_is_refused():
     assert not check_viewer("none")
     with pytest.raises(ConfigError, match="viewer is 'foxglove': choose none or rerun"):
         check_viewer("foxglove")
 
 
-def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path: Path) -> None:
-    (tmp_path / "rerun.py").write_text('raise ModuleNotFoundError("not installed", name="rerun")')
-    done = subprocess.run(
-        [sys.executable, "-m", "v2hdm.map", "drive.path=nowhere", "viewer=rerun"],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr == (
+def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["map", "drive.path=nowhere", "viewer=rerun"]) == 2
+    assert capsys.readouterr().err == (
         "error: viewer=rerun needs rerun: install the viewer extra, pip install 'v2hdm[viewer]'\n"
     )
     assert not (tmp_path / "outputs").exists()
 
 
-def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, small_drive: Path) -> None:
+def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result, small_drive):
     class Seen:
-        def __init__(self) -> None:
+        def __init__(self):
             self.calls: list[str] = []
 
-        def begun(self, *_: object) -> None:
+        def begun(self, *_):
             self.calls.append("begun")
 
-        def detected(self, found: Sequence[ImageDetections]) -> None:
+        def detected(self, found):
             self.calls.append(f"{len(found)} images")
 
-        def mapped(self, cameras: str, *_: object) -> None:
+        def mapped(self, cameras, *_):
             self.calls.append(cameras)
 
-        def close(self) -> None:
+        def close(self):
             self.calls.append("closed")
 
     seen = Seen()
@@ -157,15 +140,15 @@ def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, 
     assert seen.calls == ["begun", f"{len(read_drive(small_drive).images)} images", "front", "closed"]
 
 
-def test_images_are_shown_as_they_are_looked_at(small_drive: Path, tmp_path: Path) -> None:
+def test_images_are_shown_as_they_are_looked_at(small_drive, tmp_path):
     drive = read_drive(small_drive, DriveConfig(limit=3))
     shown: list[list[int]] = []
 
     class Watching(Unwatched):
-        def detected(self, detections: Sequence[ImageDetections]) -> None:
+        def detected(self, detections):
             shown.append([one.image for one in detections])
 
     for _ in range(2):
-        context = replace(Context.of(tmp_path, workers=1), viewer=Watching())
+        context = Context(StageCache(tmp_path), workers=1, viewer=Watching())
         detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), context)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

@@ -5,6 +5,7 @@ inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hd
 residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
 """
 
+from v2hdm.adjust.noise import estimate_noise
 from v2hdm.adjust.observability import (
     Observability,
     PoseInnovations,
@@ -21,13 +22,14 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
-from v2hdm.adjust.score_tests import Fault, ScoreTest, score_faults
+from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.validation import Excluded, Verdict
 
 __all__ = [
+    "CHANGES",
     "MODELS",
     "ControlPoints",
     "Drift",
@@ -46,11 +48,13 @@ __all__ = [
     "SolveOptions",
     "Status",
     "Verdict",
+    "estimate_noise",
     "observability",
     "observed",
     "pose_innovations",
     "score_faults",
     "select_model",
+    "sigmas_of",
     "solve",
     "with_model",
 ]

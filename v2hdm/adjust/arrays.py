@@ -152,18 +152,21 @@ class Arrays:
         corners = torch.cat([(~self.joined).nonzero()[:, 0], end])
         return corners, torch.searchsorted(self.corner, corners.to(self.corner.dtype))
 
-    @cached_property
-    def run_bounds(self) -> list[tuple[int, int]]:
-        """(observation, corner) at which each run begins, and the end."""
+    def bounds(self, size: int) -> list[tuple[int, int]]:
+        """(observation, corner) at which runs of about ``size`` observations begin, and the end."""
         corners, begins = self.unit_bounds
-        size = _RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE
         wanted = torch.arange(0, len(self.corner) + size, size, device=begins.device)
         chosen = torch.unique(torch.searchsorted(begins, wanted.clamp(max=len(self.corner))))
         return list(zip(begins[chosen].tolist(), corners[chosen].tolist(), strict=True))
 
-    def runs(self) -> Iterator[Run]:
+    @cached_property
+    def run_bounds(self) -> list[tuple[int, int]]:
+        """(observation, corner) at which each run begins, and the end."""
+        return self.bounds(_RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE)
+
+    def runs(self, size: int | None = None) -> Iterator[Run]:
         """The whole problem, run by run; corners that are joined are never parted."""
-        for (begin, first), (end, last) in pairwise(self.run_bounds):
+        for (begin, first), (end, last) in pairwise(self.run_bounds if size is None else self.bounds(size)):
             yield self.run(slice(begin, end), slice(first, last))
 
     def run(self, observations: slice, corners: slice) -> Run:

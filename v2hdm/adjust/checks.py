@@ -6,10 +6,8 @@ import numpy as np
 
 from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
-# Observations that are checked at once.
-_ROWS = 1 << 18
 # How symmetric a covariance must be, as a share of its diagonal: float32 is.
 _SYMMETRIC_TO = 1e-5
 # Tangent of the angle from a camera's axis beyond which nothing is seen on its plane: 89.9 degrees.
@@ -22,78 +20,54 @@ def check_problem(problem: Problem) -> None:
     Except observations that are there twice: :func:`v2hdm.adjust.layout.make_arrays` finds them as it sorts.
     """
     _check_shapes(problem)
-    sound = _observations_are_sound(problem)
-    if not sound:
-        _check_indices(problem)
-    _check_finite(problem, observations_too=not sound)
+    _check_finite(problem)
     _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
     _check_rigid("map_from_vehicle", problem.map_from_vehicle)
-    if not sound:
-        _check_observations(problem)
+    _check_observations(problem)
     _check_priors(problem)
     _check_control(problem)
     _check_lengths(problem)
 
 
-def _observations_are_sound(problem: Problem) -> bool:
-    """Whether one compiled pass finds no fault in any observation."""
-    from v2hdm.adjust.engines.numba.prepare import are_sound  # loads numba
-
-    seen = problem.observations
-    return are_sound(
-        *(seen.camera, seen.frame, seen.corner),
-        *(seen.pinhole_px, seen.covariance_px, problem.intrinsic),
-        frames=len(problem.map_from_vehicle),
-        corners=problem.corner_count,
-        symmetric_to=_SYMMETRIC_TO,
-        max_slope=_MAX_SLOPE,
-    )
+def _refuse(wrong: BoolArray | np.bool_, said: str, *values: FloatArray | IntArray) -> None:
+    """Raise for the first item that is ``wrong``, if any is: its number and ``values`` are filled in."""
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise AdjustError(said.format(k, *(each[k] for each in values)))
 
 
 def _check_control(problem: Problem) -> None:
     control = problem.control
     if control is None:
         return
-    count = len(control.corner)
+    count, named = len(control.corner), control.corner
     if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count, 2):
         raise AdjustError(f"control points: {count} corners need as many points_map and sigma_m (x, y)")
-    wrong = np.flatnonzero((control.corner < 0) | (control.corner >= problem.corner_count))
-    if len(wrong):
-        raise AdjustError(
-            f"control point {wrong[0]} names corner {control.corner[wrong[0]]}, which is not there"
-        )
-    if len(np.unique(control.corner)) < count:
+    there = (named >= 0) & (named < problem.corner_count)
+    _refuse(~there, "control point {} names corner {}, which is not there", named)
+    if len(np.unique(named)) < count:
         raise AdjustError("two control points name the same corner: keep one of them")
-    wrong = np.flatnonzero(~(np.isfinite(control.points_map) & (control.sigma_m > 0)).all(1))
-    if len(wrong):
-        raise AdjustError(f"control point {wrong[0]} is not finite or its sigma_m is not above 0")
+    sound = (np.isfinite(control.points_map) & (control.sigma_m > 0)).all(1)
+    _refuse(~sound, "control point {} is not finite or its sigma_m is not above 0")
 
 
 def _check_lengths(problem: Problem) -> None:
     known = problem.lengths
     if known is None:
         return
-    count = len(known.first)
-    if any(np.shape(values) != (count,) for values in (known.second, known.length_m, known.sigma_m)):
+    count, length_m, sigma_m = len(known.first), known.length_m, known.sigma_m
+    if any(np.shape(values) != (count,) for values in (known.second, length_m, sigma_m)):
         raise AdjustError(f"known lengths: {count} first corners need as many second, length_m and sigma_m")
-    ends = np.stack([known.first, known.second])
-    wrong = np.flatnonzero(((ends < 0) | (ends >= problem.corner_count)).any(0))
-    if len(wrong):
-        first, second = ends[:, wrong[0]]
-        raise AdjustError(f"known length {wrong[0]} names corners {first} and {second}; one is not there")
-    wrong = np.flatnonzero(ends[0] == ends[1])
-    if len(wrong):
-        raise AdjustError(f"known length {wrong[0]} is from corner {ends[0, wrong[0]]} to itself")
-    _, index, times = np.unique(np.sort(ends, axis=0), axis=1, return_index=True, return_counts=True)
-    if (times > 1).any():
-        first, second = ends[:, index[np.argmax(times > 1)]]
-        raise AdjustError(f"the distance of corners {first} and {second} is given twice: keep one of them")
-    wrong = np.flatnonzero(~(np.isfinite(known.length_m) & (known.length_m > 0)))
-    if len(wrong):
-        raise AdjustError(f"known length {wrong[0]} is {known.length_m[wrong[0]]:g} m: give one above 0")
-    wrong = np.flatnonzero(~(np.isfinite(known.sigma_m) & (known.sigma_m > 0)))
-    if len(wrong):
-        raise AdjustError(f"sigma_m of known length {wrong[0]} is not above 0 and finite")
+    first, second = ends = np.stack([known.first, known.second])
+    there = ((ends >= 0) & (ends < problem.corner_count)).all(0)
+    _refuse(~there, "known length {} names corners {} and {}; one is not there", first, second)
+    _refuse(first == second, "known length {} is from corner {} to itself", first)
+    (low, high), times = np.unique(np.sort(ends, axis=0), axis=1, return_counts=True)
+    _refuse(times > 1, "the distance of corners {1} and {2} is given twice: keep one of them", low, high)
+    wrong = ~(np.isfinite(length_m) & (length_m > 0))
+    _refuse(wrong, "known length {} is {:g} m: give one above 0", length_m)
+    wrong = ~(np.isfinite(sigma_m) & (sigma_m > 0))
+    _refuse(wrong, "sigma_m of known length {} is not above 0 and finite")
 
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
@@ -101,11 +75,8 @@ def check_model(problem: Problem, options: SolveOptions) -> None:
     prior, each = problem.camera_prior, 6 + problem.visit_count * int(options.clock_offset)
     if prior is not None:
         size = len(problem.intrinsic) * each
-        for name, values, shape in (
-            ("base", prior.base, problem.cam_from_vehicle.shape),
-            ("mean", prior.mean, (len(problem.intrinsic), each)),
-            ("information", prior.information, (size, size)),
-        ):
+        shapes = problem.cam_from_vehicle.shape, (len(problem.intrinsic), each), (size, size)
+        for (name, values), shape in zip(vars(prior).items(), shapes, strict=True):
             if np.shape(values) != shape or not np.isfinite(values).all():
                 raise AdjustError(f"camera_prior.{name} must hold finite numbers in the shape {shape}")
     if options.clock_offset and problem.twist_vehicle is None:
@@ -118,8 +89,8 @@ def check_options(options: SolveOptions) -> None:
     if unknown:
         raise AdjustError(f"unknown pose state '{unknown[0]}': choose from {', '.join(POSE_STATES)}")
     for name, choices in (("loss", LOSSES), ("solver", SOLVERS), ("engine", ENGINES)):
-        if getattr(options, name) not in choices:
-            chosen = getattr(options, name)
+        chosen = getattr(options, name)
+        if chosen not in choices:
             raise AdjustError(f"unknown {name} '{chosen}': choose from {', '.join(choices)}")
     if options.engine == "numba" and not options.on_cpu:
         raise AdjustError("engine=numba computes on the CPU: choose engine=torch, or device=cpu")
@@ -151,9 +122,11 @@ def _check_shapes(problem: Problem) -> None:
         ("observations.covariance_px", seen.covariance_px, (count, 2, 2)),
     ]
     for name, values, shape in expected:
-        if values is not None and not isinstance(values, np.ndarray):
+        if values is None:
+            continue
+        if not isinstance(values, np.ndarray):
             raise AdjustError(f"{name} is a {type(values).__name__}: give a numpy array")
-        if values is not None and np.shape(values) != shape:
+        if values.shape != shape:
             raise AdjustError(f"{name} has shape {np.shape(values)}, expected {shape}")
     if count == 0:
         raise AdjustError("there is no observation to adjust: detect and associate markings first")
@@ -163,90 +136,78 @@ def _check_shapes(problem: Problem) -> None:
             raise AdjustError(f"observations.{name} holds {kind}: give whole numbers")
 
 
-def _check_indices(problem: Problem) -> None:
-    seen = problem.observations
-    for name, index, size in (
-        ("camera", seen.camera, len(problem.intrinsic)),
-        ("frame", seen.frame, len(problem.map_from_vehicle)),
-        ("corner", seen.corner, problem.corner_count),
+def _check_finite(problem: Problem) -> None:
+    for name, values in (
+        ("intrinsic of camera", problem.intrinsic),
+        ("cam_from_vehicle of camera", problem.cam_from_vehicle),
+        ("map_from_vehicle of frame", problem.map_from_vehicle),
+        ("centre_vehicle of camera", problem.centre_vehicle),
+        ("corners_start of corner", problem.corners_start),
+        ("twist_vehicle of frame", problem.twist_vehicle),
     ):
-        wrong = np.flatnonzero((index < 0) | (index >= size))
-        if len(wrong):
-            raise AdjustError(
-                f"observation {wrong[0]} names {name} {index[wrong[0]]}, but there are only {size}"
-            )
+        if values is not None:
+            wrong = ~np.isfinite(values).reshape(len(values), -1).all(1)
+            _refuse(wrong, f"{name} {{}} {_NOT_FINITE}")
+    wrong = (problem.intrinsic[:, :2] <= 0).any(1)
+    _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")
 
 
-def _check_finite(problem: Problem, observations_too: bool) -> None:
-    seen = problem.observations
-    named = {
-        "intrinsic of camera": problem.intrinsic,
-        "cam_from_vehicle of camera": problem.cam_from_vehicle,
-        "map_from_vehicle of frame": problem.map_from_vehicle,
-        "pinhole_px of observation": seen.pinhole_px if observations_too else None,
-        "covariance_px of observation": seen.covariance_px if observations_too else None,
-        "centre_vehicle of camera": problem.centre_vehicle,
-        "corners_start of corner": problem.corners_start,
-        "twist_vehicle of frame": problem.twist_vehicle,
-    }
-    for name, values in named.items():
-        if values is None:
-            continue
-        wrong = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(1))
-        if len(wrong):
-            raise AdjustError(f"{name} {wrong[0]} is not finite: remove it or correct its source")
-    if np.any(problem.intrinsic[:, :2] <= 0):
-        camera = int(np.flatnonzero((problem.intrinsic[:, :2] <= 0).any(1))[0])
-        raise AdjustError(f"intrinsic of camera {camera} has a focal length that is not positive")
+_NOT_FINITE = "is not finite: remove it or correct its source"
 
 
 def _check_rigid(name: str, transforms: FloatArray) -> None:
     rotation = transforms[:, :3, :3]
     off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
-    wrong = np.flatnonzero((off > 1e-6) | (np.linalg.det(rotation) < 0))
-    if len(wrong):
-        raise AdjustError(f"{name} {wrong[0]} is no rigid transform: its rotation is not orthonormal")
-    wrong = np.flatnonzero((transforms[:, 3] != [0, 0, 0, 1]).any(1))
-    if len(wrong):
-        raise AdjustError(f"{name} {wrong[0]} is no rigid transform: its last row is not 0, 0, 0, 1")
+    said = f"{name} {{}} is no rigid transform: its "
+    _refuse((off > 1e-6) | (np.linalg.det(rotation) < 0), said + "rotation is not orthonormal")
+    _refuse((transforms[:, 3] != [0, 0, 0, 1]).any(1), said + "last row is not 0, 0, 0, 1")
 
 
 def _check_observations(problem: Problem) -> None:
+    from v2hdm.adjust.engines.numba.prepare import Seen, first_unsound  # loads numba
+
+    frames = len(problem.map_from_vehicle)
+    by_corner = np.zeros(problem.corner_count, dtype=np.int64)
+    by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
+    seen = Seen.of(vars(problem.observations).values(), problem.intrinsic)
+    k = first_unsound(seen, frames, _SYMMETRIC_TO, _MAX_SLOPE, by_corner, by_camera)
+    if k >= 0:
+        raise AdjustError(_fault(problem, k))
+    for name, times in (("corner", by_corner), ("camera", by_camera)):
+        if not times.all():
+            raise AdjustError(f"{name} {times.argmin()} has no observation: leave it out of the problem")
+
+
+def _fault(problem: Problem, k: int) -> str:
+    """The message for observation k, which is unsound."""
     seen = problem.observations
-    for name, index, size in (
-        ("corner", seen.corner, problem.corner_count),
-        ("camera", seen.camera, len(problem.intrinsic)),
-    ):
-        unseen = np.flatnonzero(np.bincount(index, minlength=size) == 0)
-        if len(unseen):
-            raise AdjustError(f"{name} {unseen[0]} has no observation: leave it out of the problem")
-    for begin in range(0, len(seen.corner), _ROWS):
-        part = slice(begin, begin + _ROWS)
-        covariance = seen.covariance_px[part]
-        own, across = np.diagonal(covariance, axis1=1, axis2=2), covariance[:, 1, 0]
-        wrong = np.flatnonzero(~((own[:, 0] > 0) & (own.prod(axis=1) > across**2)))
-        if len(wrong):
-            raise AdjustError(f"covariance_px of observation {begin + wrong[0]} is not positive definite")
-        uneven = np.abs(covariance[:, 0, 1] - across)
-        wrong = np.flatnonzero(uneven > _SYMMETRIC_TO * np.sqrt(own.prod(axis=1)))
-        if len(wrong):
-            raise AdjustError(f"covariance_px of observation {begin + wrong[0]} is not symmetric")
-        intrinsic = problem.intrinsic[seen.camera[part]]
-        aside = np.abs((seen.pinhole_px[part] - intrinsic[:, 2:]) / intrinsic[:, :2]).max(axis=1)
-        wrong = np.flatnonzero(aside > _MAX_SLOPE)
-        if len(wrong):
-            raise AdjustError(
-                f"pinhole_px of observation {begin + wrong[0]} lies {aside[wrong[0]]:.3g} focal lengths "
-                "from the principal point, where no camera looks: leave it out"
-            )
+    sizes = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
+    for name, size in zip(("camera", "frame", "corner"), sizes, strict=True):
+        index = getattr(seen, name)[k]
+        if not 0 <= index < size:
+            return f"observation {k} names {name} {index}, but there are only {size}"
+    for name in ("pinhole_px", "covariance_px"):
+        if not np.isfinite(getattr(seen, name)[k]).all():
+            return f"{name} of observation {k} {_NOT_FINITE}"
+    (xx, xy), (yx, yy) = seen.covariance_px[k].astype(np.float64)
+    intrinsic = problem.intrinsic[seen.camera[k]]
+    aside = np.abs((seen.pinhole_px[k] - intrinsic[2:]) / intrinsic[:2]).max()
+    if aside > _MAX_SLOPE:
+        return (
+            f"pinhole_px of observation {k} lies {aside:.3g} focal lengths "
+            "from the principal point, where no camera looks: leave it out"
+        )
+    if xx > 0 and xx * yy > yx**2 and abs(xy - yx) > _SYMMETRIC_TO * np.sqrt(xx * yy):
+        return f"covariance_px of observation {k} is not symmetric"
+    return f"covariance_px of observation {k} is not positive definite"
 
 
 def _check_priors(problem: Problem) -> None:
     if (problem.centre_vehicle is None) != (problem.centre_sigma_m is None):
         raise AdjustError("centre_vehicle and centre_sigma_m belong together: give both or neither")
-    if problem.centre_sigma_m is not None and not np.all(problem.centre_sigma_m > 0):
-        camera = int(np.flatnonzero(~(problem.centre_sigma_m > 0).all(1))[0])
-        raise AdjustError(f"centre_sigma_m of camera {camera} must be above 0 (inf where nothing is known)")
+    if problem.centre_sigma_m is not None:
+        wrong = ~(problem.centre_sigma_m > 0).all(1)
+        _refuse(wrong, "centre_sigma_m of camera {} must be above 0 (inf where nothing is known)")
     if not problem.clock_sigma_s > 0:
         raise AdjustError(f"clock_sigma_s is {problem.clock_sigma_s}: give a number of seconds above 0")
     _check_visits(problem)

@@ -40,18 +40,18 @@ class Covariance:
 
     def extrinsic(self) -> FloatArray:
         """Covariance (C, 6, 6) of each camera's left tangent: translation m, rotation rad."""
-        # The extrinsics come last, so the tip of L_S is the factor of their marginal information.
-        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
-        each = self.whitening.engine.arrays.camera_unknowns
-        starts = range(0, len(joint), each)
-        return np.stack([joint[k : k + 6, k : k + 6].cpu().numpy() for k in starts])
+        return np.stack([block[:6, :6] for block in self._cameras()])
 
     def clock_s2(self) -> FloatArray:
         """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is."""
-        arrays = self.whitening.engine.arrays
-        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
-        variance = joint.diagonal().reshape(arrays.camera_count, -1)[:, 6:]
-        return np.asarray(variance.cpu().numpy())
+        return np.stack([block.diagonal()[6:] for block in self._cameras()])
+
+    def _cameras(self) -> list[FloatArray]:
+        """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
+        # They come last, so the tip of L_S is the factor of their marginal information.
+        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip).cpu().numpy()
+        each = self.whitening.engine.arrays.camera_unknowns
+        return [joint[k : k + each, k : k + each] for k in range(0, len(joint), each)]
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of each frame's tangent, how well its pose is known; 0 without states."""
@@ -83,12 +83,9 @@ class Covariance:
         """
         whitening, arrays = self.whitening, self.whitening.engine.arrays
         tip = whitening.reduced_factor.tip
-        at_once = max(_NUMBERS_AT_ONCE // (2 * whitening.reduced_factor.size), 1)
-        at_once = min(at_once, _CORNERS_AT_ONCE)
         out = np.empty((arrays.corner_count, 2, len(tip)))
-        starts = arrays.unit_bounds[0].tolist()
-        begin = 0
-        for end in starts[1:]:
+        begin, at_once = 0, self._at_once
+        for end in arrays.unit_bounds[0].tolist()[1:]:
             if end - begin < at_once and end < arrays.corner_count:
                 continue
             corners = torch.arange(begin, end, device=tip.device)
@@ -101,9 +98,14 @@ class Covariance:
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
-        at_once = min(max(_NUMBERS_AT_ONCE // (2 * self.whitening.reduced_factor.size), 1), _CORNERS_AT_ONCE)
-        parts = np.array_split(groups, min(max(-(-groups.size // at_once), 1), len(groups)))
+        parts = np.array_split(groups, min(max(-(-groups.size // self._at_once), 1), len(groups)))
         return np.concatenate([self._corners(part) for part in parts])
+
+    @property
+    def _at_once(self) -> int:
+        """Corners whose right-hand sides are solved for together."""
+        most = _NUMBERS_AT_ONCE // (2 * self.whitening.reduced_factor.size)
+        return min(max(most, 1), _CORNERS_AT_ONCE)
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays
@@ -112,16 +114,17 @@ class Covariance:
         # Known lengths tie corners to others outside their group, and V^-1 with them.
         near = _with_joined(arrays, chosen)
         corners = torch.unique(near)
-        root = _reduced_root(self.whitening, corners)
-        by_near = root.T[_columns(corners, near)]
-        inverse = _corner_inverse(self.whitening, corners)
+        by_near = _reduced_root(self.whitening, corners).T[_columns(corners, near)]
+        # V^-1 of the corners and all that is joined to them; of kept ones 1.
+        unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
+        factor = self.whitening.linearised.corner_factor.take(corners)
+        inverse = factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
         own = inverse.clone()
-        kept = torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)
-        own[kept] = 0.0
+        own[torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)] = 0.0
         rows = _columns(corners, chosen)
-        spread = _blocks(inverse, rows, _columns(corners, near)) * _once(near)
-        covariance = _blocks(own, rows, rows) + spread @ (by_near @ by_near.mT) @ spread.mT
-        return np.asarray(covariance.cpu().numpy())
+        spread = inverse[rows[:, :, None], _columns(corners, near)[:, None, :]] * _once(near)
+        own = own[rows[:, :, None], rows[:, None, :]]
+        return np.asarray((own + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
 
 
 def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
@@ -149,29 +152,16 @@ def _columns(corners: Tensor, wanted: Tensor) -> Tensor:
     return torch.stack([place, place + 1], dim=-1).flatten(1)
 
 
-def _blocks(matrix: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """(M, r, c) of a matrix, for rows (M, r) and columns (M, c)."""
-    return matrix[rows[:, :, None], columns[:, None, :]]
-
-
-def _corner_inverse(whitening: Whitening, corners: Tensor) -> Tensor:
-    """V^-1 (2 n, 2 n) of corners (n,) and all that known lengths join to them; of kept ones 1."""
-    unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
-    factor = whitening.linearised.corner_factor.take(corners)
-    return factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
-
-
 def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     """L_S^-1 W (D, 2 n) for n corners, ascending; of kept ones -L_S^-1 E, where E picks them."""
     plan, estimate = whitening.plan, whitening.estimate
     run = whitening.engine.arrays.gather(corners)
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
     kept = torch.isin(corners, plan.kept)
-    if not bool(kept.any()):
-        right = reduced_coupling(plan, whitening.spread, run, coupling)
-        return whitening.reduced_factor.solve(right)
     coupling[kept[run.corner]] = 0.0
     right = reduced_coupling(plan, whitening.spread, run, coupling)
+    if not bool(kept.any()):
+        return whitening.reduced_factor.solve(right)
     number = torch.searchsorted(plan.kept, corners[kept])
     picked = right.new_zeros(len(plan.kept), 2, len(corners), 2)
     for axis in range(2):

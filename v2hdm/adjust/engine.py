@@ -7,8 +7,8 @@ or ``numba``, whose compiled kernels do the same in closed form.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 from torch import Tensor
 
@@ -40,7 +40,8 @@ class Evaluated:
     coupled: Coupled
 
 
-class Linearised(Protocol):
+@dataclass(frozen=True)
+class Linearised(ABC):
     """A problem linearised at an estimate, its corners eliminated.
 
     Attributes:
@@ -55,6 +56,7 @@ class Linearised(Protocol):
     whitened: Tensor
     coupled: Coupled
 
+    @abstractmethod
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, with which the corners move.
 
@@ -64,50 +66,62 @@ class Linearised(Protocol):
             own: (N, 2) whitened variables of the corners.
         """
 
+    @abstractmethod
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""
 
+    @abstractmethod
     def coupling(self, run: Run, corners_map: Tensor) -> Tensor:
         """W' (k, 2, 6) of a run's observations, of corners (n, 2), by the left tangents of their pairs."""
 
 
-class Engine(Protocol):
-    """The model over one problem's arrays."""
+class Engine(ABC):
+    """The model over the ``arrays`` of one problem."""
 
-    @property
-    def arrays(self) -> Arrays:
-        """The problem."""
+    def __init__(self, arrays: Arrays) -> None:
+        self.arrays = arrays
 
     def over(self, arrays: Arrays) -> Engine:
         """The same engine over another problem."""
+        return type(self)(arrays)
 
+    @abstractmethod
     def plan(self) -> Plan:
         """How the reduced system is cut into tiles."""
 
+    @abstractmethod
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
         """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) a ray fixes."""
 
+    @abstractmethod
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
         """Whitened residuals (2, K) of the observations, for pairs (C, J, 4, 4)."""
 
+    @abstractmethod
     def poses(self, estimate: Estimate) -> Tensor:
         """``cam_from_map`` of every pair, (C, J, 4, 4)."""
 
+    @abstractmethod
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
 
+    @abstractmethod
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
         """The cost, by name."""
 
+    @abstractmethod
     def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
         """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
 
+    @abstractmethod
     def spread(self, estimate: Estimate) -> Spread:
         """How pairs move with frame states and clock offsets."""
 
+    @abstractmethod
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
         """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
 
+    @abstractmethod
     def eliminate(
         self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
     ) -> Linearised:

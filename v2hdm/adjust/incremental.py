@@ -14,7 +14,7 @@ marking, so that markings that came since do not share them with the others.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -65,6 +65,15 @@ class Sighted:
 
 
 @dataclass(frozen=True)
+class _Own:
+    """One marking's share of a :class:`_Quadratic`, in the unknowns ``rows`` of its cameras."""
+
+    rows: IntArray
+    information: FloatArray
+    vector: FloatArray
+
+
+@dataclass(frozen=True)
 class _Settled:
     """Corners (n, 2) at the unknowns ``at`` (D,) of all cameras; ``gain`` (n, 2, D) how they follow these.
 
@@ -75,15 +84,6 @@ class _Settled:
     corners_map: FloatArray
     gain: FloatArray
     own: _Own | None
-
-
-@dataclass(frozen=True)
-class _Own:
-    """One marking's share of a :class:`_Quadratic`, in the unknowns ``rows`` of its cameras."""
-
-    rows: IntArray
-    information: FloatArray
-    vector: FloatArray
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,6 @@ class _Quadratic:
     @property
     def mean(self) -> FloatArray:
         return np.asarray(np.linalg.solve(self.information, self.vector))
-
-    def has(self, sighted: Sighted) -> bool:
-        """Whether all cameras that saw a marking are among these."""
-        return bool(np.isin(sighted.observations.camera, self.cameras).all())
 
     def rows(self, cameras: IntArray) -> IntArray:
         """Where the unknowns of some of the cameras stand."""
@@ -137,12 +133,6 @@ class IncrementalMap:
         self._settled: dict[int, _Settled] = {}
         self._earlier: _Quadratic | None = None
         self._adjusted_count = 0
-        self._poses = drive.map_from_vehicle.copy()
-
-    @property
-    def map_from_vehicle(self) -> FloatArray:
-        """The poses (J, 4, 4) as all markings were last solved with; recorded ones where none was seen."""
-        return self._poses
 
     @property
     def markings(self) -> Mapping[int, Sighted]:
@@ -207,7 +197,8 @@ class IncrementalMap:
         joined = sighted if before is None else before.joined(sighted)
         self._sighted[marking] = joined
         try:
-            if earlier is None or len(self._sighted) >= 2 * self._adjusted_count or not earlier.has(joined):
+            due = len(self._sighted) >= 2 * self._adjusted_count
+            if earlier is None or due or not np.isin(joined.observations.camera, earlier.cameras).all():
                 self.adjust()
             else:
                 own, settled = self._linearised(earlier, marking, joined)
@@ -221,21 +212,6 @@ class IncrementalMap:
             if before is not None:
                 self._sighted[marking] = before
             raise
-
-    def forget(self, marking: int) -> None:
-        """Take a marking back out of the map and out of what the extrinsics rest on.
-
-        Raises:
-            AdjustError: it is not in the map.
-        """
-        if marking not in self._sighted:
-            raise AdjustError(f"marking {marking} is not in the map")
-        earlier = self._without(marking, self._sighted.pop(marking))
-        self._settled.pop(marking, None)
-        if earlier is None and self._sighted:
-            self.adjust()
-        else:
-            self._earlier = earlier
 
     def _without(self, marking: int, sighted: Sighted) -> _Quadratic | None:
         """The quadratic without a marking; None where that takes a solve of all others.
@@ -269,9 +245,6 @@ class IncrementalMap:
         at[:, 6:] = solution.clock_offset_s
         self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
         self._adjusted_count = len(every)
-        frames = np.unique(np.concatenate([one.observations.frame for one in every]))
-        self._poses = self._drive.map_from_vehicle.copy()
-        self._poses[frames] = solution.map_from_vehicle
         gain, end = solution.covariance.gain(), 0
         for marking, sighted in self._sighted.items():
             own = slice(end, end := end + sighted.corner_count)
@@ -316,28 +289,30 @@ class IncrementalMap:
     def _problem(self, sighted: Sequence[Sighted], cameras: IntArray) -> Problem:
         """Some markings as a problem of the cameras and frames that saw them."""
         drive, starts = self._drive, np.cumsum([0, *(one.corner_count for one in sighted)])
-        seen = _stacked(
-            [
-                replace(one.observations, corner=one.observations.corner + start)
-                for one, start in zip(sighted, starts[:-1], strict=True)
-            ]
-        )
+        seen = _stacked([one.observations for one in sighted])
+        corner = seen.corner + np.repeat(starts[:-1], [len(one.observations.corner) for one in sighted])
         frames, frame = np.unique(seen.frame, return_inverse=True)
-        twist, centre, sigma = drive.twist_vehicle, drive.centre_vehicle, drive.centre_sigma_m
-        return Problem(
+
+        def of(values: FloatArray | None, rows: IntArray) -> FloatArray | None:
+            return None if values is None else values[rows]
+
+        return replace(
+            drive,
             intrinsic=drive.intrinsic[cameras],
             cam_from_vehicle=self.cam_from_vehicle[cameras],
             map_from_vehicle=drive.map_from_vehicle[frames],
-            observations=replace(seen, camera=np.searchsorted(cameras, seen.camera), frame=frame),
+            observations=replace(
+                seen, camera=np.searchsorted(cameras, seen.camera), frame=frame, corner=corner
+            ),
             corner_count=int(starts[-1]),
-            centre_vehicle=None if centre is None else centre[cameras],
-            centre_sigma_m=None if sigma is None else sigma[cameras],
-            pose_sigma=drive.pose_sigma,
+            centre_vehicle=of(drive.centre_vehicle, cameras),
+            centre_sigma_m=of(drive.centre_sigma_m, cameras),
+            corners_start=None,
             visit=None if drive.visit is None else drive.visit[frames],
-            twist_vehicle=None if twist is None else twist[frames],
-            clock_sigma_s=drive.clock_sigma_s,
+            twist_vehicle=of(drive.twist_vehicle, frames),
             control=_known([one.control for one in sighted], starts),
             lengths=_known([one.lengths for one in sighted], starts),
+            camera_prior=None,
         )
 
 
@@ -357,26 +332,25 @@ def _sound(solution: Solution, what: str) -> Solution:
     return solution
 
 
-def _stacked(parts: Sequence[Observations]) -> Observations:
-    names = ("camera", "frame", "corner", "pinhole_px", "covariance_px")
-    return Observations(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+_Known = TypeVar("_Known", Observations, ControlPoints, KnownLengths)
 
 
-_Known = TypeVar("_Known", ControlPoints, KnownLengths)
+def _stacked(parts: Sequence[_Known]) -> _Known:
+    columns = (
+        np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)
+    )
+    return type(parts[0])(*columns)
 
 
 def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:
     """Prior knowledge of several markings' corners, which begin at ``starts`` among those of all."""
-    given = [(one, start) for one, start in zip(parts, starts, strict=False) if one is not None]
-    if not given:
-        return None
-    columns = {
-        field.name: np.concatenate(
-            [
-                getattr(one, field.name) + (start if field.name in ("corner", "first", "second") else 0)
-                for one, start in given
-            ]
-        )
-        for field in fields(given[0][0])
-    }
-    return type(given[0][0])(**columns)
+    shifted = []
+    for one, start in zip(parts, starts, strict=False):
+        if one is not None:
+            corners = {name: value + start for name, value in vars(one).items() if name in _CORNERS}
+            shifted.append(replace(one, **corners))
+    return _stacked(shifted) if shifted else None
+
+
+# Fields that number corners.
+_CORNERS = ("corner", "first", "second")

@@ -69,13 +69,24 @@ def minimise(
 
     def closure() -> Tensor:
         new_cost, new_gradient = seen.at(u.detach())
-        if _is_no_number(new_cost, new_gradient):
+        # An infinite cost is but a step too far, whatever its gradient.
+        if bool(new_cost.isnan()) or bool(new_cost.isfinite() and not new_gradient.isfinite().all()):
             raise _NoNumberError
         u.grad = new_gradient / scale
         # Relative to the start, small improvements of a large cost keep their digits.
         return (new_cost - cost) / scale.square()
 
-    optimizer = _one_step_optimizer(u)
+    _leave_compiler_out()
+    # One iteration a step: stopping is this loop's affair.
+    optimizer = torch.optim.LBFGS(
+        [u],
+        max_iter=1,
+        max_eval=_LINE_SEARCH_EVALUATIONS,
+        tolerance_grad=0.0,
+        tolerance_change=0.0,
+        history_size=_HISTORY,
+        line_search_fn="strong_wolfe",
+    )
     best, best_gradient = cost, gradient
     gap, slow = predicted_gap(best, best_gradient), False
     for iteration in range(max_iterations):
@@ -109,11 +120,6 @@ def _steps_left(before: float, gap: float, tolerance: float) -> float:
 
 class _NoNumberError(Exception):
     """The objective is no number where a line search looked, whose comparisons then mean nothing."""
-
-
-def _is_no_number(cost: Tensor, gradient: Tensor) -> bool:
-    """Whether an evaluation holds NaN; an infinite cost is but a step too far, whatever its gradient."""
-    return bool(cost.isnan()) or bool(cost.isfinite() and not gradient.isfinite().all())
 
 
 class _Evaluations:
@@ -156,18 +162,3 @@ def _leave_compiler_out() -> None:
         if method is not None:
             with suppress(AttributeError, TypeError):
                 method.__dynamo_disable = method
-
-
-def _one_step_optimizer(u: Tensor) -> torch.optim.LBFGS:
-    """LBFGS that makes one iteration a step and leaves stopping to its caller."""
-    _leave_compiler_out()
-    return torch.optim.LBFGS(
-        [u],
-        lr=1.0,
-        max_iter=1,
-        max_eval=_LINE_SEARCH_EVALUATIONS,
-        tolerance_grad=0.0,
-        tolerance_change=0.0,
-        history_size=_HISTORY,
-        line_search_fn="strong_wolfe",
-    )

@@ -184,17 +184,23 @@ def camera_offset(prior: CameraQuadratic, cam_from_vehicle: Tensor, clock_s: Ten
     return torch.cat([tangent, clock_s], dim=1) - prior.mean
 
 
-def prior_terms(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
-    """The cost of everything but the observations, by name."""
+def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
+    """The residuals of everything but the observations, by name."""
     corners, known = estimate.corners_map, arrays.lengths
-    residuals = {
+    return {
         "camera_centre": centre_residual(arrays, estimate.cam_from_vehicle),
         "frame_states": state_residual(arrays, estimate.frame_state),
         "clock_offsets": clock_residual(arrays, estimate.clock_s),
         "control_points": control_residual(arrays, corners),
         "known_lengths": length_residual(arrays, corners[known.first], corners[known.second]),
     }
-    terms = {name: residual.square().sum() / 2 for name, residual in residuals.items()}
+
+
+def prior_terms(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
+    """The cost of everything but the observations, by name."""
+    terms = {
+        name: residual.square().sum() / 2 for name, residual in prior_residuals(arrays, estimate).items()
+    }
     if arrays.camera_prior is not None:
         off = camera_offset(arrays.camera_prior, estimate.cam_from_vehicle, estimate.clock_s).flatten()
         terms["earlier_markings"] = off @ arrays.camera_prior.information @ off / 2

@@ -165,7 +165,8 @@ class ReducedSystem:
         self.tip = arrays.camera_count * arrays.camera_unknowns
         self.matrix = TiledMatrix.zeros(plan.pattern, plan.size, self.tip, arrays.centre)
         self._own = arrays.centre.new_zeros(0)
-        self._kept_diagonal = arrays.centre.new_zeros(plan.kept_tiles, plan.size)
+        # U's diagonal: 0 in rows that only fill up a tile, until they are fixed at 0.
+        self._diagonal = arrays.centre.new_zeros(plan.tile_count * plan.size)
 
     def add(self, own: Tensor, cameras: Tensor) -> None:
         """Add U of all observations, (C, J or 1, 6, 6), and subtract the cameras' B' B."""
@@ -181,33 +182,18 @@ class ReducedSystem:
             index: (2, m) numbers of kept corners, of which the first is not the lower.
             blocks: (m, 2, 2) their part of V.
         """
-        plan, states = self.plan, len(self.arrays.states)
-        frame, axes = run.pair % self.arrays.frame_count, torch.arange(2, device=index.device)
+        plan, axes = self.plan, torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
-        begin = frame // plan.frames_per_tile, frame % plan.frames_per_tile * states
-        columns = plan.position[begin[0]] * plan.size + begin[1]
-        columns = columns[:, None] + torch.arange(states, device=index.device)
         rows = self._kept_rows(run.corner)[:, None] + axes
+        columns = self._frame_rows(run.pair % self.arrays.frame_count)
         self._scatter(rows[:, :, None], columns[:, None, :], by_state)
         first, second = self._kept_rows(index)[..., None] + axes
         self._scatter(first[:, :, None], second[:, None, :], blocks)
-        diagonal = index[0] == index[1]
-        lower = torch.zeros(plan.kept_tiles * plan.size, dtype=blocks.dtype, device=blocks.device)
-        number = index[0][diagonal]
-        each = plan.size // 2
-        at = number // each * plan.size + number % each * 2
-        own = blocks[diagonal].diagonal(dim1=1, dim2=2)
-        lower[at[:, None] + axes] = own
-        empty = lower == 0
-        # Rows that only fill up a tile are fixed at 0.
-        lower[empty] = 1.0
-        self._kept_diagonal = lower.view(plan.kept_tiles, plan.size)
-        for tile, pad in enumerate(empty.view(plan.kept_tiles, -1)):
-            place = int(plan.position[plan.frame_tiles + tile])
-            self.matrix.diagonal[place].diagonal().add_(pad.to(lower.dtype))
+        own = index[0] == index[1]
+        self._diagonal[first[own]] = blocks[own].diagonal(dim1=1, dim2=2)
         border = self.spread.by_camera(run, coupling).flatten(0, 1)
-        for tile, part in enumerate(torch.split(border, 2 * each)):
-            place = int(plan.position[plan.frame_tiles + tile])
+        for tile, part in enumerate(torch.split(border, plan.size // 2 * 2)):
+            place = plan.pattern.position[plan.frame_tiles + tile]
             self.matrix.tiles[TIP, place][:, : len(part)] += part.mT
 
     def _kept_rows(self, number: Tensor) -> Tensor:
@@ -215,12 +201,20 @@ class ReducedSystem:
         plan, each = self.plan, self.plan.size // 2
         return plan.position[plan.frame_tiles + number // each] * plan.size + number % each * 2
 
+    def _frame_rows(self, frame: Tensor) -> Tensor:
+        """Rows (n, S) of the states of frames (n,)."""
+        plan, states = self.plan, len(self.arrays.states)
+        begin = plan.position[frame // plan.frames_per_tile] * plan.size
+        within = frame % plan.frames_per_tile * states
+        return (begin + within)[:, None] + torch.arange(states, device=frame.device)
+
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
         """Add values at rows and columns of the tiles; of two that mirror each other the lower one counts."""
         rows, columns = torch.broadcast_tensors(rows, columns)  # type: ignore[no-untyped-call]
         low, high = torch.minimum(rows, columns), torch.maximum(rows, columns)
-        size, tile = self.plan.size, low // self.plan.size * self.plan.tile_count + high // self.plan.size
-        keys, at = self.matrix.addresses
+        size, device = self.plan.size, values.device
+        tile = low // size * (self.plan.tile_count + 1) + high // size
+        keys, at = (torch.as_tensor(one, device=device) for one in (self.matrix.keys, self.matrix.at))
         places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
         self.matrix.values.index_add_(0, places.flatten(), values.flatten())
 
@@ -230,7 +224,8 @@ class ReducedSystem:
         ``damping`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
         share of U's diagonal; None where S cannot be factorised.
         """
-        diagonal = [*self._add_frames(priors), self._add_cameras(priors)]
+        self._add_frames(priors)
+        diagonal = [*self._diagonal.view(self.plan.tile_count, self.plan.size), self._add_cameras(priors)]
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
             self.matrix.tiles[key].diagonal().add_(values, alpha=damping)
@@ -248,36 +243,25 @@ class ReducedSystem:
         self.matrix.tiles[TIP, TIP].add_(tip)
         return torch.diagonal(tip)
 
-    def _add_frames(self, priors: PriorBlocks) -> list[Tensor]:
-        """Add the frames' information, prior and coupling to the cameras; returns the diagonals."""
+    def _add_frames(self, priors: PriorBlocks) -> None:
+        """Add the frames' information, prior and coupling to the cameras."""
         arrays, plan, spread = self.arrays, self.plan, self.spread
         if not arrays.states:
-            return []
+            return
         by_state = self._own @ spread.state
         by_frame = (spread.state.mT @ by_state).sum(0) + priors.frame
         border = (by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2)
-        diagonal = [border] * plan.tile_count
-        for number, own in enumerate(self._kept_diagonal):
-            diagonal[plan.pattern.position[plan.frame_tiles + number]] = own
         for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):
             self.matrix.tiles[TIP, column].add_(part.mT)
-        for tile, begin in enumerate(range(0, arrays.frame_count, plan.frames_per_tile)):
-            frames = slice(begin, begin + plan.frames_per_tile)
-            place = plan.pattern.position[tile]
-            matrix = _along_route(by_frame[frames], priors.across[frames], plan.frames_per_tile)
-            self.matrix.tiles[place, place].add_(matrix)
-            diagonal[place] = matrix.diagonal()
-            if tile and bool(priors.across[begin].any()):
-                self._add_between(place, plan.pattern.position[tile - 1], priors.across[begin])
-        return diagonal
-
-    def _add_between(self, later: int, earlier: int, coupling: Tensor) -> None:
-        """Couple the first frame of one tile with the last of the one before it on the route."""
-        states = len(coupling)
-        if later > earlier:
-            self.matrix.tiles[later, earlier][:states, -states:] += coupling
-        else:
-            self.matrix.tiles[earlier, later][-states:, :states] += coupling.mT
+        rows = self._frame_rows(torch.arange(arrays.frame_count, device=border.device))
+        self._scatter(rows[:, :, None], rows[:, None, :], by_frame.tril())
+        if bool(priors.across.any()):
+            self._scatter(rows[1:, :, None], rows[:-1, None, :], priors.across[1:])
+        self._diagonal[rows] = by_frame.diagonal(dim1=1, dim2=2)
+        unused = (self._diagonal == 0).to(border.dtype)
+        self._diagonal += unused
+        for tile, pad in enumerate(unused.view(plan.tile_count, -1)):
+            self.matrix.tiles[tile, tile].diagonal().add_(pad)
 
 
 def reduced_coupling(plan: Plan, spread: Spread, run: Run, coupling: Tensor) -> Tensor:
@@ -288,16 +272,3 @@ def reduced_coupling(plan: Plan, spread: Spread, run: Run, coupling: Tensor) -> 
     by_frame.permute(0, 2, 3, 1).index_put_((run.pair % frames, run.corner), by_state, accumulate=True)
     by_camera = spread.by_camera(run, coupling)
     return torch.cat([to_tiles(plan, by_frame.flatten(2)), by_camera.permute(2, 0, 1).flatten(1)])
-
-
-def _along_route(by_frame: Tensor, across: Tensor, per_tile: int) -> Tensor:
-    """A tile of frames' blocks (n, S, S) on the diagonal and the couplings to the frame before beside it."""
-    count, states = by_frame.shape[:2]
-    matrix = by_frame.new_zeros(per_tile, states, per_tile, states)
-    index = torch.arange(per_tile, device=by_frame.device)
-    # Frames that only fill up the last tile are fixed at 0.
-    matrix[index, :, index, :] = torch.eye(states, dtype=by_frame.dtype, device=by_frame.device)
-    matrix[index[:count], :, index[:count], :] = by_frame
-    matrix[index[1:count], :, index[: count - 1], :] = across[1:]
-    matrix[index[: count - 1], :, index[1:count], :] = across[1:].mT
-    return matrix.view(per_tile * states, -1)

@@ -1,15 +1,20 @@
 r"""Which single wrong input would explain the residuals best: score tests at a solution.
 
 A fault is one number p more in the model, zero in what was solved: a clock offset, a focal length, a shift
-of a survey. At the optimum the gradient of all that was estimated vanishes, so with whitened residuals r
-and their derivatives J_p the fault's value and what it would take off the cost follow from one step,
+of a survey. With whitened residuals r, their derivatives J_p by the fault and J_y by all that was estimated,
+one step gives its value (Rao's score test; Rao, Linear Statistical Inference and Its Applications, 2nd ed.,
+section 6e):
 
-.. math:: p = -\frac{J_p' r}{s}, \quad s = J_p' J_p - \|N_{yp}\|^2, \quad \text{gain} = \frac{(J_p' r)^2}{s},
+.. math:: z = J_p - J_y H^{-1} J_y' J_p, \quad p = -\frac{z' r}{z' z},
 
-where N_yp is the coupling of p to the whitened variables (:mod:`v2hdm.adjust.whitening`): everything else
-is estimated anew along with p (Rao's score test; Rao, Linear Statistical Inference and Its Applications,
-2nd ed., section 6e). The gain is chi-square with one degree of freedom where the model is right. A fault
-costs about as much as one evaluation of the gradient, and no solve.
+everything else being estimated anew along with p. Residuals of a real road are no white noise: poses, and the
+ground under the wheels, err smoothly along the route. So each stretch g of the route is asked by itself. It
+has the score s_g = z_g' r_g and the information w_g = z_g' z_g, and what the stretches disagree by, e_g = s_g
++ p w_g, is the noise that the fault is held against: a cluster-robust variance (Liang and Zeger, Biometrika
+73, 1986; the correction of Bell and McCaffrey, Survey Methodology 28, 2002; neighbours by Bartlett's weights,
+Newey and West, Econometrica 55, 1987). Few stretches say little of their own noise, and what the others of
+the same drive say moderates it (Smyth, Statistical Applications in Genetics and Molecular Biology 3, 2004).
+A fault costs about as much as four evaluations of the gradient, and no solve.
 """
 
 from __future__ import annotations
@@ -17,24 +22,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 import torch
+from scipy import stats
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.model import (
+    Estimate,
     Gradient,
-    centre_residual,
-    control_residual,
-    length_residual,
+    camera_offset,
+    points_in_camera,
+    prior_residuals,
     rigid,
     robustified,
 )
 from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
-from v2hdm.geometry.tensors import exp, inverse
+from v2hdm.geometry.tensors import NEAR_M, exp, inverse
+from v2hdm.records import FloatArray
 
 _STEP = 1e-3
 """Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""
@@ -42,15 +51,41 @@ _STEP = 1e-3
 _LEAST_OBSERVABLE = 1e-9
 """Share of a fault's own information, left by all else, below which rounding alone is left of it."""
 
+_LEAST_P = 1e-300
+"""Below it a p-value is zero for floating-point numbers."""
+
+_STRETCHES = 24
+"""Stretches that the route is divided into: several metres each, longer than most errors go together."""
+
+_STRETCHES_PER_CHANGE = 2
+"""Stretches from one frame at which inputs may change to the next."""
+
+_LEAST_SPEED_MPS = 0.5
+"""Below it a vehicle has no course."""
+
+_LAGS = 1
+"""Neighbours of a stretch that err along with it."""
+
+_DRAWS = 16
+"""Draws of the model's own noise: what the stretches would disagree by is known to a tenth."""
+
+_PRIOR_FREEDOM = 15.0
+"""Degrees of freedom that the usual disagreement of a drive's stretches counts for in each test."""
+
 
 class Fault(Enum):
     """An input that may be wrong, and the unit of its value."""
 
     CLOCK = "clock"  # images were taken later than they say
+    CLOCK_DRIFT = "clock drift"  # and ever later: by so much from the first to the last
     FOCAL = "focal"  # share by which the focal length is longer than stated
     DISTORTION = "distortion"  # first radial coefficient
     PRINCIPAL = "principal"  # point of the image on the optical axis
     SLOPE = "slope"  # of the ground, which the poses do not know of
+    CROWN = "crown"  # fall of the ground to both sides of the route
+    COURSE = "course"  # heading is the direction of motion of a point so far ahead of the rear axle
+    STEP = "step"  # recorded positions are off by so much from a time on
+    KNOCK = "knock"  # a camera is turned by so much from a time on; all of them by load
     SURVEY = "survey"  # of one camera's centre
     LEVER = "lever"  # all centres alike: from the point that the poses are of
     SIZE = "size"  # known lengths of one value
@@ -60,21 +95,28 @@ class Fault(Enum):
     @property
     def unit(self) -> str:
         """Of the value and its sigma."""
-        return _UNITS[self]
+        return _UNITS.get(self, "m")
 
 
 _UNITS = {
     Fault.CLOCK: "s",
+    Fault.CLOCK_DRIFT: "s",
     Fault.FOCAL: "",
     Fault.DISTORTION: "",
     Fault.PRINCIPAL: "px",
     Fault.SLOPE: "rad",
-    Fault.SURVEY: "m",
-    Fault.LEVER: "m",
-    Fault.SIZE: "m",
-    Fault.CONTROL: "m",
-    Fault.DATUM: "m",
+    Fault.CROWN: "",
+    Fault.KNOCK: "rad",
 }
+
+
+def sigmas_of(p_value: float) -> float:
+    """The standard deviations at which a normal distribution has a two-sided p-value."""
+    return float(stats.norm.isf(max(p_value, _LEAST_P) / 2))
+
+
+CHANGES = (Fault.STEP, Fault.KNOCK)
+"""Faults that begin at some time, which is unknown."""
 
 
 @dataclass(frozen=True)
@@ -84,49 +126,37 @@ class ScoreTest:
     Attributes:
         fault: what would be wrong.
         camera: of which camera of the problem; -1 for all together.
-        axis: along which axis, 0 to 2: of the vehicle (survey, lever), of the map (slope, datum), of the
-            image (principal).
-        item: which of the problem's control points, known lengths or (clock) visits; -1 for none or all.
+        axis: along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope,
+            datum, step), of the image (principal).
+        item: which of the problem's control points, known lengths or (clock) visits, or the frame from which
+            on inputs are wrong (step, knock); -1 for none or all.
         value: by how much, true minus stated.
-        sigma: how well the drive observes it, inf where it cannot.
-        gain: by how much twice the cost would fall: chi-square with one degree of freedom.
+        sigma: how well the drive observes it, by what its stretches disagree; inf where it cannot.
+        p_value: how often a drive without the fault would show as large a value, 1 where it is unobservable.
+        gain: by how much the fault raises the log likelihood of each stretch as the others predict it, summed
+            over all; negative where the stretches do not agree on it.
+        image_share: of its information, what comes from images and not from the priors on poses and survey.
     """
 
     fault: Fault
     camera: int
     axis: int
     item: int
-    value: float
-    sigma: float
-    gain: float
+    value: float = 0.0
+    sigma: float = float("inf")
+    p_value: float = 1.0
+    gain: float = 0.0
+    image_share: float = 0.0
 
     @property
     def sigmas(self) -> float:
-        """The value in its standard deviations."""
-        return float(np.sqrt(self.gain))
+        """The standard deviations at which a normal distribution has this p-value."""
+        return sigmas_of(self.p_value)
 
 
-@dataclass(frozen=True)
-class _Column:
-    """J_p of one fault: how the whitened residuals change with it; None for blocks that do not.
-
-    ``observations`` (2, K), ``centre`` (C, 3), ``control`` (N, 2), ``length`` (M,).
-    """
-
-    observations: Tensor | None = None
-    centre: Tensor | None = None
-    control: Tensor | None = None
-    length: Tensor | None = None
-
-    def dot(self, other: _Column) -> float:
-        """The product with another column."""
-        pairs = (
-            (self.observations, other.observations),
-            (self.centre, other.centre),
-            (self.control, other.control),
-            (self.length, other.length),
-        )
-        return sum(float((a * b).sum()) for a, b in pairs if a is not None and b is not None)
+Rows = dict[str, Tensor]
+"""Whitened residuals, or their derivatives by one number, by kind: ``observations`` (2, K), and the priors'
+of :func:`v2hdm.adjust.model.prior_residuals`; kinds that a fault does not touch may be absent."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +164,7 @@ class _Hypothesis:
     """One fault, and how to get its column."""
 
     fault: Fault
-    column: Callable[[_Bench], _Column]
+    column: Callable[[_Bench], Rows]
     camera: int = -1
     axis: int = 0
     item: int = -1
@@ -149,12 +179,14 @@ class _Bench:
         root: (K,) of the weights.
         residuals: of everything.
         whitened_px: (2, K) residuals of the observations without weights.
+        stretch: (J,) of the route that each frame is in, from 0.
     """
 
     whitening: Whitening
     root: Tensor
-    residuals: _Column
+    residuals: Rows
     whitened_px: Tensor
+    stretch: Tensor
 
     @classmethod
     def at(cls, whitening: Whitening) -> _Bench:
@@ -163,13 +195,27 @@ class _Bench:
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
         root = weight.sqrt()  # no floor: it keeps corners factorable, and is no evidence
-        priors = _prior_residuals(engine.arrays, estimate.cam_from_vehicle, estimate.corners_map)
-        return cls(whitening, root, _Column(whitened_px * root, *priors), whitened_px)
+        rows = _rows(engine.arrays, estimate, whitened_px * root)
+        return cls(whitening, root, rows, whitened_px, _stretches(engine.arrays))
 
     @property
     def arrays(self) -> Arrays:
         """The problem."""
         return self.whitening.engine.arrays
+
+    @cached_property
+    def noise(self) -> list[Rows]:
+        """Residuals that noise as the model has it would leave, drawn."""
+        generator = torch.Generator().manual_seed(0)
+        return [
+            self.efficient(
+                {
+                    name: torch.randn(row.shape, generator=generator, dtype=row.dtype).to(row.device)
+                    for name, row in self.residuals.items()
+                }
+            )
+            for _ in range(_DRAWS)
+        ]
 
     @property
     def camera(self) -> Tensor:
@@ -188,74 +234,181 @@ class _Bench:
         first = self.whitened_px[0] / a
         return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
 
-    def coupling(self, column: _Column) -> Tensor:
+    def efficient(self, column: Rows) -> Rows:
+        """A fault's column less what is estimated in its place: z = J_p - J_y H^-1 J_y' J_p."""
+        engine, step = self.whitening.engine, _STEP * self._coupling(column)
+        high, low = (
+            _rows(engine.arrays, one, engine.residuals(engine.poses(one), one.corners_map) * self.root)
+            for one in (
+                self.whitening.linearised.evaluate(*self.whitening.step(x)).estimate for x in (step, -step)
+            )
+        )
+        return {
+            name: column.get(name, torch.zeros_like(row)) - (row - low[name]) / (2 * _STEP)
+            for name, row in high.items()
+        }
+
+    def _coupling(self, column: Rows) -> Tensor:
         """N_yp: what the column has in common with all that is estimated, whitened."""
         engine, estimate = self.whitening.engine, self.whitening.estimate
-        zero = [torch.zeros_like(one) for one in (estimate.frame_state, estimate.clock_s)]
         tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
-        leaves = tangent.requires_grad_(), estimate.corners_map.clone().requires_grad_()
-        parts = [column.centre, column.control, column.length]
-        chosen = [n for n, part in enumerate(parts) if part is not None]
-        extrinsic, corners = torch.zeros_like(tangent), torch.zeros_like(estimate.corners_map)
-        if chosen:
-            moved = rigid(leaves[0]) @ estimate.cam_from_vehicle
-            residuals = _prior_residuals(engine.arrays, moved, leaves[1])
-            ends = [residuals[n] for n in chosen]
-            by = [parts[n] for n in chosen]
-            extrinsic, corners = torch.autograd.grad(ends, leaves, by, materialize_grads=True)
-        gradient = Gradient(extrinsic, zero[0], corners, zero[1])
-        if column.observations is not None:
-            seen = engine.pull(estimate, column.observations * self.root)
+        at = (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)
+        leaves = [one.clone().requires_grad_() for one in at]
+        moved = Estimate(rigid(leaves[0]) @ estimate.cam_from_vehicle, *leaves[1:])
+        of_priors = [name for name in column if name != "observations"]
+        gradient = Gradient(*(torch.zeros_like(one) for one in at))
+        if of_priors:
+            priors = _rows(engine.arrays, moved)
+            ends, by = [priors[name] for name in of_priors], [column[name] for name in of_priors]
+            gradient = Gradient(*torch.autograd.grad(ends, leaves, by, materialize_grads=True))
+        if "observations" in column:
+            seen = engine.pull(estimate, column["observations"] * self.root)
             pairs = zip(vars(gradient).values(), vars(seen).values(), strict=True)
             gradient = Gradient(*(one + other for one, other in pairs))
-        return self.whitening.whiten(gradient)
+        whitened: Tensor = self.whitening.whiten(gradient)
+        return whitened
+
+    def by_stretch(self, one: Rows, other: Rows) -> FloatArray:
+        """The product of two columns, (G + 1,): by stretch, and of the priors that belong to none."""
+        count = int(self.stretch.max()) + 1
+        out = one["observations"].new_zeros(count + 1)
+        for name, row in one.items():
+            product = row * other[name]
+            if name == "observations":
+                frame = self.arrays.pair.long() % self.arrays.frame_count
+                out.index_add_(0, self.stretch[frame], product.sum(0))
+            elif name == "frame_states":
+                out.index_add_(0, self.stretch, product.sum(1))
+            else:
+                out[-1] += product.sum()
+        return np.asarray(out.cpu().numpy())
 
 
-def _prior_residuals(
-    arrays: Arrays, cam_from_vehicle: Tensor, corners_map: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals of the camera centres, the survey and the known lengths, in the order of :class:`_Column`."""
-    known = arrays.lengths
-    return (
-        centre_residual(arrays, cam_from_vehicle),
-        control_residual(arrays, corners_map),
-        length_residual(arrays, corners_map[known.first], corners_map[known.second]),
-    )
+def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
+    """All residuals at an estimate; those of the ``observations`` are given."""
+    rows = {} if observations is None else {"observations": observations}
+    rows |= prior_residuals(arrays, estimate)
+    if arrays.camera_prior is not None:
+        off = camera_offset(arrays.camera_prior, estimate.cam_from_vehicle, estimate.clock_s).flatten()
+        size, axes = torch.linalg.eigh(arrays.camera_prior.information)
+        rows["earlier_markings"] = size.clamp(min=0).sqrt() * (off @ axes)
+    return rows
+
+
+def _stretches(arrays: Arrays) -> Tensor:
+    """The stretch (J,) of the route that each frame is in: equally long ones of every session."""
+    ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
+    path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
+    out, count = torch.zeros_like(arrays.visit), 0
+    visits = int(arrays.visit.max()) + 1
+    for visit in range(visits):
+        own = arrays.visit == visit
+        along = path[own] - path[own].min()
+        share = along / along.max().clamp(min=1e-9)
+        out[own] = count + (share * _STRETCHES).long().clamp(max=_STRETCHES - 1)
+        count += _STRETCHES
+    stretch: Tensor = torch.unique(out, return_inverse=True)[1]
+    return stretch
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What the stretches of the route say of one fault.
+
+    Attributes:
+        hypothesis: the fault.
+        score, information: (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch.
+        drawn: (D, G + 1) scores of noise as the model has it.
+        own: the fault's information if all else were known.
+        image_share: see :class:`ScoreTest`.
+    """
+
+    hypothesis: _Hypothesis
+    score: FloatArray
+    information: FloatArray
+    drawn: FloatArray
+    own: float
+    image_share: float
+
+    @classmethod
+    def to(cls, hypothesis: _Hypothesis, bench: _Bench) -> _Answer:
+        """The answer at a solution."""
+        column = hypothesis.column(bench)
+        efficient = bench.efficient(column)
+        information = bench.by_stretch(efficient, efficient)
+        seen = float(efficient["observations"].square().sum())
+        own = sum(float(row.square().sum()) for row in column.values())
+        return cls(
+            hypothesis,
+            -bench.by_stretch(efficient, bench.residuals),
+            information,
+            np.array([bench.by_stretch(efficient, noise) for noise in bench.noise]),
+            own,
+            seen / max(float(information.sum()), 1e-300),
+        )
+
+    @property
+    def is_observable(self) -> bool:
+        """Whether more than rounding is left of the fault's information."""
+        return float(self.information.sum()) > _LEAST_OBSERVABLE * self.own > 0
+
+    @property
+    def value(self) -> float:
+        """The fault."""
+        return float(self.score.sum() / self.information.sum())
+
+    @property
+    def disagreement(self) -> float:
+        """How many times as much the stretches' scores disagree as they would by the model's own noise."""
+        by_model = np.mean([self._apart(score) for score in self.drawn])
+        return self._apart(self.score) / max(float(by_model), 1e-300)
+
+    def _apart(self, score: FloatArray) -> float:
+        """Square sum of what is left of scores (G + 1,); neighbours err alike (Bartlett's weights)."""
+        off = (score - score.sum() / self.information.sum() * self.information)[:-1]
+        lags = range(1, _LAGS + 1)
+        together = sum(2 * (1 - lag / (_LAGS + 1)) * float(off[lag:] @ off[:-lag]) for lag in lags)
+        return max(float(off @ off) + together, 0.0)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the disagreement: how many stretches speak, less one."""
+        w = self.information[:-1]
+        speaking = float(w.sum()) ** 2 / max(float(w @ w), 1e-300) - float(w.sum() / self.information.sum())
+        return max(speaking, 0.0) / (1 + 2 * sum((1 - lag / (_LAGS + 1)) ** 2 for lag in range(1, _LAGS + 1)))
+
+    def test(self, usual: float) -> ScoreTest:
+        """The test, given how many times as large as stated the variances of this drive ``usually`` are."""
+        at = self.hypothesis
+        blank = ScoreTest(at.fault, at.camera, at.axis, at.item)
+        if not self.is_observable:
+            return blank
+        freedom = self.freedom
+        multiple = (_PRIOR_FREEDOM * usual + freedom * self.disagreement) / (_PRIOR_FREEDOM + freedom)
+        w, s, total = self.information, self.score, float(self.information.sum())
+        sigma = float(np.sqrt(multiple * w[:-1].sum() + w[-1])) / total
+        # Each stretch as the others predict it; the priors that belong to no stretch are with the others.
+        others = (s.sum() - s[:-1]) / np.maximum(total - w[:-1], _LEAST_OBSERVABLE * total)
+        gain = float(np.sum(others * s[:-1] - others**2 * w[:-1] / 2)) / multiple
+        p_value = 2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + freedom))
+        return replace(
+            blank, value=self.value, sigma=sigma, p_value=p_value, gain=gain, image_share=self.image_share
+        )
 
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
-    """Every fault that ``problem`` can have, each tested by itself at its ``solution``; largest gain first.
-
-    Where residuals are larger than the model says, sigmas are larger, and gains smaller, by as much.
-    """
+    """Every fault that ``problem`` can have, each tested at its ``solution``; largest gain first."""
     bench = _Bench.at(solution.covariance.whitening)
-    found = [_test(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
-    found += _control_points(problem, solution)
-    factor = max(1.0, solution.chi2_per_dof)
-    inflated = [replace(one, sigma=one.sigma * factor**0.5, gain=one.gain / factor) for one in found]
-    return tuple(sorted(inflated, key=lambda test: -test.gain))
-
-
-def _test(hypothesis: _Hypothesis, bench: _Bench) -> ScoreTest:
-    column = hypothesis.column(bench)
-    coupling, own = bench.coupling(column), column.dot(column)
-    left = own - float(coupling.square().sum())
-    # What the descent has left of the gradient counts where a fault is nearly what something else can be.
-    slope = column.dot(bench.residuals) - float(coupling @ bench.whitening.gradient)
-    observable = own > 0 and left > _LEAST_OBSERVABLE * own
-    return ScoreTest(
-        hypothesis.fault,
-        hypothesis.camera,
-        hypothesis.axis,
-        hypothesis.item,
-        value=-slope / left if observable else 0.0,
-        sigma=float(left**-0.5) if observable else float("inf"),
-        gain=slope**2 / left if observable else 0.0,
-    )
+    answers = [_Answer.to(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
+    said = [one.disagreement for one in answers if one.is_observable]
+    usual = float(np.median(said)) if said else 1.0
+    found = _likeliest_changes([one.test(usual) for one in answers])
+    found += _control_points(problem, solution, usual)
+    return tuple(sorted(found, key=lambda test: -test.gain))
 
 
 def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
-    cameras = range(arrays.camera_count)
+    cameras, changes = range(arrays.camera_count), _changes(arrays)
     groups = [*([-1] if arrays.camera_count > 1 else []), *cameras]
     for camera in groups:
         if problem.twist_vehicle is not None:
@@ -267,8 +420,20 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.DISTORTION, _lens(camera, 1), camera)
         for axis in (0, 1):
             yield _Hypothesis(Fault.PRINCIPAL, _principal(problem, camera, axis), camera, axis)
+        if problem.twist_vehicle is not None:
+            yield _Hypothesis(Fault.CLOCK_DRIFT, _moving(_drift_motion(problem, camera)), camera)
+        for frame in changes:
+            for axis in (1, 2):
+                yield _Hypothesis(
+                    Fault.KNOCK, _moving(_knock_motion(camera, axis, frame)), camera, axis, frame
+                )
     for axis in (0, 1):
         yield _Hypothesis(Fault.SLOPE, _moving(_slope_motion(axis)), axis=axis)
+        for frame in changes:
+            yield _Hypothesis(Fault.STEP, _moving(_step_motion(axis, frame)), axis=axis, item=frame)
+    yield _Hypothesis(Fault.CROWN, _crown)
+    if problem.twist_vehicle is not None:
+        yield _Hypothesis(Fault.COURSE, _moving(_course_motion(problem)))
     if bool((arrays.centre_information_root > 0).any()):
         for axis in range(3):
             for camera in cameras:
@@ -282,7 +447,23 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.SIZE, _size(arrays.lengths.length_m == length_m), item=item)
 
 
-def _control_points(problem: Problem, solution: Solution) -> Iterator[ScoreTest]:
+def _likeliest_changes(found: list[ScoreTest]) -> list[ScoreTest]:
+    """Of inputs that may change at many frames only the likeliest, which had so many chances."""
+    kept = [one for one in found if one.fault not in CHANGES]
+    changes: dict[tuple[Fault, int, int], list[ScoreTest]] = {}
+    for one in found:
+        if one.fault in CHANGES:
+            changes.setdefault((one.fault, one.camera, one.axis), []).append(one)
+    for chances in changes.values():
+        best = max(chances, key=lambda one: one.gain)
+        many = len(chances)
+        kept.append(
+            replace(best, p_value=min(many * best.p_value, 1.0), gain=best.gain - float(np.log(many)))
+        )
+    return kept
+
+
+def _control_points(problem: Problem, solution: Solution, usual: float) -> Iterator[ScoreTest]:
     """Each surveyed point against what everything else says of its corner.
 
     What the adjustment leaves between a point and its corner has the covariance of the point less that of
@@ -297,44 +478,45 @@ def _control_points(problem: Problem, solution: Solution) -> Iterator[ScoreTest]
         expected = np.diag(sigma_m**2) - covariance[m]
         if np.linalg.eigvalsh(expected).min() <= _LEAST_OBSERVABLE * np.max(sigma_m) ** 2:
             continue
-        gain = float(off @ np.linalg.solve(expected, off))
+        squared = float(off @ np.linalg.solve(expected, off)) / max(usual, 1.0)
         # Without the point its corner would lie farther from it, by the share that it had of the information.
         apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
-        yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, apart / max(gain, 1e-12) ** 0.5, gain)
+        sigma, p_value = apart / max(squared, 1e-12) ** 0.5, float(stats.chi2.sf(squared, 2))
+        yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, p_value, squared / 2)
 
 
-def _lens(camera: int, power: int) -> Callable[[_Bench], _Column]:
+def _lens(camera: int, power: int) -> Callable[[_Bench], Rows]:
     """Points seen farther out by the share p, times the squared radius to the ``power``, than they are.
 
     A focal length longer than stated by the share p, or a first radial coefficient larger by p.
     """
 
-    def column(bench: _Bench) -> _Column:
+    def column(bench: _Bench) -> Rows:
         # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
         projected = bench.projected
         mine = (bench.camera == camera) | (camera < 0)
-        return _Column(bench.whiten(projected * projected.square().sum(0) ** power * mine))
+        return {"observations": bench.whiten(projected * projected.square().sum(0) ** power * mine)}
 
     return column
 
 
-def _principal(problem: Problem, camera: int, axis: int) -> Callable[[_Bench], _Column]:
+def _principal(problem: Problem, camera: int, axis: int) -> Callable[[_Bench], Rows]:
     """A principal point that lies farther right, or down, by one pixel."""
     focal_px = torch.as_tensor(problem.intrinsic[:, axis])
 
-    def column(bench: _Bench) -> _Column:
+    def column(bench: _Bench) -> Rows:
         seen_by = bench.camera
         off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
         none = torch.zeros_like(off)
-        return _Column(bench.whiten(torch.stack([off, none] if axis == 0 else [none, off])))
+        return {"observations": bench.whiten(torch.stack([off, none] if axis == 0 else [none, off]))}
 
     return column
 
 
-def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], _Column]:
+def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], Rows]:
     """The column of a motion of the vehicle (C, J, 6) in its own frame, by central differences."""
 
-    def column(bench: _Bench) -> _Column:
+    def column(bench: _Bench) -> Rows:
         engine, estimate = bench.whitening.engine, bench.whitening.estimate
         extrinsic, tangent = estimate.cam_from_vehicle[:, None], motion(bench.arrays) * _STEP
         poses = engine.poses(estimate)
@@ -344,7 +526,7 @@ def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], _Column]:
             )
             for sign in (1.0, -1.0)
         )
-        return _Column((high - low) / (2 * _STEP) * bench.root)
+        return {"observations": (high - low) / (2 * _STEP) * bench.root}
 
     return column
 
@@ -361,6 +543,87 @@ def _clock_motion(problem: Problem, camera: int, visit: int) -> Callable[[Arrays
     return motion
 
 
+def _changes(arrays: Arrays) -> list[int]:
+    """Frames at which inputs may change: where every other stretch of a session begins, but its first."""
+    stretch = _stretches(arrays)
+    begins = (stretch.diff() > 0).nonzero()[:, 0] + 1
+    return [int(j) for j in begins[1::_STRETCHES_PER_CHANGE] if arrays.visit[j] == arrays.visit[j - 1]]
+
+
+def _drift_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
+    """A clock that is right in the middle, and off by half the value at either end."""
+    frames = len(problem.map_from_vehicle)
+    late = np.linspace(-0.5, 0.5, frames)[:, None]
+    twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * late)
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[slice(None) if camera < 0 else camera] = twist.to(out.device)
+        return out
+
+    return motion
+
+
+def _course_motion(problem: Problem) -> Callable[[Arrays], Tensor]:
+    """A heading that is the course of a point ahead of the rear axle: it slips as the path bends."""
+    twist = np.asarray(problem.twist_vehicle)
+    speed = np.hypot(twist[:, 0], twist[:, 1])
+    curvature = np.where(speed > _LEAST_SPEED_MPS, twist[:, 5] / np.maximum(speed, _LEAST_SPEED_MPS), 0.0)
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[..., 5] = -torch.as_tensor(curvature).to(out.device)
+        return out
+
+    return motion
+
+
+def _step_motion(axis: int, frame: int) -> Callable[[Arrays], Tensor]:
+    """Positions that are recorded short along an axis of the map, from a frame to the end of its session."""
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[..., :3] = arrays.vehicle_from_map[:, :3, axis]
+        return out * _since(arrays, frame)
+
+    return motion
+
+
+def _knock_motion(camera: int, axis: int, frame: int) -> Callable[[Arrays], Tensor]:
+    """A camera that turns about its own centre; load turns all of them, about the rear axle."""
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        turn = torch.eye(3, dtype=out.dtype, device=out.device)[axis]
+        chosen = slice(None) if camera < 0 else slice(camera, camera + 1)
+        out[chosen, :, 3:] = turn
+        if camera >= 0:
+            out[chosen, :, :3] = torch.linalg.cross(arrays.centre[chosen], turn.expand(1, 3))[:, None]
+        return out * _since(arrays, frame)
+
+    return motion
+
+
+def _since(arrays: Arrays, frame: int) -> Tensor:
+    """1 for the frames (J, 1) from ``frame`` to the end of its session, else 0."""
+    later = torch.arange(arrays.frame_count, device=arrays.visit.device) >= frame
+    return (later & (arrays.visit == arrays.visit[frame])).to(arrays.centre.dtype)[:, None]
+
+
+def _crown(bench: _Bench) -> Rows:
+    """Corners that lie lower by the value times their distance from the route."""
+    arrays, estimate = bench.arrays, bench.whitening.estimate
+    frames = arrays.vehicle_from_map.inverse()
+    nearest = torch.cdist(estimate.corners_map, frames[:, :2, 3].contiguous()).argmin(dim=1)
+    away = estimate.corners_map - frames[nearest, :2, 3]
+    aside = (away * frames[nearest, :2, 1]).sum(1).abs()[arrays.corner.long()]
+    poses = bench.whitening.engine.poses(estimate).flatten(0, 1)[arrays.pair.long()]
+    up, points = poses[:, :3, 2], points_in_camera(poses, estimate.corners_map[arrays.corner.long()])
+    depth = points[:, 2:].clamp(min=NEAR_M)
+    moved = -aside[:, None] * (up[:, :2] - points[:, :2] / depth * up[:, 2:]) / depth
+    return {"observations": bench.whiten(moved.T)}
+
+
 def _slope_motion(axis: int) -> Callable[[Arrays], Tensor]:
     """Ground that rises along an axis of the map, under poses that do not know of it."""
 
@@ -373,23 +636,23 @@ def _slope_motion(axis: int) -> Callable[[Arrays], Tensor]:
     return motion
 
 
-def _survey(camera: int, axis: int) -> Callable[[_Bench], _Column]:
-    def column(bench: _Bench) -> _Column:
+def _survey(camera: int, axis: int) -> Callable[[_Bench], Rows]:
+    def column(bench: _Bench) -> Rows:
         out, which = torch.zeros_like(bench.arrays.centre), slice(None) if camera < 0 else camera
         out[which, axis] = -bench.arrays.centre_information_root[which, axis]
-        return _Column(centre=out)
+        return {"camera_centre": out}
 
     return column
 
 
-def _datum(axis: int) -> Callable[[_Bench], _Column]:
-    def column(bench: _Bench) -> _Column:
+def _datum(axis: int) -> Callable[[_Bench], Rows]:
+    def column(bench: _Bench) -> Rows:
         out = torch.zeros_like(bench.arrays.control)
         out[:, axis] = -bench.arrays.control_information[:, axis].sqrt()
-        return _Column(control=out)
+        return {"control_points": out}
 
     return column
 
 
-def _size(which: Tensor) -> Callable[[_Bench], _Column]:
-    return lambda bench: _Column(length=-bench.arrays.lengths.information_root * which)
+def _size(which: Tensor) -> Callable[[_Bench], Rows]:
+    return lambda bench: {"known_lengths": -bench.arrays.lengths.information_root * which}

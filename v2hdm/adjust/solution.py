@@ -44,10 +44,6 @@ _ADVICE = {
 }
 
 
-# Noise that is off by less than this factor cannot be distinguished from the effect of a drive's geometry.
-_NOISE_FACTOR = 1.25
-
-
 @dataclass(frozen=True)
 class Solution:
     """The adjusted extrinsics, poses and corners, and the evidence that they are the optimum.
@@ -112,22 +108,6 @@ class Solution:
     def excluded(self, observations: Observations) -> tuple[Excluded, ...]:
         """The excluded of ``observations``, those of the problem, and why; worst first."""
         return excluded(observations, self.mahalanobis2, self.verdict)
-
-    @property
-    def noise_advice(self) -> str:
-        """One sentence on whether the residuals are as large as the stated noise says."""
-        ratio = float(np.sqrt(self.chi2_per_dof))
-        if ratio > _NOISE_FACTOR:
-            return (
-                f"The residuals are {ratio:.1f} times what the stated noise allows: the observation "
-                "covariances or pose sigmas are too small, or the poses err in a way that is not estimated."
-            )
-        if ratio < 1 / _NOISE_FACTOR:
-            return (
-                f"The residuals are {1 / ratio:.1f} times smaller than the stated noise: the map is better "
-                "than its covariances say; state smaller sigmas."
-            )
-        return "The residuals are as large as the stated noise says."
 
     @property
     def extrinsic_covariance(self) -> FloatArray:

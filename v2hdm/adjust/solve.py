@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
@@ -17,10 +16,10 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, frame_tangent
-from v2hdm.adjust.problem import LINE_EXCESS, Problem, SolveOptions
+from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.start import coarse_extrinsics, is_near, is_worth_a_look
-from v2hdm.adjust.validation import VarianceFactors, as_of_point, classify, noise_scale, variance_factors
+from v2hdm.adjust.validation import as_of_point, classify, noise_scale, variance_factors
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.tensors import exp
@@ -70,7 +69,7 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
         opening,
     )
     del opening
-    return report(problem, origin_map, options, descent, spent, began)
+    return _report(problem, origin_map, options, descent, spent, began)
 
 
 def _start(
@@ -114,7 +113,7 @@ def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tup
     return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
 
 
-def report(
+def _report(
     problem: Problem,
     origin_map: FloatArray,
     options: SolveOptions,
@@ -123,33 +122,40 @@ def report(
     began: float,
 ) -> Solution:
     """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
-    from v2hdm.adjust.engines.numba.prepare import on_line  # loads numba
-
     robust = Loss(options.loss, options.loss_scale)
     engine, estimate, terms = descent.engine, descent.estimate, descent.terms
     arrays = engine.arrays
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
+    cost_terms = {name: float(value) for name, value in terms.items()}
     residual_px, mahalanobis2, behind = engine.report(estimate, problem.intrinsic[:, :2])
-    lines = on_line(problem.observations.covariance_px, LINE_EXCESS)
+    lines = problem.observations.on_line
     if lines.any():
         mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
     scale = noise_scale(mahalanobis2)
-    variance = _variance_factors(arrays, terms, mahalanobis2, scale)
-    corners_map = _unsorted(estimate.corners_map, arrays.corner_order)
-    corners_map += origin_map
+    of_priors = 2 * sum(cost for name, cost in cost_terms.items() if name != "observations")
+    held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_information > 0).sum())
+    free = 2 * arrays.corner_count + 6 * arrays.camera_count - held - len(arrays.lengths.first)
+    variance = variance_factors(mahalanobis2, of_priors, free, scale)
+    corners_map = np.empty(estimate.corners_map.shape)
+    corners_map[arrays.corner_order.cpu().numpy()] = estimate.corners_map.cpu().numpy()
+    map_from_vehicle, clock_s = problem.map_from_vehicle.copy(), estimate.clock_s.cpu().numpy()
+    if arrays.states:
+        off = exp(frame_tangent(arrays, estimate.frame_state))
+        recorded = torch.as_tensor(map_from_vehicle, dtype=off.dtype, device=off.device)
+        map_from_vehicle = (recorded @ off).cpu().numpy()
     return Solution(
         status=_status(descent, options, bool(behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
-        map_from_vehicle=_adjusted_poses(problem, arrays, estimate),
-        corners_map=corners_map,
+        map_from_vehicle=map_from_vehicle,
+        corners_map=corners_map + origin_map,
         residual_px=residual_px,
         mahalanobis2=mahalanobis2,
         verdict=classify(problem.observations, mahalanobis2, behind, options.gate_probability, scale),
         loss=options.loss,
         loss_scale=options.loss_scale,
-        clock_offset_s=_clock_offset_s(problem, estimate),
-        cost_terms={name: float(value) for name, value in terms.items()},
+        clock_offset_s=clock_s if clock_s.size else np.zeros((len(clock_s), problem.visit_count)),
+        cost_terms=cost_terms,
         evaluations=descent.evaluations + spent,
         gap=descent.gap,
         chi2_per_dof=variance.all,
@@ -157,30 +163,6 @@ def report(
         time_s=time.perf_counter() - began,
         covariance=Covariance(descent),
     )
-
-
-def _adjusted_poses(problem: Problem, arrays: Arrays, estimate: Estimate) -> FloatArray:
-    """Poses (J, 4, 4), the recorded ones where no state is estimated."""
-    if not arrays.states:
-        return problem.map_from_vehicle.copy()
-    recorded = torch.as_tensor(
-        problem.map_from_vehicle, dtype=torch.float64, device=estimate.frame_state.device
-    )
-    return np.asarray((recorded @ exp(frame_tangent(arrays, estimate.frame_state))).cpu().numpy())
-
-
-def _clock_offset_s(problem: Problem, estimate: Estimate) -> FloatArray:
-    """Clock offsets (C, V), zero where they are not estimated."""
-    if not estimate.clock_s.shape[1]:
-        return np.zeros((len(problem.intrinsic), problem.visit_count))
-    return np.asarray(estimate.clock_s.cpu().numpy())
-
-
-def _unsorted(values: Tensor, order: Tensor) -> FloatArray:
-    """Rows of ``values`` back where the problem had them."""
-    out = np.empty(values.shape)
-    out[order.cpu().numpy()] = values.cpu().numpy()
-    return out
 
 
 def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
@@ -191,15 +173,3 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
     if descent.gap <= options.gap_tolerance:
         return Status.CONVERGED
     return Status.EVALUATIONS_EXHAUSTED if descent.progressing else Status.STALLED
-
-
-def _variance_factors(
-    arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray, scale: float
-) -> VarianceFactors:
-    """Variance factors of a solve whose cost has these ``terms`` and whose noise has the ``scale``."""
-    of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
-    centres = int((arrays.centre_information_root > 0).sum())
-    surveyed = int((arrays.control_information > 0).sum())
-    known = surveyed + centres + len(arrays.lengths.first)
-    free = 2 * arrays.corner_count + 6 * arrays.camera_count - known
-    return variance_factors(squared, of_priors, free, scale)

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from heapq import heapify, heappop, heappush
-from itertools import accumulate, combinations
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -104,54 +103,38 @@ class TiledMatrix:
     Attributes:
         pattern: which there are.
         values: all numbers. What follows are views of them.
-        diagonal_at, panel_at: where each tile on the diagonal begins, and where what stands below it.
-        diagonal: tiles on the diagonal, in elimination order, without the tip.
-        panels: what stands below each, stacked, the tip's rows last.
+        columns: the tiles of each column but the tip's, stacked, in elimination order, the tip's rows last.
         tip: the last tile on the diagonal.
         tiles: all of them by (row, column) in elimination order, or :data:`TIP`.
+        keys, at: of those in columns, ascending, the column times G + 1 plus the row, the tip's being G; and
+            where each begins among the values.
     """
 
     pattern: Pattern
     values: Tensor
-    diagonal_at: tuple[int, ...]
-    panel_at: tuple[int, ...]
-    diagonal: tuple[Tensor, ...]
-    panels: tuple[Tensor, ...]
+    columns: tuple[Tensor, ...]
     tip: Tensor
     tiles: Mapping[tuple[int, int], Tensor]
+    keys: NDArray[np.int64]
+    at: NDArray[np.int64]
 
     @classmethod
     def zeros(cls, pattern: Pattern, size: int, tip: int, like: Tensor) -> TiledMatrix:
         """Tiles of ``size`` rows and columns and a tip of ``tip``; numbers are of the kind of ``like``."""
-        heights = [len(below) * size + tip for below in pattern.below]
-        begins = [0, *accumulate(size * (size + height) for height in heights)]
-        values = like.new_zeros(begins[-1] + tip * tip)
-        panel_at = [begin + size * size for begin in begins[:-1]]
-        diagonal = tuple(values[at : at + size * size].view(size, size) for at in begins[:-1])
-        panels = tuple(
-            values[at : at + height * size].view(height, size)
-            for at, height in zip(panel_at, heights, strict=True)
-        )
-        last = values[begins[-1] :].view(tip, tip)
-        tiles = {(TIP, TIP): last}
-        for column, below in enumerate(pattern.below):
-            rows = [size] * len(below) + [tip]
-            for row, tile in zip((*below, TIP), torch.split(panels[column], rows), strict=True):
-                tiles[row, column] = tile
-            tiles[column, column] = diagonal[column]
-        return cls(pattern, values, tuple(begins[:-1]), tuple(panel_at), diagonal, panels, last, tiles)
-
-    @cached_property
-    def addresses(self) -> tuple[Tensor, Tensor]:
-        """Tiles but the tip's, as column times their count plus row, ascending, and where each begins."""
-        count = len(self.diagonal)
+        count = len(pattern.below)
+        areas = [size * (size + size * len(below) + tip) for below in pattern.below]
+        values = like.new_zeros(sum(areas) + tip * tip)
+        *stacked, last = torch.split(values, [*areas, tip * tip])
+        columns = tuple(part.view(-1, size) for part in stacked)
+        tiles = {(TIP, TIP): last.view(tip, tip)}
         keys, at = [], []
-        for column, below in enumerate(self.pattern.below):
-            area = self.diagonal[column].numel()
-            keys += [column * count + row for row in (column, *below)]
-            at += [self.diagonal_at[column], *(self.panel_at[column] + n * area for n in range(len(below)))]
-        device = self.values.device
-        return torch.tensor(keys, device=device), torch.tensor(at, device=device)
+        for column, (part, below) in enumerate(zip(columns, pattern.below, strict=True)):
+            rows = (column, *below, TIP)
+            parts = torch.split(part, [size] * (len(rows) - 1) + [tip])
+            tiles.update(zip(((row, column) for row in rows), parts, strict=True))
+            keys += [column * (count + 1) + row % (count + 1) for row in rows]
+            at += [tile.storage_offset() for tile in parts]
+        return cls(pattern, values, columns, tiles[TIP, TIP], tiles, np.array(keys), np.array(at))
 
 
 @dataclass(frozen=True)
@@ -197,9 +180,7 @@ class TiledCholesky:
         """L^-T b for b (size, n)."""
         out, end = right.clone(), self.size - len(self.tip)
         out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
-        for tile, panel, rows in zip(
-            reversed(self.diagonal), reversed(self.panels), reversed(self.rows), strict=True
-        ):
+        for tile, panel, rows in zip(self.diagonal[::-1], self.panels[::-1], self.rows[::-1], strict=True):
             begin = end - len(tile)
             rest = out[begin:end] - panel.mT @ out.index_select(0, rows)
             out[begin:end] = torch.linalg.solve_triangular(tile.mT, rest, upper=True)
@@ -212,9 +193,13 @@ def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
 
     Right-looking: each column, once factorised, is subtracted from those it couples to.
     """
-    rows = []
+    diagonal, panels, rows = [], [], []
+    tip = matrix.tip
+    size = matrix.columns[0].shape[1] if matrix.columns else 0
+    index = torch.arange(size * len(matrix.columns) + len(tip), device=tip.device)
     for column, below in enumerate(matrix.pattern.below):
-        own, panel = matrix.diagonal[column], matrix.panels[column]
+        own = matrix.tiles[column, column]
+        panel = matrix.columns[column][size:]
         if not _factorise_tile(own):
             return None
         panel.copy_(torch.linalg.solve_triangular(own, panel.mT, upper=False).mT)
@@ -223,10 +208,13 @@ def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
             for second in keys[n:]:
                 left, right = matrix.tiles[second, column], matrix.tiles[first, column]
                 matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
-        rows.append(_row_index(below, len(own), len(matrix.diagonal), len(matrix.tip), panel))
-    if not _factorise_tile(matrix.tip):
+        diagonal.append(own)
+        panels.append(panel)
+        tiles = [index[tile * size : (tile + 1) * size] for tile in below]
+        rows.append(torch.cat([*tiles, index[-len(tip) :]]))
+    if not _factorise_tile(tip):
         return None
-    return TiledCholesky(matrix.diagonal, matrix.panels, tuple(rows), matrix.tip)
+    return TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip)
 
 
 def _factorise_tile(tile: Tensor) -> bool:
@@ -234,9 +222,3 @@ def _factorise_tile(tile: Tensor) -> bool:
     factor, info = torch.linalg.cholesky_ex(tile)
     tile.copy_(factor)
     return int(info) == 0
-
-
-def _row_index(below: tuple[int, ...], size: int, count: int, tip: int, like: Tensor) -> Tensor:
-    starts = torch.tensor(below, dtype=torch.int64, device=like.device)[:, None] * size
-    tiles = (starts + torch.arange(size, device=like.device)).flatten()
-    return torch.cat([tiles, torch.arange(count * size, count * size + tip, device=like.device)])

@@ -26,7 +26,6 @@ from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.homography import find_homography_dlt
 from kornia.geometry.linalg import transform_points
 
-from v2hdm.calibration.points import SurveyedPoints
 from v2hdm.geometry.ipm import extrinsic_from_ipm, homography_jacobian, pinhole_px_from_ground
 from v2hdm.geometry.least_squares import Normal, covariance_of, gauss_newton, normal_equations
 from v2hdm.geometry.lens import distort_points, undistort_points
@@ -77,14 +76,7 @@ class Seen:
     noise: Noise
 
     @classmethod
-    def of(cls, points: SurveyedPoints, info: CameraInfo, noise: Noise) -> Seen:
-        """The points as the camera ``info`` saw them."""
-        return cls.of_pixels(points.points_px, points.points_vehicle, info, noise)
-
-    @classmethod
-    def of_pixels(
-        cls, points_px: FloatArray, points_vehicle: FloatArray, info: CameraInfo, noise: Noise
-    ) -> Seen:
+    def of(cls, points_px: FloatArray, points_vehicle: FloatArray, info: CameraInfo, noise: Noise) -> Seen:
         """Recorded pixels (N, 2) of ground points (N, 2) as the camera ``info`` saw them."""
         pinhole_px = undistort_points(info, points_px)
         steps = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -165,13 +157,9 @@ class Seen:
 class Fit:
     """A mounting and how well the points determine it.
 
-    Attributes:
-        seen: the points.
-        cam_from_vehicle: (4, 4).
-        covariance: (6, 6) of its left tangent; infinite on the diagonal where the points leave it free.
-        factor: q, of the stated variances.
-        right: (N,) probability that each point is right.
-        log_posterior: of the mounting, up to a constant of the points.
+    ``covariance`` (6, 6) is of the left tangent of ``cam_from_vehicle``, infinite on the diagonal where the
+    points leave it free. ``factor`` is q, of the stated variances, ``right`` (N,) the probability that each
+    point is right.
     """
 
     seen: Seen
@@ -190,22 +178,16 @@ class Fit:
 def fit_mountings(seen: Seen, starts: int = _REFINED, rounds: int = _ROUNDS) -> list[Fit]:
     """Mountings that explain the points, the most likely first; none where all points lie on a line.
 
-    Args:
-        seen: the points.
-        starts: how many are refined.
-        rounds: of expectation maximisation that each may take.
+    So many ``starts`` are refined, each by ``rounds`` of expectation maximisation at most.
     """
     found: list[Fit] = []
     for start in _starts(seen, starts):
         fit = _refine(seen, start, rounds)
-        if not any(np.array_equal(fit.is_right, other.is_right) and _near(fit, other) for other in found):
+        alike = [other for other in found if np.array_equal(fit.is_right, other.is_right)]
+        # Up to their convergence two fits are one.
+        if all(np.abs(fit.cam_from_vehicle - other.cam_from_vehicle).max() >= 1e-3 for other in alike):
             found.append(fit)
     return sorted(found, key=lambda one: -one.log_posterior)
-
-
-def _near(fit: Fit, other: Fit) -> bool:
-    """Whether two fits are one up to their convergence."""
-    return bool(np.abs(fit.cam_from_vehicle - other.cam_from_vehicle).max() < 1e-3)
 
 
 def _starts(seen: Seen, count: int) -> list[FloatArray]:

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.show import draw_matched_ground, lines
 from v2hdm.io.calibration import Provenance, write_calibration
-from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive import as_drive
 from v2hdm.io.safe.pixels import png
 from v2hdm.records import Calibration, Drive
-from v2hdm.report.outputs import result_folder, write_json
-from v2hdm.settings import check_workers
-from v2hdm.verdict import Status, Verdict, check_drive
+from v2hdm.report.outputs import write_json
+from v2hdm.verdict import Verdict, check_drive
 
 
 @dataclass(frozen=True)
@@ -39,48 +32,30 @@ class GroundCalibration:
 
 
 def calibrate_from_ground(
-    drive: Drive, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+    drive: Drive | str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> GroundCalibration:
     """Find every camera's mounting from bare ground, without a marking, and check the drive by it.
 
     Args:
-        drive: the drive.
+        drive: the drive, or its folder.
         workers: processes, one camera each at a time.
         progress: called as ``progress(done, total)`` cameras.
 
+    Returns:
+        Calibrations of the cameras whose mounting the ground shows, and the verdict on the drive.
+
     Raises:
-        DriveError: an image cannot be read.
+        DriveError: the drive, or an image, cannot be read.
+
+    >>> found = calibrate_from_ground(port)
+    >>> found.verdict.status.value
+    'PASS'
+    >>> [one.cam_from_vehicle.shape for one in found.calibrations.values()]
+    [(4, 4)]
     """
+    drive = as_drive(drive)
     estimates = estimate_cameras(drive, workers, progress)
     return GroundCalibration(drive, estimates, check_drive(drive, ground=estimates))
-
-
-def estimate_mountings(parsed: argparse.Namespace) -> bool:
-    """Estimate every camera's mounting, print it with the verdict on the drive, and write it.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.calibrate_ground`.
-
-    Returns:
-        Whether the verdict is FAIL.
-
-    Raises:
-        V2hdmError: the drive cannot be read, or the results cannot be written.
-    """
-    check_workers(parsed.workers)
-    cv2.setNumThreads(1)
-    drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
-    folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
-    with result_folder(folder, "--output") as unfinished:
-        workers = parsed.workers or os.cpu_count() or 1
-        found = calibrate_from_ground(drive, workers=workers, progress=_report_progress)
-        settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras)}
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_ground_calibration(found, unfinished)
-    for line in summary_lines(found):
-        print(line)
-    print(f"results in {folder}")
-    return found.verdict.status is Status.FAIL
 
 
 def summary_lines(found: GroundCalibration) -> list[str]:
@@ -100,7 +75,3 @@ def write_ground_calibration(found: GroundCalibration, folder: Path) -> None:
             path = folder / f"calibration_{name}.yaml"
             write_calibration(calibration, path, verdict=verdict, about=about)
             (folder / f"ground_{name}.png").write_bytes(png(picture))
-
-
-def _report_progress(done: int, total: int) -> None:
-    print(f"matched the ground of {done} of {total} cameras", file=sys.stderr, flush=True)

@@ -7,15 +7,12 @@ explains the points and by where cameras sit on vehicles. The likeliest one is n
 
 from __future__ import annotations
 
-import argparse
 import csv
-import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from scipy.spatial import ConvexHull
 
@@ -23,17 +20,15 @@ from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
 from v2hdm.calibration.picture import save_picture
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
-from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.calibration import Provenance, write_calibration, write_camera_info
-from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.records import Calibration, CameraInfo, FloatArray
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.store.files import dump_yaml
-from v2hdm.verdict.verdict import Status, Verdict
+from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
 POINTS_FILE = "points.csv"
@@ -108,9 +103,22 @@ def calibrate_from_points(
         pixel_sigma: standard deviation of clicking, px a coordinate.
         survey_sigma: standard deviation of surveying, m a coordinate.
 
+    Returns:
+        ``calibration.cam_from_vehicle`` (4, 4), its covariance (6, 6) in m and rad, and a verdict.
+
     Raises:
         DriveError: a point is impossible, or the points fit no mounting; the message names the cause.
+        ConfigError: a standard deviation is no number, negative, or both are 0.
+
+    >>> found = calibrate_from_points(points, port.cameras["front"].info)
+    >>> found.verdict.status.value, found.calibration.covariance.shape
+    ('PASS', (6, 6))
     """
+    for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
+        if not (np.isfinite(value) and value >= 0):
+            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
+    if pixel_sigma == survey_sigma == 0:
+        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
     table = points if isinstance(points, SurveyedPoints) else read_points(Path(points))
     check_points(table, info)
     fits = solve(table, info, Noise(pixel_sigma, survey_sigma))
@@ -124,7 +132,7 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     Raises:
         DriveError: none does: they lie on a line, or the table is written otherwise than its columns say.
     """
-    fits = fit_mountings(Seen.of(points, info, noise))
+    fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
         cause = _misreading(points, info, noise, fits[0] if fits else None)
         if cause is not None:
@@ -134,8 +142,13 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
             f"{points.path}: the points fix no camera: they lie about on a line, or all but one do; "
             "survey some to the left and to the right of it"
         )
-    unit, height = _unit_of(fits[0]), _height_m(fits[0])
-    if unit is not None:
+    height = _height_m(fits[0])
+
+    def log_odds(metres: float, prior: float) -> float:
+        return float(-0.5 * (np.log(height * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
+
+    unit = max(UNITS, key=lambda unit: log_odds(UNITS[unit], _MISREAD))
+    if log_odds(UNITS[unit], _MISREAD) > log_odds(1.0, 1.0):
         raise DriveError(
             f"{points.path}: the camera comes out {height:.4g} m above the ground: x and y look like {unit}; "
             f"write metres, in which that is {height * UNITS[unit]:.2f} m"
@@ -161,23 +174,12 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise, given: F
     """The cause under which the points make sense, if they make none as they are."""
     cause, highest = None, -np.inf
     for words, points_px, points_vehicle in _readings(points, info):
-        seen = Seen.of_pixels(points_px, points_vehicle, info, noise)
+        seen = Seen.of(points_px, points_vehicle, info, noise)
         for fit in fit_mountings(seen, _STARTS, _ROUNDS):
             if _score(fit) > highest:
                 cause, highest = words, _score(fit)
     as_given = -np.inf if given is None else _score(given)
     return cause if highest > -np.inf and highest + np.log(_MISREAD) - as_given > _SURE else None
-
-
-def _unit_of(fit: Fit) -> str | None:
-    """The unit of the ground points where it is not the metre, by the height that the camera comes out at."""
-
-    def log_odds(metres: float, prior: float) -> float:
-        return float(-0.5 * (np.log(_height_m(fit) * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
-
-    scores = {unit: log_odds(metres, _MISREAD) for unit, metres in UNITS.items()}
-    best = max(scores, key=lambda unit: scores[unit])
-    return best if scores[best] > log_odds(1.0, 1.0) else None
 
 
 def _score(fit: Fit) -> float:
@@ -203,63 +205,6 @@ def _readings(points: SurveyedPoints, info: CameraInfo) -> Iterator[tuple[str, F
         yield f"{size}; give both for one size", (px + 0.5) * scale - 0.5, ground
 
 
-def calibrate_camera(parsed: argparse.Namespace) -> bool:
-    """Calibrate, print the result with the verdict on it, and write it.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.calibrate`.
-
-    Returns:
-        Whether the verdict is FAIL.
-
-    Raises:
-        V2hdmError: the points or the intrinsics cannot be used, or the results cannot be written.
-    """
-    cv2.setNumThreads(1)
-    _check_sigmas(parsed.pixel_sigma, parsed.survey_sigma)
-    info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
-    info = replace(info, name=parsed.name or info.name)
-    if "/" in info.name or info.name in ("", ".", ".."):
-        raise ConfigError(f"the camera is called {info.name!r}, which is no file name; give another --name")
-    points = read_points(parsed.points)
-    image = None if parsed.image is None else _image(parsed.image, info)
-    sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
-    found = calibrate_from_points(points, info, **sigmas)
-    folder = parsed.output or Path("outputs") / f"{info.name}-calibrate"
-    with result_folder(folder) as unfinished:
-        settings = {
-            "points": str(parsed.points),
-            "intrinsics": str(parsed.intrinsics),
-            "image": None if parsed.image is None else str(parsed.image),
-            **sigmas,
-        }
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_point_calibration(found, unfinished, image)
-    for line in summary_lines(found):
-        print(line)
-    print(f"results in {folder}")
-    return found.verdict.status is Status.FAIL
-
-
-def _check_sigmas(pixel_sigma: float, survey_sigma: float) -> None:
-    for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
-        if not (np.isfinite(value) and value >= 0):
-            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
-    if pixel_sigma == survey_sigma == 0:
-        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
-
-
-def _image(path: Path, info: CameraInfo) -> np.ndarray:
-    image = read_bgr(path)
-    rows, columns = image.shape[:2]
-    if (columns, rows) != (info.width, info.height):
-        raise DriveError(
-            f"{path}: the image is {columns} x {rows}, but the intrinsics of '{info.name}' are for "
-            f"{info.width} x {info.height}; give both for one size"
-        )
-    return image
-
-
 _COLUMNS = (
     "point", "u", "v", "x", "y", "off_u_px", "off_v_px", "off_x_m", "off_y_m", "sigmas", "probability_right",
     "known_m",
@@ -282,26 +227,18 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
     with (folder / POINTS_FILE).open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
-        table.writerows(_rows(found))
+        points, off = found.points, found.residuals
+        for k, name in enumerate(points.names):
+            shift = [
+                *(f"{value:.3f}" for value in off.off_px[k]),
+                *(f"{value:.4f}" for value in off.off_m[k]),
+            ]
+            known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
+            table.writerow(
+                [name, *points.points_px[k].tolist(), *points.points_vehicle[k].tolist(), *shift, *known]
+            )
     labels = found.points.labels
     save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
-
-
-def _rows(found: PointCalibration) -> list[list[object]]:
-    points, off = found.points, found.residuals
-    return [
-        [
-            points.names[k],
-            *points.points_px[k].tolist(),
-            *points.points_vehicle[k].tolist(),
-            *(f"{value:.3f}" for value in off.off_px[k]),
-            *(f"{value:.4f}" for value in off.off_m[k]),
-            f"{off.sigmas[k]:.2f}",
-            f"{found.fit.right[k]:.3g}",
-            f"{off.known_m[k]:.4f}",
-        ]
-        for k in range(len(points.names))
-    ]
 
 
 def summary_lines(found: PointCalibration) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from v2hdm.calibration.residuals import Residuals
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray
 from v2hdm.report import style
-from v2hdm.report.photos import project_line
+from v2hdm.report.photos import project_line, project_outline
 
 _HEIGHT_IN = 6.4
 _ARROW_SHARE = 0.06  # length of the longest arrow of a right point, as a share of the picture's width
@@ -54,9 +53,8 @@ def save_picture(
     """Draw points and residuals on an image (H, W, 3) BGR, or blank paper of its size, and on the ground."""
     points = fit.seen.points_vehicle
     margin = _MARGIN * np.ptp(points, axis=0).max()
-    scene = _Scene(
-        labels, fit, residuals, roi_vehicle, points.min(axis=0) - margin, points.max(axis=0) + margin
-    )
+    extent = (points.min(axis=0) - margin, points.max(axis=0) + margin)
+    scene = _Scene(labels, fit, residuals, roi_vehicle, *extent)
     low, high = _plan_limits(scene)
     view_in = _HEIGHT_IN * fit.seen.info.width / fit.seen.info.height
     plan_in = _HEIGHT_IN * float(np.clip((high - low)[1] / (high - low)[0], 0.4, 1.4)) + 0.6
@@ -87,15 +85,10 @@ def _draw_view(axes: Axes, image: np.ndarray | None, scene: _Scene) -> None:
                 axes.plot(*piece.T, color="white", lw=1.6, alpha=0.5)
                 axes.plot(*piece.T, color=_GRID, lw=0.8)
                 _label_line(axes, f"{'xy'[along]} {mark:g} m", piece, labelled, (info.width, info.height))
-    closed = np.vstack([scene.roi_vehicle, scene.roi_vehicle[:1]])
-    dense = np.concatenate([np.linspace(a, b, 40) for a, b in pairwise(closed)])
-    for piece in project_line(info, mounting, dense):
+    for piece in project_outline(info, mounting, scene.roi_vehicle):
         axes.plot(*piece.T, color=_ROI, lw=1.5)
-    axes.set_xlim(-0.5, info.width - 0.5)
-    axes.set_ylim(info.height - 0.5, -0.5)
+    style.set_image_axes(axes, -0.5, info.width - 0.5, info.height - 0.5, -0.5)
     axes.set_aspect("equal")
-    axes.set_xlabel("u (px)")
-    axes.set_ylabel("v (px)")
     _draw_residuals(axes, scene, scene.fit.seen.points_px, -scene.residuals.off_px, info.width, "px")
     axes.set_title(f"{info.name}: grid of the ground, ROI, arrows from the clicked to the predicted pixel")
 
@@ -138,13 +131,9 @@ def _draw_plan(axes: Axes, scene: _Scene) -> None:
     for place, radius in zip(points, 2 * factor * scene.residuals.known_m, strict=True):
         if radius < span:
             axes.plot(*(place + radius * circle).T[::-1], color="#9aa4ad", lw=0.8)
-    axes.set_xlim(high[1], low[1])
-    axes.set_ylim(low[0], high[0])
-    axes.set_aspect("equal")
-    axes.grid(color="#e6eaed", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.set_ylabel("x, forward (m)")
-    axes.set_title("from above; circles: 2 sigmas")
+    axes.set(xlim=(high[1], low[1]), ylim=(low[0], high[0]), aspect="equal", axisbelow=True)
+    axes.grid(color=style.GRID, lw=0.6)
+    axes.set(ylabel="x, forward (m)", title="from above; circles: 2 sigmas")
     axes.legend(loc="upper right", fontsize=8)
 
 
@@ -177,8 +166,6 @@ def _draw_residuals(
     else:
         words = f"arrows {factor:.0f} times as long; the longest is {longest:.2f} px"
     if not right.all():
-        words += (
-            "; crosses contradict the others, true to scale" if unit == "px" else "; crosses true to scale"
-        )
+        words += f"; crosses {'contradict the others, ' if unit == 'px' else ''}true to scale"
     axes.set_xlabel(f"{axes.get_xlabel()}\n{words}")
     return factor

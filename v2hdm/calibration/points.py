@@ -80,12 +80,16 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
         DriveError: there are some; names the first.
     """
     size = np.array([info.width, info.height])
-    outside = ~_inside(points.points_px, size)
+
+    def inside(points_px: FloatArray) -> BoolArray:
+        return np.asarray(((points_px > -0.5) & (points_px < size - 0.5)).all(axis=1))
+
+    outside = ~inside(points.points_px)
     if outside.any():
         k = int(np.argmax(outside))
         u, v = points.points_px[k]
         hint = "mend it, or name the intrinsics of this image"
-        if _inside(points.points_px[:, ::-1], size).all():
+        if inside(points.points_px[:, ::-1]).all():
             hint = "u and v look exchanged: u counts columns to the right, v rows down"
         raise DriveError(
             f"{points.path}: {points.names[k]}: pixel ({u:g}, {v:g}) lies outside the image of "
@@ -98,10 +102,6 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
                     f"{points.path}: {points.names[a]} and {points.names[b]} have the same {what}; drop or "
                     "mend one of them"
                 )
-
-
-def _inside(points_px: FloatArray, size: np.ndarray) -> BoolArray:
-    return np.asarray(((points_px > -0.5) & (points_px < size - 0.5)).all(axis=1))
 
 
 def _columns(header: list[str], path: Path) -> list[str]:

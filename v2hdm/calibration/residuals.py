@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -19,7 +20,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.records import FloatArray
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 CHANCE = 1e-3
@@ -38,12 +39,10 @@ _AROUND = 12  # places on the circle of known_around
 class Residuals:
     """N points under a mounting.
 
-    Attributes:
-        off_px: (N, 2) recorded less predicted pixel.
-        off_m: (N, 2) where the IPM puts the pixel, less where the point was surveyed; nan above the horizon.
-        sigmas: (N,) distance of the point from the prediction of all others, in standard deviations.
-        probability: (N,) of a right point being as far off by chance.
-        known_m: (N,) standard deviation of the IPM there, in the direction known worst.
+    ``off_px`` (N, 2) is the recorded less the predicted pixel, ``off_m`` (N, 2) where the IPM puts the pixel
+    less where the point was surveyed, nan above the horizon. ``sigmas`` (N,) is the distance from what all
+    others predict, in standard deviations, ``probability`` (N,) that of a right point being as far off by
+    chance, ``known_m`` (N,) the standard deviation of the IPM there, in the direction known worst.
     """
 
     off_px: FloatArray
@@ -126,8 +125,7 @@ def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
     return np.sqrt(ratio), np.asarray(f.sf(ratio / 2, 2, free))
 
 
-@dataclass(frozen=True)
-class Scatter:
+class Scatter(NamedTuple):
     """By how much the right points scatter more than stated, and the chance of that or more."""
 
     ratio: float
@@ -141,20 +139,15 @@ def scatter(fit: Fit, chance: float) -> Scatter:
     stated = fit.seen.covariance(fit.cam_from_vehicle)[fit.is_right]
     total = float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(stated), residual))
     free = max(2 * len(residual) - UNKNOWNS, 1)
-    return Scatter(
-        float(np.sqrt(total / free)),
-        float(np.sqrt(chi2.isf(chance, free) / free)),
-        float(chi2.sf(total, free)),
-    )
+    limit = float(np.sqrt(chi2.isf(chance, free) / free))
+    return Scatter(float(np.sqrt(total / free)), limit, float(chi2.sf(total, free)))
 
 
-@dataclass(frozen=True)
-class Lens:
+class Lens(NamedTuple):
     """Whether the points agree with the intrinsics.
 
-    Attributes:
-        probability: of as large a disagreement by chance, with both focal lengths freed.
-        focal: by which share the points want the focal length longer, and the standard deviation of that.
+    ``probability`` is of as large a disagreement by chance, with both focal lengths freed. ``focal`` is by
+    which share the points want the focal length longer, and the standard deviation of that.
     """
 
     probability: float
@@ -166,9 +159,10 @@ def lens(fit: Fit) -> Lens:
     probability, focal, sigma = _freed(fit)
     total = 1 + focal
     for _ in range(_FOCAL_ROUNDS if abs(focal) > sigma else 0):
-        points_px, points_vehicle, noise = fit.seen.points_px, fit.seen.points_vehicle, fit.seen.noise
-        seen = Seen.of_pixels(points_px, points_vehicle, _longer(fit.seen.info, total), noise)
-        again = fit_mountings(seen, starts=1)
+        seen, intrinsic = fit.seen, fit.seen.info.intrinsic.copy()
+        intrinsic[:2, :2] *= total
+        info = replace(seen.info, intrinsic=intrinsic)
+        again = fit_mountings(Seen.of(seen.points_px, seen.points_vehicle, info, seen.noise), starts=1)
         if not again:
             break
         _, focal, sigma = _freed(again[0])
@@ -208,12 +202,6 @@ def _gain_of(
     left, force = own - through @ shared.T, wanted - through @ pull
     step = -np.linalg.pinv(left, hermitian=True) @ force
     return float(-step @ force), step, left
-
-
-def _longer(info: CameraInfo, factor: float) -> CameraInfo:
-    intrinsic = info.intrinsic.copy()
-    intrinsic[:2, :2] *= factor
-    return replace(info, intrinsic=intrinsic)
 
 
 def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals) -> Iterator[Finding]:

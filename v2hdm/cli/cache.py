@@ -1,4 +1,4 @@
-"""``v2hdm cache list`` says what is kept; ``prune`` and ``verify`` mend it (docs/cache.md)."""
+"""``v2hdm cache list`` says what is kept; ``prune`` makes room (docs/cache.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _GB = 1e9
 
 
 def run(arguments: Sequence[str]) -> None:
-    """List, prune or verify a cache."""
+    """List or prune a cache."""
     parser = parser_of("cache")
     actions = parser.add_subparsers(dest="what", required=True)
     shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
@@ -24,36 +24,28 @@ def run(arguments: Sequence[str]) -> None:
         "prune", help="remove what was not used for longest, and what killed runs left"
     )
     pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
-    verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
-    for action in (shown, pruned, verified):
-        action.add_argument("--cache", default="cache", help="the folder or URL (default: cache)")
+    for action in (shown, pruned):
+        action.add_argument("--cache", default=Path("cache"), type=Path, help="the folder (default: cache)")
     parsed = parser.parse_args(arguments)
     from v2hdm.errors import ConfigError
-    from v2hdm.store.pruning import items_of, prune, remove_damaged
-    from v2hdm.store.remote import place_of
+    from v2hdm.store.pruning import items_of, prune
 
-    cache = place_of(parsed.cache, "--cache")
-    if isinstance(cache, Path) and not cache.is_dir():
+    cache = parsed.cache
+    if not cache.is_dir():
         raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
     if parsed.what == "list":
-        _show(items_of(cache), "last used" if isinstance(cache, Path) else "last written")
-    elif parsed.what == "prune":
-        if not parsed.gb >= 0:
-            raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
-        removed = prune(cache, parsed.gb * _GB)
-        freed, left = sum(item.size for item in removed), sum(item.size for item in items_of(cache))
-        print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
-    else:
-        items = items_of(cache)
-        damaged = remove_damaged(items)
-        for item in damaged:
-            print(f"{item.path}: is damaged and was removed; the next run makes it anew")
-        print(f"read {len(items)} entries, {len(damaged)} of them damaged")
+        _show(items_of(cache))
+        return
+    if not parsed.gb >= 0:
+        raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
+    removed = prune(cache, parsed.gb * _GB)
+    freed, left = sum(item.size for item in removed), sum(item.size for item in items_of(cache))
+    print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
 
 
-def _show(items: Sequence[Item], when: str) -> None:
+def _show(items: Sequence[Item]) -> None:
     kinds = sorted({item.kind for item in items})
-    print(f"{'what':<20}{'entries':>8}{'size':>12}  {when}")
+    print(f"{'what':<20}{'entries':>8}{'size':>12}  last used")
     for kind in kinds:
         own = [item for item in items if item.kind == kind]
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))

@@ -71,12 +71,7 @@ def _line(one: Movement) -> str:
 
 
 def _as_json(one: Movement) -> dict[str, object]:
-    return {
-        "camera": one.camera,
-        "moved": one.moved,
-        "probability": one.probability,
-        "shift_m": one.shift_m.tolist(),
-        "turn_rad": one.turn_rad.tolist(),
-        "covariance": one.covariance.tolist(),
-        "detectable": one.detectable.tolist(),
+    arrays = {
+        name: getattr(one, name).tolist() for name in ("shift_m", "turn_rad", "covariance", "detectable")
     }
+    return {"camera": one.camera, "moved": one.moved, "probability": one.probability, **arrays}

@@ -6,10 +6,11 @@ needed.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from v2hdm.cli.main import add_drive, parser_of
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -17,6 +18,16 @@ def run(arguments: Sequence[str]) -> int:
     parser = parser_of("calibrate ground")
     add_drive(parser, "extrinsic")
     parsed = parser.parse_args(arguments)
-    from v2hdm.calibration.from_ground import estimate_mountings
+    from v2hdm.calibration.from_ground import calibrate_from_ground, summary_lines, write_ground_calibration
 
-    return EXIT_FAILED_VERDICT if estimate_mountings(parsed) else 0
+    drive = drive_of(parsed)
+    folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
+    with result_of(folder, {"drive": str(parsed.drive), "cameras": list(drive.cameras)}) as unfinished:
+        found = calibrate_from_ground(drive, workers=parsed.workers, progress=_show)
+        write_ground_calibration(found, unfinished)
+    print(*summary_lines(found), f"results in {folder}", sep="\n")
+    return exit_code(found.verdict)
+
+
+def _show(done: int, total: int) -> None:
+    print(f"matched the ground of {done} of {total} cameras", file=sys.stderr, flush=True)

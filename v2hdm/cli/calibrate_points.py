@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import parser_of
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.cli.main import exit_code, parser_of, result_of
+from v2hdm.errors import ConfigError, DriveError
 
 _SIGMA = "standard deviation of {}, per coordinate (default: %(default)g {})"
 
@@ -39,6 +39,30 @@ def run(arguments: Sequence[str]) -> int:
         "--output", type=Path, help="folder for the results (default: outputs/<camera>-calibrate)"
     )
     parsed = parser.parse_args(arguments)
-    from v2hdm.calibration.from_points import calibrate_camera
+    from dataclasses import replace
 
-    return EXIT_FAILED_VERDICT if calibrate_camera(parsed) else 0
+    from v2hdm.calibration.from_points import calibrate_from_points, summary_lines, write_point_calibration
+    from v2hdm.calibration.points import read_points
+    from v2hdm.detection.frames import read_bgr
+    from v2hdm.io.calibration.intrinsics import read_intrinsics
+
+    info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
+    info = replace(info, name=parsed.name or info.name)
+    if "/" in info.name or info.name in ("", ".", ".."):
+        raise ConfigError(f"the camera is called {info.name!r}, which is no file name; give another --name")
+    points = read_points(parsed.points)
+    image = None if parsed.image is None else read_bgr(parsed.image)
+    if image is not None and image.shape[:2] != (info.height, info.width):
+        raise DriveError(
+            f"{parsed.image}: the image is {image.shape[1]} x {image.shape[0]}, but the intrinsics of "
+            f"'{info.name}' are for {info.width} x {info.height}; give both for one size"
+        )
+    sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
+    found = calibrate_from_points(points, info, **sigmas)
+    folder = parsed.output or Path("outputs") / f"{info.name}-calibrate"
+    files = {"points": str(parsed.points), "intrinsics": str(parsed.intrinsics)}
+    settings = {**files, "image": None if parsed.image is None else str(parsed.image), **sigmas}
+    with result_of(folder, settings) as unfinished:
+        write_point_calibration(found, unfinished, image)
+    print(*summary_lines(found), f"results in {folder}", sep="\n")
+    return exit_code(found.verdict)

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import add_drive, parser_of
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -30,6 +29,19 @@ def run(arguments: Sequence[str]) -> int:
 
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
-    from v2hdm.verdict.check import check_up
+    from v2hdm.ground import estimate_cameras
+    from v2hdm.report.outputs import write_json
+    from v2hdm.verdict import check_drive
+    from v2hdm.verdict.check import draw_check
 
-    return EXIT_FAILED_VERDICT if check_up(parsed) else 0
+    drive = drive_of(parsed)
+    folder = parsed.output or Path("outputs") / f"{drive.name}-check"
+    settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras), "ground": parsed.ground}
+    with result_of(folder, settings) as unfinished:
+        ground = estimate_cameras(drive, parsed.workers) if parsed.ground else {}
+        verdict = check_drive(drive, ground=ground)
+        write_json(unfinished / "verdict.json", verdict.as_json())
+        draw_check(drive, unfinished, ground)
+    passed = [finding.line for finding in verdict.passed if parsed.all]
+    print(*passed, *verdict.lines[1:], verdict.lines[0], f"pictures in {folder}", sep="\n")
+    return exit_code(verdict)

@@ -5,10 +5,26 @@ It needs the base install only (numpy, opencv, onnxruntime, PyYAML). docs/detect
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+import errno
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
 
 from v2hdm.cli.main import parser_of
+from v2hdm.errors import ConfigError, DriveError
+
+if TYPE_CHECKING:
+    from v2hdm.detection.stopwatch import Stopwatch
+
+_FIRST = b'{"source": '
+"""The beginning of every line of detections."""
+
+_STAGES = ("read", "net", "propose", "lanes", "fit", "judge")
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -43,7 +59,115 @@ def run(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--draw", type=Path, metavar="DIR", help="folder for the images with detections drawn"
     )
-    parsed = parser.parse_args(arguments)
-    from v2hdm.cli.detect_files import detect_to_files
+    _detect(parser.parse_args(arguments))
 
-    detect_to_files(parsed)
+
+def _detect(parsed: argparse.Namespace) -> None:
+    """Detect; a live camera is watched until Ctrl-C, which any other source raises on without a file."""
+    import cv2
+
+    from v2hdm.detection.options import DetectorOptions
+    from v2hdm.detection.road import as_record, draw_detections
+    from v2hdm.detection.stopwatch import Stopwatch
+    from v2hdm.detection.weights import unknown_network
+    from v2hdm.pipeline.detect_images import detect_images
+    from v2hdm.store.results import growing_folder
+
+    cv2.setNumThreads(1)
+    stopwatch, live = Stopwatch(), parsed.source.isdecimal()
+    frames = detect_images(
+        parsed.source,
+        camera=parsed.camera,
+        camera_name=parsed.camera_name,
+        mounting=parsed.mounting,
+        linear=parsed.linear,
+        detector=DetectorOptions(model=parsed.model, threads=parsed.threads),
+        limit=parsed.limit,
+        stopwatch=stopwatch,
+    )
+    failure = None
+    folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw")
+    with folder as drawings, _lines(parsed.output) as stream:
+        try:
+            for frame, camera, road in frames:
+                print(json.dumps(as_record(frame, camera, road)), file=stream, flush=live)
+                if drawings is not None:
+                    markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
+                    drawn = draw_detections(frame.pixels, markings, lanes)
+                    _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
+                    drawings.write(f"{frame.name}.jpg", packed.tobytes())
+        except KeyboardInterrupt:
+            if not live:
+                raise
+        except DriveError as error:
+            if not (live and stopwatch.images):
+                raise
+            failure = error  # hours of a camera that was unplugged are kept
+    _report(stopwatch)
+    unknown = unknown_network(parsed.model) if parsed.model is not None else None
+    if unknown is not None:
+        print(unknown, file=sys.stderr)
+    if failure:
+        raise failure
+
+
+@contextmanager
+def _lines(output: Path | None) -> Iterator[TextIO]:
+    """The stream of JSON lines; a file appears when it is complete."""
+    from v2hdm.store.files import whole_file
+    from v2hdm.store.inputs import refuse_input
+
+    try:
+        if output is None:
+            yield sys.stdout
+            sys.stdout.flush()
+            return
+        if output.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        refuse_input(output)
+        if output.is_file():
+            with output.open("rb") as earlier:
+                if earlier.read(len(_FIRST)) not in (b"", _FIRST):
+                    raise ConfigError(
+                        f"{output}: is there already and holds no detections; give another --output"
+                    )
+        is_special = output.exists() and not output.is_file()  # a pipe, or /dev/null
+        place = nullcontext(output) if is_special else whole_file(output)
+        with place as partial, partial.open("w", encoding="utf-8") as stream:
+            yield stream
+    except OSError as error:
+        if output is not None:
+            line = f"{output}: cannot write there ({error.strerror}); give another --output"
+        elif isinstance(error, BrokenPipeError):
+            raise
+        else:
+            line = f"standard output: cannot be written ({error.strerror}); give an --output with room for it"
+        raise DriveError(line) from error
+
+
+def _report(stopwatch: Stopwatch) -> None:
+    """How long it took, on stderr."""
+    import numpy as np
+
+    from v2hdm.detection.stopwatch import TOTAL
+
+    if not stopwatch.images:
+        print("no images", file=sys.stderr)
+        return
+    print(f"{stopwatch.images} images{_peak_memory()}", file=sys.stderr)
+    print(f"{'latency, ms':12s} {'p50':>7s} {'p90':>7s} {'p99':>7s}", file=sys.stderr)
+    first = [stage for stage in _STAGES if stage in stopwatch.stages]
+    times_s = {stage: stopwatch.times_s(stage) for stage in dict.fromkeys([*first, *stopwatch.stages])}
+    times_s["other"] = stopwatch.times_s(TOTAL) - sum(times_s.values())
+    times_s[TOTAL] = stopwatch.times_s(TOTAL)
+    for stage, seconds in times_s.items():
+        p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
+        print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)
+
+
+def _peak_memory() -> str:
+    """The most memory that this process ever held, where Linux counts it."""
+    status = Path("/proc/self/status")  # getrusage would count what the parent held when it started us
+    lines = status.read_text().splitlines() if status.is_file() else []
+    peak_kb = next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), None)
+    return "" if peak_kb is None else f", peak memory {peak_kb * 1024 / 1e6:.0f} MB"

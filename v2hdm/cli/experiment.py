@@ -20,14 +20,11 @@ def run(arguments: Sequence[str]) -> int:
     from v2hdm.cli.compose import work_on
     from v2hdm.experiment.plan import ExperimentConfig
 
-    return work_on(COMMANDS["experiment"], "experiment", ExperimentConfig, _compare, arguments)
+    return work_on(COMMANDS["experiment"], "experiment", ExperimentConfig, _compare, arguments, _PORTS)
 
 
 def _compare(job: Job) -> None:
-    from v2hdm.cli import compose
-    from v2hdm.experiment.plan import ExperimentConfig
     from v2hdm.experiment.run import experiment_on_terminal
 
-    settings = compose.to_dataclass(job.composed, ExperimentConfig, _PORTS)
-    settings.output = job.folder(settings.output)
-    experiment_on_terminal(settings, compose.to_yaml(job.composed))
+    job.settings.output = job.folder(job.settings.output)
+    experiment_on_terminal(job.settings, job.yaml)

@@ -39,22 +39,20 @@ def run(arguments: Sequence[str]) -> None:
         "else Local)",
     )
     parsed = parser.parse_args(arguments)
-    log, handler = logging.getLogger("v2hdm"), logging.StreamHandler()
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    folder = parsed.output or parsed.source.parent
+    from v2hdm.pipeline.context import logging_to
+
+    handler, folder = logging.StreamHandler(), parsed.output or parsed.source.parent
+    handler.setLevel(logging.INFO)
+    export = _export_calibration if parsed.source.suffix.lower() in (".yaml", ".yml") else _export_map
     try:
-        export = _export_calibration if parsed.source.suffix.lower() in (".yaml", ".yml") else _export_map
-        for path in export(parsed, folder):
-            print(path)
+        with logging_to(handler):
+            print(*export(parsed, folder), sep="\n")
     except BrokenPipeError:  # the reader of our output has had enough
         raise
     except OSError as error:
         raise MapFileError(
             f"{error.filename}: cannot be written ({error.strerror}); set another --output"
         ) from None
-    finally:
-        log.removeHandler(handler)
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
@@ -63,9 +61,8 @@ def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
 
     check_formats(parsed.format, "--format")
     name = parsed.source.stem
-    if parsed.source.resolve() in [
-        (folder / FORMATS[one].file.format(name=name)).resolve() for one in parsed.format
-    ]:
+    files = [folder / FORMATS[one].file.format(name=name) for one in parsed.format]
+    if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be written over: set another --output or --format")
     hd_map, verdict = read_map(parsed.source)
     return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector)
@@ -75,14 +72,10 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.io.calibration.reading import read_calibration, read_provenance
     from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration_as
 
-    for name in parsed.format:
-        if name not in CALIBRATION_FORMATS:
-            raise ConfigError(
-                f"--format: unknown format '{name}' of a calibration; "
-                f"choose from: {', '.join(CALIBRATION_FORMATS)}"
-            )
+    unknown = [name for name in parsed.format if name not in CALIBRATION_FORMATS]
+    if unknown:
+        known = ", ".join(CALIBRATION_FORMATS)
+        raise ConfigError(f"--format: unknown format '{unknown[0]}' of a calibration; choose from: {known}")
     calibration, about = read_calibration(parsed.source), read_provenance(parsed.source)
-    return [
-        write_calibration_as(name, calibration, about, folder, calibration.info.name)
-        for name in parsed.format
-    ]
+    camera = calibration.info.name
+    return [write_calibration_as(name, calibration, about, folder, camera) for name in parsed.format]

@@ -27,9 +27,10 @@ def run(arguments: Sequence[str]) -> int:
     )
     parser.add_argument(
         "--table",
-        default="outputs/fleet",
+        type=Path,
+        default=Path("outputs/fleet"),
         metavar="FOLDER",
-        help="or the URL of one, takes the table of verdicts, fleet.csv and fleet.json (outputs/fleet)",
+        help="takes the table of verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
     )
     parser.add_argument(
         "--site", metavar="NAME", help="map all the drives together, as one site of that name"

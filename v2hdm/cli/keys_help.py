@@ -10,10 +10,10 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 _USAGE = """\
 Usage: {command} [key=value ...] [--config-dir FOLDER] [--multirun]
@@ -25,7 +25,6 @@ Usage: {command} [key=value ...] [--config-dir FOLDER] [--multirun]
                       '# @package _global_'
   --multirun          one job for each of several values: key=1,2,3; each has its own folder of results
   --cfg job           only prints the configuration
-  --hydra-help        what else Hydra knows
 """
 _OFTEN = {
     "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",
@@ -35,20 +34,13 @@ _OFTEN = {
 _KINDS = {"str": "text", "int": "whole number", "float": "number", "bool": "true or false"}
 
 
-@dataclass(frozen=True)
-class Key:
+class Key(NamedTuple):
     """A key as users write it: its type, its default and what it means."""
 
     name: str
     kind: str
     default: str
     meaning: str
-
-    @property
-    def lines(self) -> list[str]:
-        """Its entry on the page."""
-        head = f"  {self.name} ({self.kind}{f', {self.default}' if self.default else ''})"
-        return [head, *textwrap.wrap(self.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)]
 
 
 def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
@@ -57,11 +49,13 @@ def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
     if "drive" in {one.name for one in fields(schema)}:
         runs = ", ".join(sorted(path.stem for path in (conf / "run").glob("*.yaml")))
         parts += [f"Shipped runs: {runs}", ""]
-    keys = list(keys_of(schema))
-    often = [key for key in keys if key.name in _OFTEN or "." not in key.name]
-    parts += ["Keys, as key (type, default):", *(line for key in often for line in key.lines)]
-    parts += ["", "For experts:", *(line for key in keys if key not in often for line in key.lines)]
-    return "\n".join(parts)
+    often: list[str] = ["Keys, as key (type, default):"]
+    rest: list[str] = ["", "For experts:"]
+    for key in keys_of(schema):
+        page = often if key.name in _OFTEN or "." not in key.name else rest
+        page.append(f"  {key.name} ({key.kind}{f', {key.default}' if key.default else ''})")
+        page += textwrap.wrap(key.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join([*parts, *often, *rest])
 
 
 def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
@@ -121,12 +115,9 @@ def _kind(hint: Any) -> str:
 
 
 def _default(one: Field[Any]) -> str:
-    if one.default is not MISSING:
-        value = one.default
-    elif one.default_factory is not MISSING:
-        value = one.default_factory()
-    else:
+    if one.default is MISSING and one.default_factory is MISSING:
         return "required"
+    value = one.default if one.default_factory is MISSING else one.default_factory()
     if is_dataclass(value) or isinstance(value, dict):
         return ""
     text = str(value.value if isinstance(value, Enum) else value)

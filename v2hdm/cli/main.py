@@ -9,18 +9,24 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import logging
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from v2hdm import __version__
-from v2hdm.errors import EXIT_USER_ERROR, V2hdmError, describe, one_line
+from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, describe, one_line
+
+if TYPE_CHECKING:
+    from v2hdm.records import Drive
+    from v2hdm.verdict import Verdict
 
 _NOTHING = "interrupted; nothing was written"
 _GO_ON = "the same command goes on from there"
@@ -47,17 +53,16 @@ class Command:
             from v2hdm.store.inputs import protected_inputs
 
             with protected_inputs():
-                return _to_the_end(work)
+                try:
+                    code = work() or 0
+                except SystemExit:  # argparse, after --help
+                    sys.stdout.flush()
+                    raise
+                sys.stdout.flush()  # while an error of writing can still be reported
+                return code
         except BrokenPipeError:  # the reader of our output has had enough
-            _forget_stdout()
+            _leave_stdout()
             return 0
-        except (V2hdmError, MemoryError, OSError) as error:
-            line = describe(error)
-            if line is None:
-                raise
-            if not isinstance(error, V2hdmError):
-                _forget_full_stdout()
-            return _fail(line)
         except ModuleNotFoundError as error:
             if (error.name or "v2hdm").split(".")[0] in ("v2hdm", "models", "train", "export"):
                 raise
@@ -66,60 +71,43 @@ class Command:
             return _fail(f"{self.name} needs {error.name}: {install}pip install 'v2hdm{extra}'")
         except KeyboardInterrupt:
             return _fail(self.interrupted)
+        except Exception as error:
+            if (line := describe(error)) is None:
+                raise
+            _leave_stdout()
+            return _fail(line)
 
 
-_ALL = (
-    Command(
-        "v2hdm map",
-        "Turn a drive into a map, calibrations and a verdict.",
-        interrupted="interrupted; what was found so far is kept in the cache, no result was written",
-    ),
-    Command(
-        "v2hdm detect",
-        "Find markings and lanes in images, one JSON object per image.",
-        None,
-        "interrupted before the last image; no --output was written",
-    ),
-    Command("v2hdm check", "Say in seconds what is wrong with a drive."),
-    Command("v2hdm calibrate points", "Calibrate a camera from surveyed ground points and their pixels."),
-    Command("v2hdm calibrate ground", "Estimate each camera's mounting from bare ground, without markings."),
-    Command("v2hdm calibrate compare", "Say whether a camera has moved between two results."),
-    Command("v2hdm localize", "Find the vehicle's poses from the markings of a map."),
-    Command(
-        "v2hdm report",
-        "Make the report.html of a result again.",
-        interrupted="interrupted; the report is as it was",
-    ),
-    Command(
-        "v2hdm mosaic",
-        "Show the ground of a result from above, before and after the optimisation.",
-        interrupted="interrupted; files that stand in the result folder are whole",
-    ),
-    Command(
-        "v2hdm export",
-        "Convert a map or a calibration to other formats.",
-        None,
-        "interrupted; files that were named are whole",
-    ),
-    Command(
-        "v2hdm experiment",
-        "Compare all methods on both ports, as the paper does.",
-        interrupted=f"interrupted; finished drives and detections are kept, {_GO_ON}",
-    ),
-    Command(
-        "v2hdm cache",
-        "List, verify or prune the cache of runs.",
-        None,
-        "interrupted; what was removed so far is made anew when it is needed",
-    ),
-    Command(
-        "v2hdm fleet",
-        "Map many drives, each described by a run file, on Ray.",
-        "fleet",
-        f"interrupted; finished drives are kept, {_GO_ON}",
-    ),
-)
-COMMANDS = {one.name.removeprefix("v2hdm "): one for one in _ALL}
+_SAYS = {
+    "map": "Turn a drive into a map, calibrations and a verdict.",
+    "detect": "Find markings and lanes in images, one JSON object per image.",
+    "check": "Say in seconds what is wrong with a drive.",
+    "calibrate points": "Calibrate a camera from surveyed ground points and their pixels.",
+    "calibrate ground": "Estimate each camera's mounting from bare ground, without markings.",
+    "calibrate compare": "Say whether a camera has moved between two results.",
+    "localize": "Find the vehicle's poses from the markings of a map.",
+    "report": "Make the report.html of a result again.",
+    "mosaic": "Show the ground of a result from above, before and after the optimisation.",
+    "export": "Convert a map or a calibration to other formats.",
+    "experiment": "Compare all methods on both ports, as the paper does.",
+    "cache": "List or prune the cache of runs.",
+    "fleet": "Map many drives, each described by a run file, on Ray.",
+}
+_EXTRAS = {"detect": None, "export": None, "cache": None, "fleet": "fleet"}
+_INTERRUPTED = {
+    "map": "interrupted; what was found so far is kept in the cache, no result was written",
+    "detect": "interrupted before the last image; no --output was written",
+    "report": "interrupted; the report is as it was",
+    "mosaic": "interrupted; files that stand in the result folder are whole",
+    "export": "interrupted; files that were named are whole",
+    "experiment": f"interrupted; finished drives and detections are kept, {_GO_ON}",
+    "cache": "interrupted; what was removed so far is made anew when it is needed",
+    "fleet": f"interrupted; finished drives are kept, {_GO_ON}",
+}
+COMMANDS = {
+    name: Command(f"v2hdm {name}", says, _EXTRAS.get(name, "map"), _INTERRUPTED.get(name, _NOTHING))
+    for name, says in _SAYS.items()
+}
 """``v2hdm/cli/<name>.py`` has ``run(arguments)`` of each."""
 
 _OLD = {"calibrate": "calibrate points", "extrinsic": "calibrate ground", "calibration": "calibrate compare"}
@@ -181,29 +169,41 @@ def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
 
 
-def _to_the_end(work: Callable[[], int | None]) -> int:
-    """Do the work and write all that it printed, while an error of writing can still be reported."""
-    try:
-        code = work() or 0
-    except SystemExit:  # argparse, after --help
-        sys.stdout.flush()
-        raise
-    sys.stdout.flush()
-    return code
+def drive_of(parsed: argparse.Namespace) -> Drive:
+    """The drive that the arguments of :func:`add_drive` name; ``parsed.workers`` is a number of them then."""
+    import cv2
+
+    from v2hdm.io.drive import ReadOptions, read_drive
+    from v2hdm.settings import check_workers
+
+    check_workers(parsed.workers)
+    parsed.workers = parsed.workers or os.cpu_count() or 1
+    logging.basicConfig(format="%(message)s")
+    cv2.setNumThreads(1)
+    return read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
 
 
-def _forget_full_stdout() -> None:
+@contextmanager
+def result_of(folder: Path, settings: Mapping[str, object]) -> Iterator[Path]:
+    """The unfinished folder of a command's results, with the settings that they were made of."""
+    from v2hdm.store.results import result_folder
+
+    with result_folder(folder, "--output") as unfinished:
+        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        yield unfinished
+
+
+def exit_code(verdict: Verdict) -> int:
+    """3 for FAIL, 0 for PASS and WARN."""
+    return EXIT_FAILED_VERDICT if verdict.status.value == "FAIL" else 0
+
+
+def _leave_stdout() -> None:
     """Keep Python from failing once more at its end, where nothing can be printed."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError):
-        _forget_stdout()
-
-
-def _forget_stdout() -> None:
-    from v2hdm.store.files import forget_stdout
-
-    forget_stdout()
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
 def _fail(message: str) -> int:
@@ -243,13 +243,10 @@ def version_line() -> str:
             with suppress(metadata.PackageNotFoundError):
                 found.append(f"{name} {metadata.version(name)}")
         parts += found or [f"no {packages[0]}"]
-    return ", ".join([*parts, _weights()])
-
-
-def _weights() -> str:
     manifest = Path(__file__).parents[1] / "detection" / "weights" / "manifest.json"
     try:
         network = json.loads(manifest.read_text(encoding="utf-8"))["files"]["default.onnx"]["sha256"]
+        parts.append(f"weights {network[:8]}")
     except (OSError, ValueError, KeyError, TypeError):
-        return "no weights"
-    return f"weights {network[:8]}"
+        parts.append("no weights")
+    return ", ".join(parts)

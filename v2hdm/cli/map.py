@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.main import COMMANDS
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.cli.main import COMMANDS, exit_code
 
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
 
 _RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
+_STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -19,16 +20,38 @@ def run(arguments: Sequence[str]) -> int:
     from v2hdm.cli.compose import work_on
     from v2hdm.pipeline.config import RunConfig
 
-    return work_on(COMMANDS["map"], "map", RunConfig, _map, arguments)
+    return work_on(COMMANDS["map"], "map", RunConfig, _map, arguments, _RUNS)
 
 
 def _map(job: Job) -> int:
-    from v2hdm.cli import compose
-    from v2hdm.cli.terminal import run_on_terminal
-    from v2hdm.pipeline.config import RunConfig
-    from v2hdm.verdict import Status
+    """Run the pipeline and show what it does and found."""
+    from rich.console import Console
+    from rich.logging import RichHandler
 
-    settings = compose.to_dataclass(job.composed, RunConfig, _RUNS)
-    settings.output = job.folder(settings.output)
-    verdict = run_on_terminal(settings, compose.to_yaml(job.composed))
-    return EXIT_FAILED_VERDICT if verdict.status is Status.FAIL else 0
+    from v2hdm.pipeline.config import run_name
+    from v2hdm.pipeline.context import logging_to
+    from v2hdm.pipeline.run import run
+    from v2hdm.progress import progress_bars
+    from v2hdm.report.terminal import changes_table, results_table
+    from v2hdm.viewer import RerunViewer, check_viewer
+
+    config, console = job.settings, Console()
+    config.output = job.folder(config.output)
+    handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
+    viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
+    with logging_to(handler), progress_bars(console) as progress:
+        result = run(config, job.yaml, progress, viewer)
+    console.print()
+    for line in result.headlines:
+        console.print(line, highlight=False)
+    if result.metrics["results"]:
+        console.print(results_table(result.metrics["name"], result.metrics["results"]))
+    if "changes" in result.metrics:
+        console.print(changes_table(result.metrics["changes"]))
+    first, *lines = result.verdict.lines
+    for line in [*lines, f"results in {result.place}: open report.html"]:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    # Last, where it is in sight: how good the map is.
+    style = _STYLES[result.verdict.status.value]
+    console.print(first, style=style, highlight=False, markup=False, soft_wrap=True)
+    return exit_code(result.verdict)

@@ -88,32 +88,27 @@ def recipe_file(recipe: str) -> str:
 def drive_record(job: Job, workers: int, progress: Progress) -> dict[str, Any]:
     """The record of a drive and of its maps, from disk or made now and kept there.
 
-    Args:
-        job: the drive.
-        workers: processes to render and detect in; 1 stays in this one.
-        progress: called with how far each stage is.
+    ``workers`` are processes to render and detect in; 1 stays in this one.
 
     Raises:
         V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
     """
-    if _setting_and_maps(job) is None:
+    known = _kept(job)
+    if known is None:
         _find(job, workers, progress)
-    known = _setting_and_maps(job)
+        known = _kept(job)
     assert known is not None
     progress("finished", 1, 1)
-    return _together(*known)
+    return known
 
 
-def _setting_and_maps(job: Job) -> tuple[dict[str, Any], dict[str, dict[str, Any]]] | None:
-    """The drive, and its maps by recipe, from disk; None where something is missing."""
+def _kept(job: Job) -> dict[str, Any] | None:
+    """One record of a drive and of its maps under all recipes, from disk; None where something is missing."""
     setting = stored(job.folder / SETTING_FILE, setting_key(job))
     kept = {name: stored(job.folder / recipe_file(name), recipe_key(job, name)) for name in job.options}
     maps = {recipe: found for recipe, found in kept.items() if found is not None}
-    return None if setting is None or len(maps) < len(kept) else (setting, maps)
-
-
-def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """One record of a drive and its maps under all recipes."""
+    if setting is None or len(maps) < len(kept):
+        return None
     return {
         **setting,
         "maps": {
@@ -205,8 +200,13 @@ def _mapped(
         except (MappingError, AdjustError) as failure:
             out["failures"].append([name, str(failure)])
             continue
-        rows = {row_of(method, recipe): result for method, result in methods.items()}
-        out["maps"][name] = {row: _plain_map(one.hd_map.markings) for row, one in rows.items() if row}
+        # Under other recipes than ours the naive methods give the same maps again.
+        rows = {
+            method if recipe == OURS else f"{method}, {recipe}": result
+            for method, result in methods.items()
+            if recipe == OURS or method not in NAIVE_IPMS
+        }
+        out["maps"][name] = {row: _plain_map(one.hd_map.markings) for row, one in rows.items()}
         out["extrinsics"][name] = _extrinsics(drive, methods, truth)
         if last and methods["Opt"].growth:
             out["growth"] = _growth(methods, truth)
@@ -215,13 +215,6 @@ def _mapped(
             out["residuals"] = residuals(inspection.drive_as_described, detections, methods, truth)
     progress(f"map, {recipe}", len(sets), len(sets))
     return out
-
-
-def row_of(method: str, recipe: str) -> str | None:
-    """The row of the tables that a method's result under a recipe belongs to, None where it repeats one."""
-    if recipe == OURS:
-        return method
-    return None if method in NAIVE_IPMS else f"{method}, {recipe}"
 
 
 def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.rigid import camera_centre, inverse
+from v2hdm.mapping.methods import NAIVE_IPMS
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, ImageDetections, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, marking_metrics, match_markings, rms
@@ -96,27 +97,18 @@ def measure(record: Mapping[str, Any]) -> Measured:
     true = markings_of(record["truth"])
     truth = Truth(HdMap(true), {}, np.empty((0, 4, 4)), np.empty((0, len(true))), (), {})
     passed = _passed(true, np.array(record["route"], dtype=np.float64))
-    rows: dict[str, dict[str, Row]] = {}
-    matched: dict[str, dict[str, Matched]] = {}
+    rows: dict[str, Mapping[str, Row]] = {}
+    matched: dict[str, Mapping[str, Matched]] = {}
     for cameras, plain_maps in record["maps"].items():
         maps = {row: HdMap(markings_of(plain_maps[row])) for row in ROWS if row in plain_maps}
         found = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
-        shared = set(range(len(true)))
-        for one in found.values():
-            shared &= set(one.true.tolist())
+        shared = set(range(len(true))).intersection(*(one.true.tolist() for one in found.values()))
         expected = np.array(record["expected"][cameras], dtype=np.bool_)
         rows[cameras] = {row: _row(maps[row], truth, expected, found[row], shared) for row in maps}
         matched[cameras] = found
-    started = sorted({camera["initial_ipm"] for camera in record["cameras"].values()})
-    return Measured(
-        port=record["port"],
-        seed=record["seed"],
-        started_from=" and ".join(started),
-        rows=rows,
-        matched=matched,
-        extrinsics=record["extrinsics"],
-        failures=tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"]),
-    )
+    started = " and ".join(sorted({camera["initial_ipm"] for camera in record["cameras"].values()}))
+    failures = tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"])
+    return Measured(record["port"], record["seed"], started, rows, matched, record["extrinsics"], failures)
 
 
 def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
@@ -125,7 +117,7 @@ def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
         return np.empty(0, dtype=np.int64)
     centres = np.array([marking.corners_map.mean(axis=0) for marking in true])
     away_m = np.linalg.norm(centres[:, None] - route_map[None], axis=2)
-    return np.asarray(away_m.argmin(axis=1), dtype=np.int64)
+    return np.asarray(away_m.argmin(axis=1))
 
 
 def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:
@@ -168,18 +160,6 @@ _FARTHEST_M = 22.0
 _FEWEST = 20  # corners below which neither a cell nor a bin has figures
 
 
-@dataclass(frozen=True)
-class _Sighted:
-    """N sightings that were recognised in the map: ``row`` (N,) indexes them, ``marking`` (N,) the map.
-
-    ``corners_map`` (N, 4, 2) are the markings' corners in the order of the sightings'.
-    """
-
-    row: IntArray
-    marking: IntArray
-    corners_map: FloatArray
-
-
 def residuals(
     drive: Drive,
     detections: Sequence[ImageDetections],
@@ -191,13 +171,8 @@ def residuals(
     ``field`` holds for ``before`` and ``after`` the median residual (px) of detected corners against the
     optimised map, by cell of the image: before under the first IPM and the recorded poses, after under
     the optimised extrinsic and the adjusted poses. ``range`` holds by method quartiles of the distance
-    (m) between corners of single sightings, laid on the ground, and the true ones.
-
-    Args:
-        drive: as it was described, with its first IPMs.
-        detections: of its images.
-        methods: of one camera set; ``Opt`` is among them.
-        truth: of the drive.
+    (m) between corners of single sightings, laid on the ground, and the true ones. ``drive`` is as it was
+    described; ``Opt`` is among the ``methods``.
     """
     best = methods["Opt"]
     out: dict[str, Any] = {}
@@ -206,10 +181,10 @@ def residuals(
             sightings = collect_sightings(drive, detections, (name,))
         except MappingError:
             continue  # a camera that saw nothing has no residuals
-        seen = _recognised(drive, sightings, name, best)
+        seen = _Seen.of(drive, sightings, name, best)
         out[name] = {
-            "field": _field(drive, sightings, name, best, seen),
-            "range": _by_range(drive, sightings, name, methods, truth, seen),
+            "field": _field(drive, seen, name, best),
+            "range": _by_range(drive, seen, name, methods, truth),
         }
     return out
 
@@ -219,62 +194,70 @@ def _adjusted(drive: Drive, image: int, best: MethodResult) -> FloatArray:
     return one.map_from_vehicle if best.poses is None else best.poses.of_image(one)
 
 
-def _recognised(drive: Drive, sightings: Sightings, name: str, best: MethodResult) -> _Sighted:
-    """Which sightings are of which marking of the map, by where the optimised calibration sees it."""
-    calibration, markings = best.calibrations[name], best.hd_map.markings
-    found: list[tuple[int, int, FloatArray]] = []
-    corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
-    kinds = np.array([marking.kind for marking in markings])
-    for image in np.unique(sightings.image):
-        cam_from_map = calibration.cam_from_vehicle @ inverse(_adjusted(drive, int(image), best))
-        places, depth = project_ground(calibration.info.intrinsic, cam_from_map, corners.reshape(-1, 2))
-        places, ahead = places.reshape(-1, 4, 2), (depth.reshape(-1, 4) > 0).all(axis=1)
-        centres = places.mean(axis=1)
-        for row in np.flatnonzero(sightings.image == image):
-            corners_px = sightings.corners_pinhole_px[row]
-            if not sightings.valid[row].all():
-                continue
-            alike = np.flatnonzero(ahead & (kinds == sightings.kinds[sightings.kind[row]]))
-            if not len(alike):
-                continue
-            distance = np.linalg.norm(centres[alike] - corners_px.mean(axis=0), axis=1)
-            marking = int(alike[distance.argmin()])
-            if distance.min() > SAME_SHARE * np.linalg.norm(np.ptp(corners_px, axis=0)):
-                continue
-            off = [((np.roll(places[marking], -s, axis=0) - corners_px) ** 2).sum() for s in range(4)]
-            turned = np.roll(corners[marking], -int(np.argmin(off)), axis=0)
-            found.append((int(row), marking, turned))
-    rows, seen, turned_map = zip(*found, strict=True) if found else ((), (), ())
-    return _Sighted(
-        np.array(rows, np.int64), np.array(seen, np.int64), np.array(turned_map).reshape(-1, 4, 2)
-    )
+@dataclass(frozen=True)
+class _Seen:
+    """N sightings that were recognised in the map, by where the optimised calibration sees its markings.
 
+    ``marking`` (N,) indexes the map, ``corners_map`` (N, 4, 2) are its corners in the order of
+    ``corners_px`` (N, 4, 2), those of the images ``image``.
+    """
 
-def _field(
-    drive: Drive, sightings: Sightings, name: str, best: MethodResult, seen: _Sighted
-) -> dict[str, Any]:
-    camera = drive.cameras[name]
-    corners_map, observed = seen.corners_map, sightings.corners_pinhole_px[seen.row]
-    first = np.linalg.inv(facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0)))
-    found = best.calibrations[name]
-    images = [int(image) for image in sightings.image[seen.row]]
-    before = [first @ flat_motion(inverse(drive.images[image].map_from_vehicle)) for image in images]
-    after = [
-        pinhole_px_from_ground(
-            camera.info.intrinsic, found.cam_from_vehicle @ inverse(_adjusted(drive, image, best))
+    image: list[int]
+    marking: IntArray
+    corners_map: FloatArray
+    corners_px: FloatArray
+
+    @classmethod
+    def of(cls, drive: Drive, sightings: Sightings, name: str, best: MethodResult) -> _Seen:
+        calibration, markings = best.calibrations[name], best.hd_map.markings
+        found: list[tuple[int, int, FloatArray]] = []
+        corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
+        kinds = np.array([marking.kind for marking in markings])
+        whole = sightings.valid.all(axis=1)
+        for image in np.unique(sightings.image):
+            cam_from_map = calibration.cam_from_vehicle @ inverse(_adjusted(drive, int(image), best))
+            places, depth = project_ground(calibration.info.intrinsic, cam_from_map, corners.reshape(-1, 2))
+            places, ahead = places.reshape(-1, 4, 2), (depth.reshape(-1, 4) > 0).all(axis=1)
+            for row in np.flatnonzero((sightings.image == image) & whole):
+                corners_px = sightings.corners_pinhole_px[row]
+                alike = np.flatnonzero(ahead & (kinds == sightings.kinds[sightings.kind[row]]))
+                if not len(alike):
+                    continue
+                distance = np.linalg.norm(places[alike].mean(axis=1) - corners_px.mean(axis=0), axis=1)
+                marking = int(alike[distance.argmin()])
+                if distance.min() <= SAME_SHARE * np.linalg.norm(np.ptp(corners_px, axis=0)):
+                    off = [((np.roll(places[marking], -s, axis=0) - corners_px) ** 2).sum() for s in range(4)]
+                    turned = np.roll(corners[marking], -int(np.argmin(off)), axis=0)
+                    found.append((int(row), marking, turned))
+        rows = [row for row, _, _ in found]
+        return cls(
+            sightings.image[rows].tolist(),
+            np.array([marking for _, marking, _ in found], np.int64),
+            np.array([turned for _, _, turned in found]).reshape(-1, 4, 2),
+            sightings.corners_pinhole_px[rows],
         )
-        for image in images
-    ]
+
+
+def _field(drive: Drive, seen: _Seen, name: str, best: MethodResult) -> dict[str, Any]:
+    camera, found = drive.cameras[name], best.calibrations[name]
+    first = np.linalg.inv(facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0)))
     size = (camera.info.width, camera.info.height)
-    return {
-        "size_px": size,
-        "before": _cells(observed, _projected(before, corners_map), size),
-        "after": _cells(observed, _projected(after, corners_map), size),
-    }
-
-
-def _projected(homographies: Sequence[FloatArray], corners_map: FloatArray) -> FloatArray:
-    return apply_in_front(np.array(homographies).reshape(-1, 3, 3), corners_map)
+    out: dict[str, Any] = {"size_px": size}
+    for when, homographies in (
+        ("before", [first @ flat_motion(inverse(drive.images[i].map_from_vehicle)) for i in seen.image]),
+        (
+            "after",
+            [
+                pinhole_px_from_ground(
+                    camera.info.intrinsic, found.cam_from_vehicle @ inverse(_adjusted(drive, i, best))
+                )
+                for i in seen.image
+            ],
+        ),
+    ):
+        projected = apply_in_front(np.array(homographies).reshape(-1, 3, 3), seen.corners_map)
+        out[when] = _cells(seen.corners_px, projected, size)
+    return out
 
 
 def _cells(observed_px: FloatArray, projected_px: FloatArray, size: tuple[int, int]) -> dict[str, Any]:
@@ -296,28 +279,21 @@ def _cells(observed_px: FloatArray, projected_px: FloatArray, size: tuple[int, i
 
 
 def _by_range(
-    drive: Drive,
-    sightings: Sightings,
-    name: str,
-    methods: Mapping[str, MethodResult],
-    truth: Truth,
-    seen: _Sighted,
+    drive: Drive, seen: _Seen, name: str, methods: Mapping[str, MethodResult], truth: Truth
 ) -> dict[str, Any]:
     """Quartiles of the distance (m) of single sightings' corners to the true ones, by method."""
     camera, best = drive.cameras[name], methods["Opt"]
-    mapped, true = match_markings(best.hd_map.markings, truth.map.markings)
-    true_of = dict(zip(mapped, true, strict=True))
-    known = np.flatnonzero(np.isin(seen.marking, mapped))
-    rows = seen.row[known]
-    if not len(rows):
+    true_of = dict(zip(*match_markings(best.hd_map.markings, truth.map.markings), strict=True))
+    known = np.flatnonzero(np.isin(seen.marking, list(true_of)))
+    if not len(known):
         return {}
-    corners = np.array(
-        [
-            _alike(truth.map.markings[true_of[int(marking)]].corners_map, turned)
-            for marking, turned in zip(seen.marking[known], seen.corners_map[known], strict=True)
-        ]
-    )
-    images = [int(image) for image in sightings.image[rows]]
+    corners = []
+    for k in known:
+        # Corners begin where they lie nearest to those of the sighting.
+        true = truth.map.markings[true_of[int(seen.marking[k])]].corners_map
+        turned = np.stack([np.roll(true, shift, axis=0) for shift in range(4)])
+        corners.append(turned[((turned - seen.corners_map[k]) ** 2).sum(axis=(1, 2)).argmin()])
+    images = [seen.image[k] for k in known]
     recorded = flat_motion(np.array([drive.images[image].map_from_vehicle for image in images]))
     vehicle_from_map = inverse(np.array([_adjusted(drive, image, best) for image in images]))
     found, intrinsic = best.calibrations[name].cam_from_vehicle, camera.info.intrinsic
@@ -326,25 +302,18 @@ def _by_range(
         "ONI": recorded @ ground_from_pinhole_px(intrinsic, found),
         "Opt": ground_from_pinhole_px(intrinsic, found @ vehicle_from_map),
     }
-    for method, ipm in {"CNI": "calibrated", "ENI": "estimated"}.items():
+    for method, ipm in NAIVE_IPMS.items():
         if method in methods and ipm in camera.ipm:
             grounds[method] = recorded @ facing_ipm(camera.ipm[ipm], side)
     true_pose = truth.map_from_vehicle[images]
     camera_map = (true_pose @ np.append(camera_centre(truth.cam_from_vehicle[name]), 1.0))[:, :2]
-    range_m = np.linalg.norm(corners - camera_map[:, None], axis=2).ravel()
-    pinhole = sightings.corners_pinhole_px[rows]
+    range_m = np.linalg.norm(np.array(corners) - camera_map[:, None], axis=2).ravel()
     out = {}
-    for method in ("CNI", "ENI", "Opt", "ONI"):
+    for method in METHODS:
         if method in grounds:
-            error = np.linalg.norm(apply_in_front(grounds[method], pinhole) - corners, axis=2).ravel()
-            out[method] = _quartiles(range_m, error)
+            on_ground = apply_in_front(grounds[method], seen.corners_px[known])
+            out[method] = _quartiles(range_m, np.linalg.norm(on_ground - corners, axis=2).ravel())
     return out
-
-
-def _alike(corners: FloatArray, other: FloatArray) -> FloatArray:
-    """Corners (4, 2) of a quadrilateral, begun where they lie nearest to those of another."""
-    turned = [np.roll(corners, shift, axis=0) for shift in range(4)]
-    return min(turned, key=lambda one: float(((one - other) ** 2).sum()))
 
 
 def _quartiles(range_m: FloatArray, error_m: FloatArray) -> list[list[float]]:

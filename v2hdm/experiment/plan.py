@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -98,7 +99,13 @@ def jobs(config: ExperimentConfig) -> list[Job]:
         DetectorError: ``detector.model`` cannot be used.
     """
     _check(config)
-    options = {name: _options(config.mapping, name) for name in dict.fromkeys([OURS, *config.recipes])}
+    changed: dict[str, dict[str, Any]] = {
+        OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}
+    }  # fmt: skip
+    options = {
+        name: replace(deepcopy(config.mapping), **changed[name])
+        for name in dict.fromkeys([OURS, *config.recipes])
+    }
     folder = Path(config.output) / config.name / "drives"
     found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:
@@ -107,18 +114,11 @@ def jobs(config: ExperimentConfig) -> list[Job]:
                 found.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
             elif seed == config.seeds[0]:
                 found.append((port, None, site))
-    jobs = []
-    for port, number, site in found:
-        own = folder / (port if number is None else f"{port}-{number}")
-        jobs.append(Job(port, number, site, config.detector, options, Path(config.cache), own))
-    return jobs
-
-
-def _options(given: MappingOptions, recipe: str) -> MappingOptions:
-    options = deepcopy(given)
-    if recipe == PAPER:
-        return replace(options, pose_model="paper", loss="none")
-    return replace(options, mode=INCREMENTAL) if recipe == INCREMENTAL else options
+    return [
+        Job(port, number, site, config.detector, options, Path(config.cache), folder / own)
+        for port, number, site in found
+        for own in [port if number is None else f"{port}-{number}"]
+    ]
 
 
 def _check(config: ExperimentConfig) -> None:

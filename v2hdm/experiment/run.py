@@ -29,7 +29,7 @@ from v2hdm.workers import share_out
 
 _OPTION = "output="
 _PATIENCE_S = 2.0
-_queue: SimpleQueue[tuple[str, str, int, int] | None] | None = None
+_queue: SimpleQueue[Any] | None = None
 
 
 def run_experiment(
@@ -37,15 +37,8 @@ def run_experiment(
 ) -> tuple[Path, list[Measured]]:
     """Map every drive by every recipe and write what comes of it into ``<output>/<name>/``.
 
-    Drives that an earlier run has finished under the same settings are taken from there.
-
-    Args:
-        config: what to do.
-        config_yaml: the configuration as text, kept beside the results.
-        progress: called with how far each drive is.
-
-    Returns:
-        The folder, and the figures of every drive.
+    Drives that an earlier run has finished under the same settings are taken from there. ``config_yaml`` is
+    the configuration as text, kept beside the results. Returns the folder, and the figures of every drive.
 
     Raises:
         V2hdmError: a setting or a drive is at fault, or the folder holds something that is not ours.
@@ -78,9 +71,9 @@ def _records(todo: Sequence[Job], workers: int, progress: DriveProgress) -> list
 
 
 @contextmanager
-def _listening(progress: DriveProgress) -> Iterator[SimpleQueue[tuple[str, str, int, int] | None]]:
+def _listening(progress: DriveProgress) -> Iterator[SimpleQueue[Any]]:
     """A queue whose messages become progress here while other processes work."""
-    queue: SimpleQueue[tuple[str, str, int, int] | None] = multiprocessing.get_context("spawn").SimpleQueue()
+    queue: SimpleQueue[Any] = multiprocessing.get_context("spawn").SimpleQueue()
 
     def listen() -> None:
         while (message := queue.get()) is not None:
@@ -96,20 +89,19 @@ def _listening(progress: DriveProgress) -> Iterator[SimpleQueue[tuple[str, str, 
         listener.join(_PATIENCE_S)
 
 
-def _start_worker(queue: SimpleQueue[tuple[str, str, int, int] | None]) -> None:
+def _start_worker(queue: SimpleQueue[Any]) -> None:
     global _queue
     _queue = queue
     logging.getLogger("v2hdm").setLevel(logging.ERROR)
 
 
 def _work(job: Job) -> dict[str, Any]:
+    def report(task: str, done: int, total: int) -> None:
+        if _queue is not None:
+            _queue.put((job.title, task, done, total))
+
     with listed_files(job.root, _OPTION):
-        return drive_record(job, 1, partial(_report, job.title))
-
-
-def _report(title: str, stage: str, done: int, total: int) -> None:
-    if _queue is not None:
-        _queue.put((title, stage, done, total))
+        return drive_record(job, 1, report)
 
 
 _SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")

@@ -8,7 +8,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import jinja2
 import numpy as np
 
 from v2hdm import __version__
@@ -32,23 +34,27 @@ COLUMNS: Mapping[str, tuple[Callable[[Row], float], int]] = {
 
 _EXTRINSICS = ("rotation (deg)", "centre (cm)")
 
-NOTE = (
-    "Mean over the seeds, and after +- the standard deviation from seed to seed. CNI, ENI: naive map "
-    "under the manually calibrated and the borrowed IPM. Opt: joint optimisation. ONI: naive map under "
-    "the optimised IPM. 'paper': our code under the paper's recipe (pose_model=paper, loss=none); "
-    "'incremental': marking by marking. Recall is that of the diamonds driven past. Bias is the length of "
-    "the mean error vector of all corners, spread the root mean square distance from it. Shared are the "
-    "markings that every row of the same cameras has mapped: only there do the methods' errors compare "
-    "like with like."
-)
-"""The columns and rows of the main table explained."""
-
 
 def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
     """Write ``results`` and ``calibrations`` as .csv (a line per seed), .md and .tex into a folder."""
-    replace_text(folder / "results.csv", _results_csv(measured))
-    replace_text(folder / "calibrations.csv", _calibrations_csv(measured))
-    for name, table in (("results", results_table), ("calibrations", calibrations_table)):
+    results = [
+        [one.port, one.seed, cameras, method, *(f"{take(row):.6g}" for take, _ in COLUMNS.values())]
+        for one in measured
+        for cameras, rows in one.rows.items()
+        for method, row in rows.items()
+    ]
+    calibrations = [
+        [one.port, one.seed, camera, origin, *(f"{error:.6g}" for error in errors)]
+        for one in measured
+        for camera, origin, errors in _extrinsics(one)
+    ]
+    for name, keys, table, rows in (
+        ("results", ("cameras", "method", *COLUMNS), results_table, results),
+        ("calibrations", ("camera", "extrinsic of", *_EXTRINSICS), calibrations_table, calibrations),
+    ):
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([["port", "seed", *keys], *rows])
+        replace_text(folder / f"{name}.csv", text.getvalue())
         heads, lines = table(measured)
         replace_text(folder / f"{name}.md", markdown(heads, lines))
         replace_text(folder / f"{name}.tex", _latex(heads, lines))
@@ -60,7 +66,7 @@ def results_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[st
     for port, drives in by_port(measured).items():
         for method in ROWS:
             for cameras in drives[0].rows:
-                rows = [one.rows[cameras][method] for one in drives if method in one.rows.get(cameras, {})]
+                rows = [one[method] for one in _common(drives, cameras, [method])]
                 if rows:
                     cells = [_mean([take(row) for row in rows], digits) for take, digits in COLUMNS.values()]
                     lines.append([port, method, cameras, *cells])
@@ -69,15 +75,15 @@ def results_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[st
 
 def calibrations_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
     """Heads and lines: how far the extrinsics are from the true ones, by port, camera and origin."""
-    lines = []
+    found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for port, drives in by_port(measured).items():
-        found: dict[tuple[str, str], list[tuple[float, float]]] = {}
         for one in drives:
             for camera, origin, errors in _extrinsics(one):
-                found.setdefault((camera, origin), []).append(errors)
-        for (camera, origin), pairs in found.items():
-            degrees, centres = ([pair[n] for pair in pairs] for n in range(2))
-            lines.append([port, camera, origin, _mean(degrees, 3), _mean(centres, 1)])
+                found.setdefault((port, camera, origin), []).append(errors)
+    lines = []
+    for key, pairs in found.items():
+        degrees, centres = zip(*pairs, strict=True)
+        lines.append([*key, _mean(degrees, 3), _mean(centres, 1)])
     return ["port", "camera", "extrinsic of", *_EXTRINSICS], lines
 
 
@@ -112,7 +118,7 @@ def _extrinsics(one: Measured) -> list[tuple[str, str, tuple[float, float]]]:
 
 
 def _mean(values: Sequence[float], digits: int) -> str:
-    known = [value for value in values if not math.isnan(value)]
+    known = _known(values)
     if not known:
         return "-"
     mean = f"{np.mean(known):.{digits}f}"
@@ -136,46 +142,13 @@ def _tex(text: str) -> str:
     return text.replace("+-", r"$\pm$")
 
 
-def _results_csv(measured: Sequence[Measured]) -> str:
-    lines: list[list[object]] = [["port", "seed", "cameras", "method", *COLUMNS]]
-    for one in measured:
-        for cameras, rows in one.rows.items():
-            for method, row in rows.items():
-                cells = [f"{take(row):.6g}" for take, _ in COLUMNS.values()]
-                lines.append([one.port, one.seed, cameras, method, *cells])
-    return _csv(lines)
-
-
-def _calibrations_csv(measured: Sequence[Measured]) -> str:
-    lines: list[list[object]] = [["port", "seed", "camera", "extrinsic of", *_EXTRINSICS]]
-    for one in measured:
-        for camera, origin, errors in _extrinsics(one):
-            lines.append([one.port, one.seed, camera, origin, *(f"{error:.6g}" for error in errors)])
-    return _csv(lines)
-
-
-def _csv(lines: Iterable[Iterable[object]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()
-
-
-OPT_TO_CNI = 1.1
-"""The optimised map is to be at most so many times as far off as one under a manual calibration (port1)."""
-
-ENI_TO_OPT = 10.0
-"""The map under a borrowed calibration is to be so many times as far off as the optimised one (port2)."""
-
-ONI_TO_CNI = 1.2
-"""The naive map under the optimised IPM is to be at most so many times as far off as under the manual one."""
-
-_PAPER = (
-    "The paper is *Monocular Camera Mapping with Pose-Guided Optimization* (IROS 2023). It drove through "
-    "two real ports; these are two rendered ones, so ratios between methods are compared and no absolute "
-    "figure. Its claims, as far as ratios can test them: the joint optimisation is as good as a manual "
-    "calibration where there is one (port1), repairs a borrowed one (port2), finds an IPM that serves the "
-    "naive method as well as a manual calibration does, and maps more with more cameras."
+_RATIOS = (
+    ("the optimisation is as good as a manual calibration", "Opt", "CNI", "<=", 1.1, "calibrated"),
+    ("it repairs a borrowed calibration", "ENI", "Opt", ">=", 10.0, "estimated"),
+    ("its IPM serves as well as the manual one", "ONI", "CNI", "<=", 1.2, None),
 )
+"""Claims on how many times as far off the map of one method is as that of another, the limit of that, and the
+IPM that a port must start from to test it; None for any."""
 
 
 @dataclass(frozen=True)
@@ -205,83 +178,11 @@ def claims(measured: Sequence[Measured]) -> list[Claim]:
     for port, drives in by_port(measured).items():
         started = drives[0].started_from
         for cameras in drives[0].rows:
-            if started == "calibrated":
-                text = "the optimisation is as good as a manual calibration: Opt / CNI"
-                found.append(_claim(text, port, drives, cameras, ("Opt", "CNI"), most=OPT_TO_CNI))
-            elif started == "estimated":
-                text = "it repairs a borrowed calibration: ENI / Opt"
-                found.append(_claim(text, port, drives, cameras, ("ENI", "Opt"), least=ENI_TO_OPT))
-            text = "its IPM serves as well as the manual one: ONI / CNI"
-            found.append(_claim(text, port, drives, cameras, ("ONI", "CNI"), most=ONI_TO_CNI))
+            for text, above, below, sign, limit, needed in _RATIOS:
+                if needed in (None, started):
+                    found.append(_claim(text, port, drives, cameras, (above, below), sign, limit))
         found += _more_with_more(port, drives)
     return [claim for claim in found if claim.values]
-
-
-def write_words(
-    folder: Path, measured: Sequence[Measured], captions: Mapping[str, str], config: ExperimentConfig
-) -> None:
-    """Write ``experiment.md``, the text, and ``figures.md``, the figures with their captions."""
-    replace_text(folder / "experiment.md", words(measured, config))
-    shown = "".join(f"![{name}]({name})\n\n{caption}\n\n" for name, caption in captions.items())
-    replace_text(folder / "figures.md", f"# Figures\n\n{shown}")
-
-
-def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
-    """The text in Markdown."""
-    tested = claims(measured)
-    heads = ["claim", "where", "asked", "measured", "on shared markings", "holds"]
-    lines = [
-        [c.text, c.where, c.limit, c.figure, _with_range(c.shared), "yes" if c.holds else "**no**"]
-        for c in tested
-    ]
-    drives = ", ".join(one.title for one in measured)
-    recipes = "".join(f"- {name}: {what}\n" for name, what in RECIPES.items() if name in config.recipes)
-    return (
-        f"# Experiment {config.name}\n\nv2hdm {__version__}. Drives: {drives}. Recipes:\n\n{recipes}\n"
-        f"## Beside the paper\n\n{_PAPER}\n\n"
-        "Ratios are of corner RMSE; the mean over the seeds is asked, the range of the seeds stands behind "
-        f"it.\n\n{markdown(heads, lines)}\n{_verdict(tested)}\n{_remarks(measured)}{_failures(measured)}"
-        f"## Maps\n\n{markdown(*results_table(measured))}\n{NOTE}\n\n"
-        f"## Calibrations\n\n{markdown(*calibrations_table(measured))}\n"
-        "How far each camera's extrinsic is from the true one: angle, and distance of the centre. CNI and "
-        "ENI are the rigid extrinsics nearest to the manual and the borrowed IPM; Opt is found with all "
-        "cameras together.\n\nFigures and what they show: [figures.md](figures.md).\n"
-    )
-
-
-def _verdict(tested: Sequence[Claim]) -> str:
-    broken = [claim for claim in tested if not claim.holds]
-    if not broken:
-        return f"All {len(tested)} figures agree with the paper's claims.\n"
-    lines = "".join(f"- {c.where}: {c.text} is {c.figure}, asked was {c.limit}\n" for c in broken)
-    return f"**{len(broken)} of {len(tested)} figures disagree with the paper's claims:**\n\n{lines}"
-
-
-def _remarks(measured: Sequence[Measured]) -> str:
-    """Errors on shared markings, those of the paper's recipe beside ours."""
-    out = []
-    for port, drives in by_port(measured).items():
-        for cameras in drives[0].rows:
-            rows = _common(drives, cameras, ("CNI", "Opt"))
-            if rows:
-                cni, opt = (_cm(row[name].shared_rmse_m for row in rows) for name in ("CNI", "Opt"))
-                count = np.mean([row["Opt"].shared for row in rows])
-                where = f"- {port}, {cameras}: on {count:.0f} shared markings"
-                line = f"{where} CNI is {cni} cm off, Opt {opt} cm"
-                recipe = _common(drives, cameras, ("Opt, paper",))
-                if recipe:
-                    line += f"; by the paper's recipe {_cm(r['Opt, paper'].shared_rmse_m for r in recipe)} cm"
-                out.append(line + "\n")
-    return f"Like with like, on markings that every method has mapped:\n\n{''.join(out)}\n" if out else ""
-
-
-def _failures(measured: Sequence[Measured]) -> str:
-    lines = [
-        f"- {one.title}, {cameras}, recipe {recipe}: {text}\n"
-        for one in measured
-        for recipe, cameras, text in one.failures
-    ]
-    return f"No map came of these, and the tables are without them:\n\n{''.join(lines)}\n" if lines else ""
 
 
 def _more_with_more(port: str, drives: Sequence[Measured]) -> list[Claim]:
@@ -304,18 +205,77 @@ def _claim(
     drives: Sequence[Measured],
     cameras: str,
     methods: tuple[str, str],
-    least: float | None = None,
-    most: float | None = None,
+    sign: str,
+    limit: float,
 ) -> Claim:
     """The ratio of two methods' corner RMSE, which is to be at least or at most some value."""
-    rows = _common(drives, cameras, methods)
-    pairs = [(row[methods[0]], row[methods[1]]) for row in rows]
+    pairs = [(row[methods[0]], row[methods[1]]) for row in _common(drives, cameras, methods)]
     values = _known(above.rmse_m / below.rmse_m for above, below in pairs)
     shared = _known(above.shared_rmse_m / below.shared_rmse_m for above, below in pairs)
     mean = float(np.mean(values)) if values else float("nan")
-    holds = mean <= most if most is not None else least is not None and mean >= least
-    limit = f"<= {most:g}" if most is not None else f">= {least:g}"
-    return Claim(text, f"{port}, {cameras}", limit, values, holds, shared)
+    holds = mean <= limit if sign == "<=" else mean >= limit
+    title = f"{text}: {' / '.join(methods)}"
+    return Claim(title, f"{port}, {cameras}", f"{sign} {limit:g}", values, holds, shared)
+
+
+def write_words(
+    folder: Path,
+    measured: Sequence[Measured],
+    captions: Mapping[str, tuple[str, Mapping[str, Any]]],
+    config: ExperimentConfig,
+) -> None:
+    """Write ``experiment.md``, the text, and ``figures.md``, the figures with their captions.
+
+    ``captions`` are by file name the kind of a figure and the values that its caption states.
+    """
+    replace_text(folder / "experiment.md", words(measured, config))
+    replace_text(folder / "figures.md", _filled("figures.md", captions=captions))
+
+
+def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
+    """The text in Markdown."""
+    tested = claims(measured)
+    lines = [
+        [c.text, c.where, c.limit, c.figure, _with_range(c.shared), "yes" if c.holds else "**no**"]
+        for c in tested
+    ]
+    return _filled(
+        "experiment.md",
+        config=config,
+        version=__version__,
+        drives=", ".join(one.title for one in measured),
+        recipes=RECIPES,
+        tested=tested,
+        broken=[claim for claim in tested if not claim.holds],
+        claims_table=markdown(["claim", "where", "asked", "measured", "on shared markings", "holds"], lines),
+        remarks=_on_shared(measured),
+        failures=[(one.title, *failure) for one in measured for failure in one.failures],
+        results_table=markdown(*results_table(measured)),
+        calibrations_table=markdown(*calibrations_table(measured)),
+    )
+
+
+def _filled(template: str, **values: Any) -> str:
+    loader = jinja2.PackageLoader("v2hdm.experiment")
+    found = jinja2.Environment(
+        loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True
+    )
+    return found.get_template(template).render(**values)
+
+
+def _on_shared(measured: Sequence[Measured]) -> list[tuple[str, ...]]:
+    """Cameras, markings that all methods share, and errors on them (cm): CNI, Opt, Opt by the paper."""
+    out: list[tuple[str, ...]] = []
+    for port, drives in by_port(measured).items():
+        for cameras in drives[0].rows:
+            rows = _common(drives, cameras, ("CNI", "Opt"))
+            if rows:
+                of_paper = _common(drives, cameras, ("Opt, paper",))
+                cni, opt = (_cm(row[name].shared_rmse_m for row in rows) for name in ("CNI", "Opt"))
+                recipe = _cm(row["Opt, paper"].shared_rmse_m for row in of_paper) if of_paper else ""
+                shared = f"{np.mean([row['Opt'].shared for row in rows]):.0f}"
+                out.append((f"{port}, {cameras}", shared, cni, opt, recipe))
+    return out
 
 
 def _known(values: Iterable[float]) -> tuple[float, ...]:

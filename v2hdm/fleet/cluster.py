@@ -54,7 +54,11 @@ def cluster(address: str, workers: int) -> Iterator[Any]:
         ConfigError: Ray is not installed, or there is no cluster at the address.
     """
     with ExitStack() as stack:
-        stack.callback(_restore, {name: os.environ.get(name) for name in _ONE_THREAD})
+        for name in _ONE_THREAD:
+            if name in os.environ:
+                stack.callback(os.environ.__setitem__, name, os.environ[name])
+            else:
+                stack.callback(os.environ.pop, name, None)
         os.environ.update(_QUIET | _ONE_THREAD)
         if address == LOCAL:
             # A secret of this process's own: else Ray keeps one in the home folder for all.
@@ -80,13 +84,6 @@ def cluster(address: str, workers: int) -> Iterator[Any]:
                 "same RAY_AUTH_TOKEN, or leave --address out"
             ) from error
         yield ray
-
-
-def _restore(environment: dict[str, str | None]) -> None:
-    for name, value in environment.items():
-        os.environ.pop(name, None)
-        if value is not None:
-            os.environ[name] = value
 
 
 @dataclass(frozen=True)

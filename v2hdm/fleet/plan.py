@@ -55,17 +55,10 @@ class Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict, sets = metrics["verdict"], list(metrics["results"].values())
         worst = next((f"{one['check']} ({one['about']}): {one['says']}" for one in verdict["findings"]), "")
-        return cls(
-            drive,
-            status=str(verdict["status"]),
-            says=one_line(worst),
-            images=int(metrics["drive"]["images"]),
-            markings=int(sets[-1]["Opt"]["markings"]) if sets else None,
-            minutes=round(sum(metrics.get("seconds", {}).values()) / 60, 3),
-            kept=kept,
-            folder=place,
-            source=source,
-        )
+        markings = int(sets[-1]["Opt"]["markings"]) if sets else None
+        images, seconds = int(metrics["drive"]["images"]), sum(metrics.get("seconds", {}).values())
+        figures = (images, markings, round(seconds / 60, 3))
+        return cls(drive, str(verdict["status"]), one_line(worst), *figures, kept, place, source)
 
 
 def as_csv(rows: Sequence[Row]) -> bytes:
@@ -170,7 +163,11 @@ def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source
         _, config = _composed(file, overrides)
         if not config.drive.paths:
             raise ConfigError(f"{file}: --site joins drives that lie in folders; set drive.path")
-        _refuse_other_settings(files[0], settings, file, config)
+        for key, *values in _differences(settings, config):
+            raise ConfigError(
+                f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {files[0]}: a site has one "
+                f"set of settings; say the same in both, or {key}=... for all"
+            )
         paths += map(str, config.drive.path if isinstance(config.drive.path, list) else [config.drive.path])
     OmegaConf.update(first, "name", site)
     OmegaConf.update(first, "drive.path", paths)
@@ -186,16 +183,13 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
     return composed, config
 
 
-def _refuse_other_settings(first: Path, settings: RunConfig, file: Path, config: RunConfig) -> None:
+def _differences(settings: RunConfig, config: RunConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Every setting besides name and path that is another in the second: its key, and both values."""
     without = [replace(one, name=None, drive=replace(one.drive, path=None)) for one in (settings, config)]
     mine, other = (dict(_leaves(asdict(one))) for one in without)
-    for key in [*mine, *other]:
-        values = [one.get(key) for one in (mine, other)]
-        if values[0] != values[1]:
-            raise ConfigError(
-                f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {first}: a site has one "
-                f"set of settings; say the same in both, or {key}=... for all"
-            )
+    return (
+        (key, mine.get(key), other.get(key)) for key in [*mine, *other] if mine.get(key) != other.get(key)
+    )
 
 
 def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,7 @@ from rich.console import Console
 from v2hdm.fleet.cluster import LOCAL, NO_GPU, RETRIES, Shares, cluster, wants_gpu
 from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
-from v2hdm.store.remote import place_of
 from v2hdm.store.results import GrowingFolder, growing_folder
-from v2hdm.store.upload import RemoteTable
 
 ALL = "fleet"
 """In place of a drive's name, for the progress of the fleet."""
@@ -28,11 +26,11 @@ class FleetOptions:
     """The choices of a user beside the drives.
 
     ``workers`` are the cores that are used on this machine, 0 for all; ``address`` is that of a cluster.
-    ``folder``, or the URL of one, takes the table; ``again`` does what is finished again. ``site`` names the
+    ``folder`` takes the table; ``again`` does what is finished again. ``site`` names the
     one that all drives are of; without a name each is mapped by itself.
     """
 
-    folder: Path | str
+    folder: Path
     workers: int = 0
     address: str = LOCAL
     again: bool = False
@@ -64,7 +62,7 @@ def run_fleet(
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)
-    with _growing(options.folder) as folder:
+    with growing_folder(options.folder, "--table") as folder:
         table = _Table(folder, todo.sources, progress)
         for row in todo.refused:
             table.add(row)
@@ -74,21 +72,10 @@ def run_fleet(
         return table.rows
 
 
-def _growing(place: Path | str) -> AbstractContextManager[GrowingFolder | RemoteTable]:
-    """The folder of the table, or its place at an object store."""
-    there = place_of(str(place), "--table")
-    if isinstance(there, Path):
-        return growing_folder(there, "--table")
-    there.check()
-    return nullcontext(RemoteTable(there))
-
-
 class _Table:
     """The rows so far, on disk as well."""
 
-    def __init__(
-        self, folder: GrowingFolder | RemoteTable, sources: Sequence[str], progress: DriveProgress
-    ) -> None:
+    def __init__(self, folder: GrowingFolder, sources: Sequence[str], progress: DriveProgress) -> None:
         self._folder, self._sources, self._progress = folder, sources, progress
         self._rows: dict[str, Row] = {}
 

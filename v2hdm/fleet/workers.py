@@ -2,36 +2,42 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 import traceback
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import ray
-from ray.exceptions import RayActorError, RayTaskError
+from ray.exceptions import RayActorError, RayTaskError, WorkerCrashedError
 
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError, WorkerError, describe
-from v2hdm.fleet.cluster import DETECTORS_A_GPU
+from v2hdm.executor import IN_PROCESS
+from v2hdm.fleet.cluster import DETECTORS_A_GPU, RETRIES
 from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.finished import RunResult, take_or_make
-from v2hdm.pipeline.run import map_and_save
+from v2hdm.pipeline.run import RunResult, map_and_save, take_or_make
+from v2hdm.progress import Progress
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.store.cache import StageCache
+from v2hdm.store.cache import Line, StageCache, log_again, recorded
+
+_Result = TypeVar("_Result")
 
 IMAGES_A_BATCH = 8
 """Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
 
 _BATCHES_AHEAD = 2  # calls that wait at each actor, so that it is never idle between them
 _DRIVES_KEPT = 4
+_CORES_EACH = 0.5
+"""Booked for a task: the other half of its core is an actor's that detects, which then has nothing to do."""
 _REPORT_EVERY_S = 0.5
 
 
@@ -51,18 +57,18 @@ class ProgressActor:
         return [(*key, *value) for key, value in reported.items()]
 
 
-class DriveProgress:
-    """Reports one drive to the :class:`ProgressActor`, now and then and at the ends of its stages."""
+def reported(actor: Any, drive: str) -> Progress:
+    """Progress of one drive for the :class:`ProgressActor`, now and then and at the ends of its stages."""
+    last_s = -_REPORT_EVERY_S
 
-    def __init__(self, actor: Any, drive: str) -> None:
-        self._actor, self._drive, self._reported_s = actor, drive, -_REPORT_EVERY_S
-
-    def __call__(self, task: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``task`` are finished."""
+    def report(task: str, done: int, total: int) -> None:
+        nonlocal last_s
         now_s = time.monotonic()
-        if done >= total or now_s - self._reported_s >= _REPORT_EVERY_S:
-            self._reported_s = now_s
-            self._actor.report.remote(self._drive, task, done, total)
+        if done >= total or now_s - last_s >= _REPORT_EVERY_S:
+            last_s = now_s
+            actor.report.remote(drive, task, done, total)
+
+    return report
 
 
 class DetectorActor:
@@ -92,7 +98,7 @@ class DetectorActor:
             if not root.exists():
                 raise DriveError(
                     f"{root}: is not on {os.uname().nodename}, which is to detect in its images; put drives, "
-                    "and local_cache for those that are copied, on a folder that all machines share"
+                    "and the cache for those that are copied, on a folder that all machines share"
                 )
         if known not in self._detectors:
             self._detectors = {known: Detector.load(options=options)}
@@ -147,7 +153,8 @@ def detect_by(
             waiting[actor.detect.remote([reference], options, batch)] = number, actor
         (done,), _ = ray.wait(list(waiting), num_returns=1)
         number, actor = waiting.pop(done)
-        found[number] = _result(done)
+        died = "a detection worker died again and again over the same images"
+        found[number] = _result(done, died, ", or look at the images")
         free.append(actor)
         while taken in found:
             for one in found.pop(taken):
@@ -155,17 +162,45 @@ def detect_by(
             taken += 1
 
 
-def _result(reference: Any) -> list[ImageDetections]:
+class RayExecutor:
+    """A :class:`v2hdm.executor.Executor` of a cluster's cores."""
+
+    def __init__(self, cores: int, folder: str) -> None:
+        """``cores`` are those of the cluster; ``folder`` is where relative paths begin."""
+        self.workers, self._folder = cores, folder
+
+    def begin(self, work: Callable[[], _Result]) -> Callable[[], _Result]:
+        """Hand ``work`` to a task; one whose worker dies is begun anew."""
+        level = logging.getLogger("v2hdm").getEffectiveLevel()
+        task: Any = ray.remote(_done).options(num_cpus=_CORES_EACH, max_retries=RETRIES)
+        reference = task.remote(work, level, self._folder)
+
+        def result() -> _Result:
+            died = "a worker process of a site died again and again"
+            done: tuple[_Result, list[Line]] = _result(reference, died, "")
+            log_again(done[1])
+            return done[0]
+
+        return result
+
+
+def _done(work: Callable[[], _Result], level: int, folder: str) -> tuple[_Result, list[Line]]:
+    """The result of ``work`` in the process of a task, and its log lines."""
+    os.chdir(folder)
+    logging.getLogger("v2hdm").setLevel(level)
+    with recorded() as lines:
+        result = work()
+    return result, lines
+
+
+def _result(reference: Any, died: str, else_do: str) -> Any:
+    """The result of a call, its own error, or a WorkerError where its process died."""
     try:
-        result: list[ImageDetections] = ray.get(reference)
+        return ray.get(reference)
     except RayTaskError as failure:
-        raise failure.cause from None
-    except RayActorError:
-        raise WorkerError(
-            "a detection worker died again and again over the same images, perhaps for want of memory; set "
-            "fewer --workers, or look at the images"
-        ) from None
-    return result
+        raise failure.cause from failure
+    except (RayActorError, WorkerCrashedError):
+        raise WorkerError(f"{died}, perhaps for want of memory; set fewer --workers{else_do}") from None
 
 
 def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) -> tuple[Row, str]:
@@ -176,7 +211,7 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
     os.chdir(folder)
     job.config.workers = 1
     try:
-        report = DriveProgress(progress, job.name)
+        report = reported(progress, job.name)
         mapped = partial(_mapped, job, detectors, report)
         result, kept = take_or_make(job.config, mapped, job.config.resume, report)
     except Exception as error:  # a drive that fails is a row, and the others go on
@@ -189,11 +224,9 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
 
 
 def _mapped(
-    job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, cache: StageCache
+    job: Job, detectors: Sequence[Any], report: Progress, config: RunConfig, cache: StageCache
 ) -> RunResult:
-    # It loads torch, which a finished result does not need.
-    from v2hdm.fleet.executor import RayExecutor
-
-    executor = RayExecutor(len(detectors), str(Path.cwd())) if len(config.drive.paths) > 1 else None
+    several = len(config.drive.paths) > 1
+    executor = RayExecutor(len(detectors), str(Path.cwd())) if several else IN_PROCESS
     context = Context(progress=report, detect=partial(detect_by, detectors), executor=executor)
     return map_and_save(config, cache, job.config_yaml, context)

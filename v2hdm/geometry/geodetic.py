@@ -54,9 +54,8 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     """
     system = _system(crs, where, error)
     if not system.is_projected:
-        raise error(
-            f"{where}: {crs} is not projected; give latitude and longitude as such, or a projected one"
-        )
+        advice = "give latitude and longitude as such, or a projected one"
+        raise error(f"{where}: {crs} is not projected; {advice}")
     lon, lat = _inverse_of(crs).transform(points[:, 0], points[:, 1])
     geodetic = np.column_stack([lat, lon, points[:, 2]])
     if not np.isfinite(geodetic).all():
@@ -151,10 +150,9 @@ def _geodetic_from_ecef(points: FloatArray) -> FloatArray:
     parametric = np.arctan2(z * _SEMI_MAJOR_M, out_m * minor_m)
     second2 = _ECCENTRICITY2 / (1 - _ECCENTRICITY2)
     for _ in range(3):
-        lat = np.arctan2(
-            z + second2 * minor_m * np.sin(parametric) ** 3,
-            out_m - _ECCENTRICITY2 * _SEMI_MAJOR_M * np.cos(parametric) ** 3,
-        )
+        cubed = np.cos(parametric) ** 3
+        raised_m = z + second2 * minor_m * np.sin(parametric) ** 3
+        lat = np.arctan2(raised_m, out_m - _ECCENTRICITY2 * _SEMI_MAJOR_M * cubed)
         parametric = np.arctan2((1 - _FLATTENING) * np.sin(lat), np.cos(lat))
     on_ellipsoid = out_m - _SEMI_MAJOR_M * np.cos(parametric), z - minor_m * np.sin(parametric)
     height_m = on_ellipsoid[0] * np.cos(lat) + on_ellipsoid[1] * np.sin(lat)

@@ -17,9 +17,7 @@ from v2hdm.records import CameraInfo, FloatArray
 def pinhole_px_from_ground(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
     """The homography (..., 3, 3) from the plane z = 0 of a frame to pinhole pixels: K [r1 r2 t].
 
-    Args:
-        intrinsic: K, (..., 3, 3), px.
-        cam_from_ground: the camera's pose in that frame, (..., 4, 4).
+    ``intrinsic`` is K, (..., 3, 3) px, ``cam_from_ground`` (..., 4, 4) the camera's pose in that frame.
     """
     return np.asarray(intrinsic @ cam_from_ground[..., :3, :][..., [0, 1, 3]])
 
@@ -27,8 +25,7 @@ def pinhole_px_from_ground(intrinsic: FloatArray, cam_from_ground: FloatArray) -
 def ground_from_pinhole_px(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
     """The inverse (..., 3, 3) of :func:`pinhole_px_from_ground`.
 
-    Raises:
-        numpy.linalg.LinAlgError: the camera centre lies on the ground plane.
+    Raises numpy.linalg.LinAlgError when the camera's centre lies on the ground plane.
     """
     return np.asarray(np.linalg.inv(pinhole_px_from_ground(intrinsic, cam_from_ground)), dtype=np.float64)
 
@@ -36,8 +33,7 @@ def ground_from_pinhole_px(intrinsic: FloatArray, cam_from_ground: FloatArray) -
 def ipm_from_extrinsic(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
     """The IPM ``vehicle_from_pinhole_px`` (3 x 3, unit norm) of a camera at ``cam_from_vehicle`` (4 x 4).
 
-    Raises:
-        numpy.linalg.LinAlgError: the camera centre lies on the ground plane.
+    Raises numpy.linalg.LinAlgError when the camera's centre lies on the ground plane.
     """
     ipm = ground_from_pinhole_px(info.intrinsic, cam_from_vehicle)
     return np.asarray(ipm / np.linalg.norm(ipm))
@@ -64,9 +60,7 @@ def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
 def facing_ipm(ipm: FloatArray, seen_vehicle: FloatArray) -> FloatArray:
     """The IPM (3 x 3), of that sign whose third coordinate is positive for ground in front of the camera.
 
-    Args:
-        ipm: ``vehicle_from_pinhole_px``, of any sign.
-        seen_vehicle: a ground point (2,) m that lies in front of the camera.
+    ``ipm`` is of any sign, ``seen_vehicle`` (2,) m a ground point that lies in front of the camera.
     """
     # With ipm @ (u, v, 1) = w * ground, the solution is (u, v, 1) / w.
     in_front = np.linalg.solve(ipm, np.append(seen_vehicle, 1.0))[2] > 0
@@ -100,23 +94,17 @@ def homography_jacobian(dst_from_src: FloatArray, points_src: FloatArray) -> Flo
     homogeneous = _homogeneous(dst_from_src, points_src)
     third = np.where(homogeneous[..., 2:] > 0, homogeneous[..., 2:], np.nan)
     mapped = (homogeneous[..., :2] / third)[..., None]
-    return np.asarray(
-        (dst_from_src[..., None, :2, :2] - mapped * dst_from_src[..., None, 2:, :2]) / third[..., None]
-    )
+    slope = dst_from_src[..., None, :2, :2] - mapped * dst_from_src[..., None, 2:, :2]
+    return np.asarray(slope / third[..., None])
 
 
 def project_ground(
     intrinsic: FloatArray, cam_from_ground: FloatArray, points_ground: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Pinhole pixels (..., N, 2) and depths (..., N), m, of ground points (..., N, 2).
+    """Pinhole pixels (..., N, 2) and depths (..., N), m, of ground points (..., N, 2), m.
 
-    The pixels of points behind the camera, whose depth is negative, are those of their mirror images; at
-    depth zero they are inf or nan.
-
-    Args:
-        intrinsic: K, (..., 3, 3), px.
-        cam_from_ground: the camera's pose in the frame of the points, (..., 4, 4).
-        points_ground: points of the plane z = 0 of that frame, m.
+    Camera and frame are those of :func:`pinhole_px_from_ground`. The pixels of points behind the camera,
+    whose depth is negative, are those of their mirror images; at depth zero they are inf or nan.
     """
     homogeneous = _homogeneous(pinhole_px_from_ground(intrinsic, cam_from_ground), points_ground)
     depth_m = homogeneous[..., 2]
@@ -127,13 +115,9 @@ def project_ground(
 def direction_covariance(ray_ground: FloatArray, height_m: FloatArray, sigma_rad: float) -> FloatArray:
     """Covariance (..., 2, 2), m^2, of a ground point whose viewing direction is uncertain.
 
-    A change of pitch by d moves a point at range r along the ray by (r^2 + h^2) / h * d, one of yaw across
-    it by r * d.
-
-    Args:
-        ray_ground: (..., 2) m, from below the camera to the point.
-        height_m: h, (...), of the camera.
-        sigma_rad: standard deviation of pitch and yaw.
+    ``ray_ground`` (..., 2) m leads from below the camera, which is ``height_m`` (...) up, to the point;
+    ``sigma_rad`` is that of pitch and yaw. At height h a change of pitch by d moves a point at range r along
+    the ray by (r^2 + h^2) / h * d, one of yaw across it by r * d.
     """
     range_m = np.linalg.norm(ray_ground, axis=-1)
     along = ray_ground / np.maximum(range_m, 1e-9)[..., None]

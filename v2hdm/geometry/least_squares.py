@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from operator import add
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -52,15 +53,10 @@ def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatAr
 
 @dataclass(frozen=True)
 class Fit(Generic[X, N]):
-    """Where an iteration ended.
+    """Where an iteration ended: at the estimate ``x``, after ``steps``.
 
-    Attributes:
-        x: the estimate after the last step.
-        last: the normal equations that this step was taken from.
-        step: that step (U,), as limited.
-        converged: whether it was short enough to be the last; if not, the steps were used up, or the
-            problem was not finite.
-        steps: how many were taken.
+    ``step`` (U,) is the last one, as limited, taken from the normal equations ``last``. It was short enough
+    if ``converged``; if not, the steps were used up, or the problem was not finite.
     """
 
     x: X
@@ -93,20 +89,15 @@ def gauss_newton(
     limit: Callable[[FloatArray], FloatArray] | None = None,
     settled: Callable[[FloatArray], bool] | None = None,
 ) -> Fit[X, N]:
-    """Minimise a sum of squares from ``x0``.
+    """Minimise a sum of squares from ``x0`` in at most so many ``steps``.
 
-    Args:
-        linearise: the normal equations at an estimate.
-        x0: where to start.
-        retract: an estimate moved by a step (U,); addition if not given.
-        steps: at most so many.
-        tolerance: a step below so many conditional standard deviations, of every unknown, is the last.
-        damping: of the first step, as a share of the information's diagonal. Above 0, steps that raise the
-            cost are undone and taken again with ten times the damping; at 0 every step is taken whole.
-        limit: shortens a step to what the linearisation holds for.
-        settled: whether a step is the last, in place of ``tolerance``.
+    ``linearise`` gives the normal equations at an estimate, ``retract`` an estimate moved by a step (U,), by
+    default their sum. A step that is below ``tolerance`` conditional standard deviations of every unknown, or
+    that is ``settled``, is the last; ``limit`` shortens one to what the linearisation holds for. With a
+    ``damping``, a share of the information's diagonal, steps that raise the cost are undone and taken again
+    with ten times of it; at 0 every step is taken whole.
     """
-    move: Callable[[X, FloatArray], X] = retract or _add
+    move: Callable[[X, FloatArray], X] = retract or add
     x, last, damped = x0, linearise(x0), damping
     step, taken = np.zeros(len(last.gradient)), 0
     while taken < steps:
@@ -115,7 +106,8 @@ def gauss_newton(
         step = solve_normal(last, damped)
         step = step if limit is None else limit(step)
         moved, taken = move(x, step), taken + 1
-        if settled(step) if settled else _is_short(step, last, tolerance):
+        in_sigmas = np.abs(step) * np.sqrt(np.diag(last.information))
+        if settled(step) if settled else np.max(in_sigmas, initial=0.0) < tolerance:
             return Fit(moved, last, step, True, taken)
         if damping == 0 and taken == steps:
             return Fit(moved, last, step, False, taken)
@@ -127,14 +119,6 @@ def gauss_newton(
         else:
             x, last, damped = moved, after, damped / 10.0
     return Fit(x, last, step, False, taken)
-
-
-def _add(x: Any, step: FloatArray) -> Any:
-    return np.asarray(x) + step
-
-
-def _is_short(step: FloatArray, last: Normal, tolerance: float) -> bool:
-    return bool(np.max(np.abs(step) * np.sqrt(np.diag(last.information)), initial=0.0) < tolerance)
 
 
 def solve_normal(equations: Normal, damping: float = 0.0) -> FloatArray:

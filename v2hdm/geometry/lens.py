@@ -26,14 +26,9 @@ def undistort_points(info: CameraInfo, points_px: FloatArray) -> FloatArray:
     if points.size == 0 or not has_distortion(info):
         return points.reshape(-1, 2).copy()
     coefficients = np.asarray(info.distortion, dtype=np.float64)
-    if info.distortion_model == "equidistant":
-        out = cv2.fisheye.undistortPoints(
-            points, info.intrinsic, coefficients, P=info.intrinsic, criteria=_UNDISTORT_CRITERIA
-        )
-    else:
-        out = cv2.undistortPoints(
-            points, info.intrinsic, coefficients, P=info.intrinsic, criteria=_UNDISTORT_CRITERIA
-        )
+    model = cv2.fisheye if info.distortion_model == "equidistant" else cv2
+    k = info.intrinsic
+    out = model.undistortPoints(points, k, coefficients, P=k, criteria=_UNDISTORT_CRITERIA)
     return np.asarray(out, dtype=np.float64).reshape(-1, 2)
 
 

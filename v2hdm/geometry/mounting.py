@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.rigid import camera_centre, euler_from_rotation, exp
 from v2hdm.records import FloatArray
 
 
@@ -15,26 +15,14 @@ def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
     """
     # Columns: the camera's right, down and forward in a frame of forward, left and up.
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    turn = cam_from_vehicle[:3, :3].T @ level.T
-    return np.array(
-        [
-            np.arctan2(turn[2, 1], turn[2, 2]),
-            -np.arcsin(np.clip(turn[2, 0], -1, 1)),
-            np.arctan2(turn[1, 0], turn[0, 0]),
-        ]
-    )
+    return euler_from_rotation(cam_from_vehicle[:3, :3].T @ level.T)
 
 
 def angle_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> FloatArray:
     """Standard deviations (3,) of :func:`mounting_angles`, rad, from the left tangent's covariance (6, 6)."""
     step = 1e-6
-    columns = []
-    for axis in range(3):
-        x, y, z = step * np.eye(3)[axis]
-        moved = cam_from_vehicle.copy()
-        moved[:3, :3] = (np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])) @ moved[:3, :3]
-        columns.append((mounting_angles(moved) - mounting_angles(cam_from_vehicle)) / step)
-    jacobian = np.column_stack(columns)
+    moved = [mounting_angles(exp(step * axis) @ cam_from_vehicle) for axis in np.eye(6)[3:]]
+    jacobian = (np.array(moved) - mounting_angles(cam_from_vehicle)).T / step
     return np.asarray(np.sqrt(np.diag(jacobian @ covariance[3:, 3:] @ jacobian.T)))
 
 

@@ -26,6 +26,21 @@ def signed_area(polygon: FloatArray) -> FloatArray:
     return np.asarray(cross.sum(axis=-1) / 2)
 
 
+def winding(polygon: FloatArray) -> int:
+    """The turning of a convex polygon (N, 2), 1 or -1 as :func:`signed_area` has it; 0 if it is not convex.
+
+    Straight corners are fine; a star turns one way at every corner but goes around twice.
+    """
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    ahead = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
+    winding_rad = np.arctan2(turns, np.sum(edges * ahead, axis=1)).sum()
+    one_way = (turns >= 0).all() or (turns <= 0).all()
+    if not one_way or not turns.any() or not np.isclose(abs(winding_rad), 2 * np.pi):
+        return 0
+    return 1 if winding_rad > 0 else -1
+
+
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
     """A polygon (N, 2) cut to a convex window (M, 2) of either turning (Sutherland and Hodgman, CACM 1974).
 

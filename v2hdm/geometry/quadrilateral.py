@@ -22,16 +22,13 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 _NEXT, _LAST = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 _TURN = np.array([-1.0, 1.0])
 
-SHIFTS = (np.arange(4)[:, None] + np.arange(4)[None, :]) % 4
+_CORNER = np.arange(4)
+SHIFTS = (_CORNER[:, None] + _CORNER[None, :]) % 4
 """Row s lists, for corner c of one quadrilateral, corner (c + s) mod 4 of the other."""
 
-
-_LEAST_SINE = 1e-3
-"""Of the angle of two sides that meet; parallel ones meet nowhere."""
-
-_CORNER = np.arange(4)
+_LEAST_SINE = 1e-3  # of the angle of two sides that meet; parallel ones meet nowhere
+# Each corner is the start of its own side and the end of the one before, in this place among the moves.
 _END = 4 + (_CORNER - 1) % 4
-"""Each corner is the start of its own side and the end of the one before, in this place among the moves."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ class Quad:
     def corner_from_side(self) -> FloatArray:
         """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
         tangent = self.tangent
-        before = preceding(tangent)
+        before = tangent.take(_LAST, axis=-2)
         determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
         determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
         jacobian = np.zeros((len(tangent), 4, 2, 8))
@@ -152,11 +149,6 @@ def following(values: np.ndarray, axis: int = -2) -> np.ndarray:
     return np.asarray(values.take(_NEXT, axis=axis))
 
 
-def preceding(values: np.ndarray, axis: int = -2) -> np.ndarray:
-    """Values of four corners or sides, each replaced by that of the one before."""
-    return np.asarray(values.take(_LAST, axis=axis))
-
-
 def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Tangent (..., 4, 2), normal (..., 4, 2) and length (..., 4) of each side.
 
@@ -205,8 +197,7 @@ def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) 
     offset = np.take_along_axis(mean, chosen[..., None], axis=-2)[..., 0, :]
     deviation = np.linalg.norm(difference - mean[..., None, :], axis=-1)
     worst = np.max(np.where(both, deviation, 0.0), axis=-1)
-    common = np.take_along_axis(common, chosen, axis=-1)[..., 0]
-    worst = np.take_along_axis(worst, chosen, axis=-1)[..., 0]
+    common, worst = (np.take_along_axis(each, chosen, axis=-1)[..., 0] for each in (common, worst))
     return Alignment(shift, offset, np.where(common >= 2, worst, np.inf), common)
 
 
@@ -214,9 +205,8 @@ def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:
     """Largest distance (...) between two valid corners of quadrilaterals (..., 4, 2)."""
     difference = corners[..., :, None, :] - corners[..., None, :, :]
     distance = np.linalg.norm(difference, axis=-1)
-    return np.asarray(
-        np.max(np.where(valid[..., :, None] & valid[..., None, :], distance, 0.0), axis=(-1, -2))
-    )
+    both = valid[..., :, None] & valid[..., None, :]
+    return np.asarray(np.max(np.where(both, distance, 0.0), axis=(-1, -2)))
 
 
 def mean_corners(corners: FloatArray, valid: BoolArray) -> FloatArray:
@@ -235,6 +225,5 @@ def _turns(corners: FloatArray) -> FloatArray:
 def block_diagonal(blocks: FloatArray) -> FloatArray:
     """(M, 4, 2, 2) blocks, one a corner, to (M, 8, 8)."""
     full = np.zeros((len(blocks), 4, 2, 4, 2))
-    for corner in range(4):
-        full[:, corner, :, corner] = blocks[:, corner]
+    full[:, _CORNER, :, _CORNER] = blocks.swapaxes(0, 1)
     return full.reshape(-1, 8, 8)

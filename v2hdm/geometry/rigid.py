@@ -31,11 +31,7 @@ ad^n / (n + 1)!, see :func:`left_jacobian`."""
 
 def inverse(dst_from_src: FloatArray) -> FloatArray:
     """The inverse (..., 4, 4) of rigid transforms, by transposing their rotation."""
-    src_from_dst = np.zeros_like(dst_from_src)
-    src_from_dst[..., :3, :3] = np.swapaxes(dst_from_src[..., :3, :3], -1, -2)
-    src_from_dst[..., :3, 3] = camera_centre(dst_from_src)
-    src_from_dst[..., 3, 3] = 1.0
-    return src_from_dst
+    return make_transform(np.swapaxes(dst_from_src[..., :3, :3], -1, -2), camera_centre(dst_from_src))
 
 
 def camera_centre(cam_from_frame: FloatArray) -> FloatArray:
@@ -54,6 +50,13 @@ def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> F
     """Ground points (..., 2) m of the map as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
     offset = np.concatenate([points_map, np.zeros((*np.shape(points_map)[:-1], 1))], axis=-1)
     return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
+
+
+def make_transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """The transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    out = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    return out
 
 
 def heading_rad(map_from_vehicle: FloatArray) -> FloatArray:
@@ -77,7 +80,7 @@ def exp(tangents: FloatArray) -> FloatArray:
     squared = omega @ omega
     sine, cosine, third = _even_series(tangents[..., 3:], EXP_SERIES)
     moved = (np.eye(3) + cosine * omega + third * squared) @ tangents[..., :3, None]
-    return _transform(np.eye(3) + sine * omega + cosine * squared, moved[..., 0])
+    return make_transform(np.eye(3) + sine * omega + cosine * squared, moved[..., 0])
 
 
 def log(dst_from_src: FloatArray) -> FloatArray:
@@ -168,17 +171,13 @@ def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatA
     cosine = np.sum(first * second, axis=1, keepdims=True)
     second = np.where(cosine < 0, -second, second)
     # atan2 of chord and sum keeps full precision for angles near zero, where arccos does not.
-    angle = 2 * np.arctan2(
-        np.linalg.norm(second - first, axis=1, keepdims=True),
-        np.linalg.norm(second + first, axis=1, keepdims=True),
-    )
+    chord, total = (np.linalg.norm(way, axis=1, keepdims=True) for way in (second - first, second + first))
+    angle = 2 * np.arctan2(chord, total)
     t = fraction[:, None]
     # sin(t a) / sin(a) as a ratio of sincs, which is t at a = 0.
     sinc = np.sinc(angle / np.pi)
-    mixed = (
-        first * (1 - t) * np.sinc((1 - t) * angle / np.pi) / sinc
-        + second * t * np.sinc(t * angle / np.pi) / sinc
-    )
+    mixed = first * (1 - t) * np.sinc((1 - t) * angle / np.pi) / sinc
+    mixed += second * t * np.sinc(t * angle / np.pi) / sinc
     return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
 
 
@@ -193,11 +192,14 @@ def rotation_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: Fl
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def _transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """The transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
-    out = np.zeros((*translation.shape[:-1], 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
-    return out
+def euler_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Roll, pitch and yaw (3,) in rad of a rotation (3, 3), as :func:`rotation_from_euler` has them."""
+    flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    pitch = np.arctan2(-rotation[2, 0], flat)
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0]) if flat > 0 else 0.0
+    # By its cosines with the other two axes turned, roll stays exact where the pitch is a right angle.
+    across = rotation.T @ [-np.sin(yaw), np.cos(yaw), 0.0]
+    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
 
 
 def _even_series(rotation: FloatArray, coefficients: tuple[tuple[float, ...], ...]) -> list[FloatArray]:

@@ -112,11 +112,7 @@ def left_jacobian(tangent: Tensor) -> Tensor:
 def extrinsic_from_ipm(intrinsic: Tensor, ipm: Tensor) -> Tensor:
     """The rigid ``cam_from_vehicle`` (C, 4, 4) nearest to IPMs (C, 3, 3), their cameras above the ground.
 
-    As :func:`v2hdm.geometry.ipm.extrinsic_from_ipm`, which has the source.
-
-    Args:
-        intrinsic: K, (C, 3, 3), px.
-        ipm: ``vehicle_from_pinhole_px``, of any scale and sign.
+    As :func:`v2hdm.geometry.ipm.extrinsic_from_ipm`, which has the source; ``intrinsic`` (C, 3, 3) is K, px.
     """
     columns = torch.linalg.solve(intrinsic, torch.linalg.inv(ipm))
     left, singular, right = torch.linalg.svd(columns[..., :2], full_matrices=False)
@@ -156,23 +152,14 @@ def back_project_with_jacobian(ground_from_pinhole_px: Tensor, pinhole_px: Tenso
 
 def distort_points(info: CameraInfo, points_pinhole_px: Tensor) -> Tensor:
     """Pinhole pixels (n, 2) to recorded pixels (n, 2): as :func:`v2hdm.geometry.lens.distort_points`."""
-    intrinsic, coefficients = _lens(info, points_pinhole_px)
+    intrinsic = torch.as_tensor(info.intrinsic).to(points_pinhole_px)
+    coefficients = torch.tensor(info.distortion).to(points_pinhole_px)
     points_px: Tensor
     if info.distortion_model == "equidistant":
         centred = points_pinhole_px - intrinsic[:2, 2]
         at_depth_one = torch.linalg.solve(intrinsic[:2, :2], centred.mT).mT
-        parameters = torch.cat([_focal_and_centre(intrinsic), coefficients])
-        points_px = distort_points_kannala_brandt(at_depth_one, parameters)
+        focal_and_centre = torch.cat([intrinsic.diagonal()[:2], intrinsic[:2, 2]])
+        points_px = distort_points_kannala_brandt(at_depth_one, torch.cat([focal_and_centre, coefficients]))
     else:
         points_px = brown_conrady.distort_points(points_pinhole_px, intrinsic, coefficients)
     return points_px
-
-
-def _lens(info: CameraInfo, like: Tensor) -> tuple[Tensor, Tensor]:
-    """K (3, 3) and the distortion coefficients of a camera, of the kind of another tensor."""
-    return torch.as_tensor(info.intrinsic).to(like), torch.tensor(info.distortion).to(like)
-
-
-def _focal_and_centre(intrinsic: Tensor) -> Tensor:
-    """fx, fy, cx and cy (4,) of K (3, 3)."""
-    return torch.stack([intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]])

@@ -8,19 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion, slerp
+from v2hdm.geometry.rigid import make_transform, quaternion_from_rotation, rotation_from_quaternion, slerp
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, Trajectory
 
 
 def interpolate(
     trajectory: Trajectory, stamp_s: FloatArray, max_gap_s: float
 ) -> tuple[FloatArray, BoolArray]:
-    """The poses at ``stamp_s`` (N,): position linear, rotation by slerp, never extrapolated.
+    """The poses (N, 4, 4) at ``stamp_s`` (N,): position linear, rotation by slerp; and a flag per time.
 
-    Returns:
-        ``map_from_vehicle`` (N, 4, 4) and a flag per time. The flag is False, and the pose that of
-        the nearest recorded one, before the first pose, after the last and between two poses that
-        are more than ``max_gap_s`` apart; the time of a recorded pose itself is never in a gap.
+    Nothing is extrapolated. The flag is False, and the pose that of the nearest recorded one, before the
+    first pose, after the last and between two poses that are more than ``max_gap_s`` apart; the time of a
+    recorded pose itself is never in a gap.
     """
     recorded = trajectory.stamp_s
     stamp_s = np.asarray(stamp_s, dtype=np.float64)
@@ -33,14 +32,9 @@ def interpolate(
     fraction = np.clip(np.where(inside, linear, np.round(linear)), 0.0, 1.0)
 
     first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
-    poses = np.tile(np.eye(4), (len(stamp_s), 1, 1))
-    poses[:, :3, 3] = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    poses[:, :3, :3] = rotation_from_quaternion(
-        slerp(
-            quaternion_from_rotation(first[:, :3, :3]), quaternion_from_rotation(second[:, :3, :3]), fraction
-        )
-    )
-    return poses, inside
+    turns = [quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second)]
+    points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    return make_transform(rotation_from_quaternion(slerp(turns[0], turns[1], fraction)), points), inside
 
 
 def in_order(image: Image) -> tuple[int, float, str]:
@@ -51,19 +45,11 @@ def in_order(image: Image) -> tuple[int, float, str]:
 def with_clock_offsets(
     drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, visit: int = 0
 ) -> Drive:
-    """The drive with the images of some cameras posed for when they were taken.
+    """The drive with the images of some cameras of a visit posed for when they were taken.
 
-    Args:
-        drive: a drive that holds its trajectory.
-        offset_s: by camera, how much later than stamped its images were taken, s.
-        max_gap_s: longest gap between two poses that is interpolated across, s.
-        visit: of which visit; images of others stay as they are.
-
-    Returns:
-        The drive; images whose time the trajectory does not cover are left out.
-
-    Raises:
-        DriveError: the drive holds no trajectory, or no image of some camera is left.
+    ``offset_s`` says, by camera, how much later than stamped its images were taken, s. Images whose time the
+    trajectory does not cover, up to gaps of ``max_gap_s`` between two poses, are left out. Raises DriveError
+    when the drive holds no trajectory, or no image of some camera is left.
     """
     root, trajectory = drive.visits[visit].root, drive.visits[visit].trajectory
     if trajectory is None:

@@ -114,7 +114,6 @@ def adjust(
 
 
 def _short(step: FloatArray) -> FloatArray:
-    """The step, shortened to the range in which the equations are linear."""
     turn, shift = np.abs(step[TURN]).max(), np.abs(step[CENTRE]).max()
     return np.asarray(step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -62,8 +63,7 @@ _FLATNESS_M = 0.003
 _LEAST_PATCHES = 200  # fewer in view of all pairs say nothing, matched or not
 
 
-@dataclass(frozen=True)
-class _Stage:
+class _Stage(NamedTuple):
     """One round: how far matches are searched, on how wide a grid, in every how manieth pair.
 
     ``loosened`` is how much further off than stated the poses' heading and sideways place may be, so that the
@@ -121,8 +121,8 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
     pairs = spread_pairs(path_m, options.pairs, options.shortest_m, options.longest_m)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
     if free is not None:
-        velocity = stated.motion.velocity_at_images()
-        pairs = np.vstack([pairs, changing_pairs(path_m, velocity, options.clock_pairs, *_CLOCK_APART_M)])
+        moves = stated.motion.moves_ground_mps()
+        pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, *_CLOCK_APART_M)])
     poses = stated.poses()
     for stage in _STAGES:
         matched = matcher.match(
@@ -152,7 +152,10 @@ def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> 
     mount, matched, adjusted = solved.adjusted.mount, solved.matched, solved.adjusted
     seen = matched.observations
     factor = _scatter(seen, solved.stated, adjusted)
-    covariance = tangent_covariance(mount, factor * adjusted.covariance[:6, :6] + _flatness(options))
+    # Ground that is no plane is tilted and lifted for all pairs alike.
+    tilt, pitch = _FLATNESS_M / (2 * options.strip_m), _FLATNESS_M / (2 * options.longest_m)
+    flatness = np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
+    covariance = tangent_covariance(mount, factor * adjusted.covariance[:6, :6] + flatness)
     return replace(
         nothing,
         status=GroundStatus.FOUND,
@@ -186,13 +189,6 @@ def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
         patches=None,
         seconds=0.0,
     )
-
-
-def _flatness(options: GroundOptions) -> FloatArray:
-    """Covariance (6, 6) of turn and centre from ground that is no plane, tilted and lifted for all pairs."""
-    tilt = _FLATNESS_M / (2 * options.strip_m)
-    pitch = _FLATNESS_M / (2 * options.longest_m)
-    return np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
 
 
 def _innovations(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +42,10 @@ class Motion:
     def path_at_images(self, clock_s: float = 0.0) -> FloatArray:
         """Distance driven (I,) at the images."""
         return np.interp(self.stamp_s + clock_s, self.trajectory.stamp_s, self.path_m)
+
+    def moves_ground_mps(self) -> FloatArray:
+        """How fast (I, 3) the ground in view moves by each of the velocities at the images."""
+        return self.velocity_at_images() * [1.0, 1.0, _ARM_M]
 
     def velocity_at_images(self, clock_s: float = 0.0) -> FloatArray:
         """Smoothed velocity (I, 3) at the images."""
@@ -134,37 +137,15 @@ def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: f
 
 
 def changing_pairs(
-    path_m: FloatArray, velocity: FloatArray, count: int, shortest_m: float, longest_m: float
+    path_m: FloatArray, values: FloatArray, count: int, shortest_m: float, longest_m: float
 ) -> IntArray:
-    """Pairs (P, 2) of images between which the velocity (I, 3) changes most, so that a clock shows."""
-
-    def worth(first: int, second: int) -> float:
-        change = velocity[second] - velocity[first]
-        return float(np.hypot(np.hypot(change[0], change[1]), _ARM_M * change[2]))
-
-    return _best_pairs(path_m, worth, count, shortest_m, longest_m)
-
-
-def turning_pairs(
-    path_m: FloatArray, yaw_rad: FloatArray, count: int, shortest_m: float, longest_m: float
-) -> IntArray:
-    """Pairs (P, 2) of images between which the unwrapped heading (I,) turns most: a mirrored path shows."""
-
-    def worth(first: int, second: int) -> float:
-        return abs(float(yaw_rad[second] - yaw_rad[first]))
-
-    return _best_pairs(path_m, worth, count, shortest_m, longest_m)
-
-
-def _best_pairs(
-    path_m: FloatArray, worth: Callable[[int, int], float], count: int, shortest_m: float, longest_m: float
-) -> IntArray:
-    """The pairs of most worth, no image used twice."""
+    """Pairs (P, 2) of images between which values (I, K) change most, no image used twice."""
     found: list[tuple[float, int, int]] = []
     for first in range(len(path_m)):
         away = path_m - path_m[first]
-        for second in np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist():
-            found.append((worth(first, second), first, second))
+        fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m))
+        change = np.hypot.reduce(values[fitting] - values[first], axis=1)
+        found += zip(change.tolist(), [first] * len(fitting), fitting.tolist(), strict=True)
     used: set[int] = set()
     chosen: list[tuple[int, int]] = []
     for _, first, second in sorted(found, reverse=True):

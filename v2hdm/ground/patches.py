@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,13 +77,20 @@ class Sheet:
     shape: tuple[int, int]
 
     @classmethod
-    def around(cls, points_map: FloatArray, pose: FloatArray, margin_m: float, grid_m: float) -> Sheet:
-        """A sheet around points (N, 2), aligned with a pose (4, 4): rows ahead, columns to the left."""
-        axes = _axes(pose)
+    def around(
+        cls, points_map: FloatArray, pose: FloatArray, margin: int, grid_m: float
+    ) -> tuple[Sheet, IntArray]:
+        """A sheet around points (N, 2) with a ``margin`` of cells, and their nearest cells (N, 2) in it.
+
+        It is aligned with a pose (4, 4): rows ahead, columns to the left.
+        """
+        forward = pose[:2, 0] / np.linalg.norm(pose[:2, 0])
+        axes = np.array([forward, [-forward[1], forward[0]]])
         along = points_map @ axes.T
-        low, high = np.nanmin(along, axis=0) - margin_m, np.nanmax(along, axis=0) + margin_m
-        rows, columns = np.ceil((high - low) / grid_m).astype(int)
-        return cls(low @ axes, axes, grid_m, (int(rows), int(columns)))
+        low = along.min(axis=0)
+        cells = np.round((along - low) / grid_m).astype(np.int64) + margin
+        rows, columns = cells.max(axis=0) + margin + 1
+        return cls((low - margin * grid_m) @ axes, axes, grid_m, (int(rows), int(columns))), cells
 
     def points(self) -> FloatArray:
         """All grid points (rows * columns, 2) in the map."""
@@ -90,7 +98,7 @@ class Sheet:
         ahead, left = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
         return self.at(np.column_stack([ahead.ravel(), left.ravel()]))
 
-    def at(self, cells: FloatArray) -> FloatArray:
+    def at(self, cells: FloatArray | IntArray) -> FloatArray:
         """Map points (N, 2) of grid places (N, 2): rows, columns."""
         return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
 
@@ -140,7 +148,7 @@ def match_pair(
     grid_m = options.grid_m
     half = round(options.patch_m / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
-    sheet, cells = _sheet_around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
+    sheet, cells = Sheet.around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
     first_grey, first_seen = sheet.texture(first)
     second_grey, second_seen = sheet.texture(second)
     wide = half + reach
@@ -169,24 +177,6 @@ def match_pair(
 def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
     """Means over squares of ``2 half + 1`` cells around each."""
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
-
-
-def _axes(pose: FloatArray) -> FloatArray:
-    """Unit vectors (2, 2) of the map ahead and to the left of a pose, as rows."""
-    forward = pose[:2, 0] / np.linalg.norm(pose[:2, 0])
-    return np.array([forward, [-forward[1], forward[0]]])
-
-
-def _sheet_around(
-    centres_map: FloatArray, pose: FloatArray, margin: int, grid_m: float
-) -> tuple[Sheet, FloatArray]:
-    """A sheet that holds all centres with a ``margin`` of cells, and the centres' cells (N, 2) in it."""
-    axes = _axes(pose)
-    along = centres_map @ axes.T
-    low = along.min(axis=0)
-    cells = np.round((along - low) / grid_m).astype(np.int64) + margin
-    rows, columns = cells.max(axis=0) + margin + 1
-    return Sheet((low - margin * grid_m) @ axes, axes, grid_m, (int(rows), int(columns))), cells
 
 
 def _peak(score: Float32Array) -> tuple[float, float, float] | None:
@@ -252,10 +242,8 @@ class Matcher:
 
     def under(self, motion: Motion, turned: bool = False) -> Matcher:
         """The same images under another reading of the poses, the region ``turned`` to the other end."""
-        other = object.__new__(Matcher)
-        other.__dict__.update(self.__dict__)
-        other._path = _path_of(motion)
-        other._roi = -self._roi if turned else self._roi
+        other = copy(self)
+        other._path, other._roi = _path_of(motion), -self._roi if turned else self._roi
         return other
 
     def match(

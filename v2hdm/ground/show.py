@@ -91,7 +91,8 @@ def _panel(drive: Drive, patches: MatchedGround, mount: Mount, title: str) -> ND
         hit_ground(mount, px[own], np.tile(pose, (int(own.sum()), 1, 1))).points_map
         for px, pose in zip((patches.first_px, patches.second_px), poses, strict=True)
     ]
-    sheet = Sheet.around(hits[0], poses[0], _MARGIN_M, _GRID_M)
+    known = hits[0][np.isfinite(hits[0]).all(axis=1)]
+    sheet, _ = Sheet.around(known, poses[0], round(_MARGIN_M / _GRID_M), _GRID_M)
     layers = []
     for image, pose in zip(patches.pair_images[number].tolist(), poses, strict=True):
         grey, seen = sheet.resample(View(read_grey(str(drive.images[image].path)), mount, pose))

@@ -10,11 +10,11 @@ import numpy as np
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.ground.adjust import adjust
 from v2hdm.ground.model import Mount
-from v2hdm.ground.motion import motion_of, spread_pairs, turning_pairs
+from v2hdm.ground.motion import changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import Matcher
 from v2hdm.ground.prior import Stated
 from v2hdm.ground.results import Reading
-from v2hdm.records import Drive, FloatArray, IntArray
+from v2hdm.records import Drive, IntArray
 
 _PAIRS, _GRID_M = 10, 0.06
 # Distance between the images of a pair that a start is found by: a wrong guess shifts the ground by a part
@@ -47,7 +47,10 @@ class Start:
 
 def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
     """The first of the guess and copies that look further up or down from which the ground matches."""
-    pairs = _short_pairs(stated.path_m())
+    path_m = stated.path_m()
+    pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
+    if len(pairs) < _PAIRS // 2:  # images are rarer: those next to each other
+        pairs = spread_pairs(path_m, _PAIRS, _SHORT_M[0], 2 * _SHORT_M[1])
     best = Start(None, 0.0, 0)
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
@@ -60,28 +63,18 @@ def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
     return best
 
 
-def _short_pairs(path_m: FloatArray) -> IntArray:
-    """Pairs of neighbouring images, or of those next to each other where images are rarer."""
-    pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
-    if len(pairs) < _PAIRS // 2:
-        pairs = spread_pairs(path_m, _PAIRS, _SHORT_M[0], 2 * _SHORT_M[1])
-    return pairs
-
-
 def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, guess: Mount) -> Start:
     surveyed = stated.with_surveyed_height()
-    share, sought = 0.0, 0
     for search_m in _SEARCH_M:
         matched = matcher.match(mount, stated.poses(), pairs, search_m, _GRID_M)
-        share, sought = matched.share, matched.sought
-        if len(matched.correlation) < _LEAST_MATCHES or share < _LEAST_SHARE:
-            return Start(None, share, sought)
+        if len(matched.correlation) < _LEAST_MATCHES or matched.share < _LEAST_SHARE:
+            return Start(None, matched.share, matched.sought)
         used, prior, _ = surveyed.prior_of(matched.observations)
         mount = adjust(used, prior, mount, tolerance=_TOLERANCE).mount
         away = guess.vehicle_from_cam_rotation.T @ mount.vehicle_from_cam_rotation
         if np.trace(away) < 1 + 2 * np.cos(np.deg2rad(_FARTHEST_DEG)):
-            return Start(None, 0.0, sought)
-    return Start(mount, share, sought)
+            return Start(None, 0.0, matched.sought)
+    return Start(mount, matched.share, matched.sought)
 
 
 @dataclass(frozen=True)
@@ -127,7 +120,7 @@ def _distinctive_pairs(drive: Drive, camera: str) -> IntArray:
     """Pairs between which the vehicle turns most along its path; evenly spread ones on a straight route."""
     motion = motion_of(drive, camera, Reading.HEADING_FROM_PATH)
     yaw = np.unwrap(heading_rad(motion.poses()))
-    pairs = turning_pairs(motion.path_at_images(), yaw, _PAIRS, *_APART_M)
+    pairs = changing_pairs(motion.path_at_images(), yaw[:, None], _PAIRS, *_APART_M)
     if len(pairs) and np.median(np.abs(yaw[pairs[:, 1]] - yaw[pairs[:, 0]])) > _TURN_RAD:
         return pairs
     return spread_pairs(motion.path_at_images(), _PAIRS, *_APART_M)

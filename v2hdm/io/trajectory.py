@@ -6,20 +6,19 @@ Trajectories are files in the format of the TUM RGB-D benchmark, ``timestamp tx 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion
+from v2hdm.geometry.rigid import make_transform, quaternion_from_rotation, rotation_from_quaternion
 from v2hdm.records import FloatArray, GeodeticOrigin, IntArray, Trajectory
 from v2hdm.store.files import read_text, replace_text
 
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
-_NORM_TOLERANCE = 1e-3  # files with four decimals pass, a forgotten component does not
 _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
 _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
 _LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
@@ -30,21 +29,27 @@ _ALIKE = 5.0  # poses and images of one drive last equally long to within this f
 _LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand years
 
 
-def pose_matrices(rotation: FloatArray, points: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    poses[:, :3, :3] = rotation
-    poses[:, :3, 3] = points
-    return poses
+def checked_rotations(
+    quaternion: FloatArray, place: Callable[[int], str], advice: str = "normalise it", tolerance: float = 1e-3
+) -> FloatArray:
+    """Rotations (N, 3, 3) of quaternions (N, 4), xyzw; DriveError at the ``place`` of one not of unit norm.
+
+    Files with four decimals pass the usual ``tolerance``, a forgotten component does not.
+    """
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    wrong = np.flatnonzero(np.abs(norm - 1) > tolerance)
+    if len(wrong):
+        k = int(wrong[0])
+        raise DriveError(f"{place(k)}: quaternion of norm {norm[k, 0]:.6g} instead of 1; {advice}")
+    return rotation_from_quaternion(quaternion / norm)
 
 
 def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, where: str) -> None:
     """Refuse poses off the earth, or far from the map's ``origin`` on it."""
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
-        raise DriveError(
-            f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend the poses"
-        )
+        problem = f"a position is {farthest_m:.3g} m from zero, off the earth"
+        raise DriveError(f"{where}: {problem}; mend the poses")
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
@@ -68,50 +73,37 @@ def check_geodetic(geodetic: FloatArray, where: str) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read the trajectory at ``path``: stamps in s, strictly rising, and poses ``map_from_vehicle`` in m."""
     rows: dict[int, list[float]] = {}
-    for number, line in _content_lines(path):
+    for number, line in _content_lines(path, "holds no pose", _COLUMNS):
         where, parts = f"{path}: line {number}", line.replace(",", " ").split()
         if len(parts) != 8:
             raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
         rows[number] = [_parse_float(part, where) for part in parts]
-    if not rows:
-        raise DriveError(f"{path}: holds no pose; expected lines '{_COLUMNS}'")
     numbers, table = list(rows), np.array(list(rows.values()))
     _check_rising(table[:, 0], numbers, path)
-    norm = np.linalg.norm(table[:, 4:], axis=1)
-    wrong = np.flatnonzero(np.abs(norm - 1.0) > _NORM_TOLERANCE)
-    if len(wrong):
-        raise DriveError(
-            f"{path}: line {numbers[wrong[0]]}: quaternion of norm {norm[wrong[0]]:.6g} instead of 1; "
-            f"normalise it, order qx qy qz qw"
-        )
-    return Trajectory(
-        table[:, 0], pose_matrices(rotation_from_quaternion(table[:, 4:] / norm[:, None]), table[:, 1:4])
-    )
+    advice = "normalise it, order qx qy qz qw"
+    rotation = checked_rotations(table[:, 4:], lambda k: f"{path}: line {numbers[k]}", advice)
+    return Trajectory(table[:, 0], make_transform(rotation, table[:, 1:4]))
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write ``trajectory`` to ``path`` with nanoseconds and nanometres, atomically."""
     poses = trajectory.map_from_vehicle
     quaternion = quaternion_from_rotation(poses[:, :3, :3])
-    lines = [f"# {_COLUMNS}"]
-    for stamp_s, position, xyzw in zip(trajectory.stamp_s, poses[:, :3, 3], quaternion, strict=True):
-        values = " ".join([*(f"{value:.9f}" for value in position), *(f"{value:.12f}" for value in xyzw)])
-        lines.append(f"{stamp_s:.9f} {values}")
-    replace_text(path, "\n".join(lines) + "\n")
+    rows = np.column_stack([trajectory.stamp_s, poses[:, :3, 3], quaternion])
+    form = " ".join(["{:.9f}"] * 4 + ["{:.12f}"] * 4)
+    replace_text(path, "\n".join([f"# {_COLUMNS}", *(form.format(*row) for row in rows.tolist())]) + "\n")
 
 
 def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
     """Read ``timestamp filename`` lines: stamps (N,) in s, strictly rising, and the file names."""
     stamps: dict[int, float] = {}
     names: list[str] = []
-    for number, line in _content_lines(path):
+    for number, line in _content_lines(path, "lists no image", "timestamp filename"):
         where, parts = f"{path}: line {number}", line.split(maxsplit=1)
         if len(parts) != 2:
             raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
         stamps[number] = _parse_float(parts[0], where)
         names.append(parts[1])
-    if not names:
-        raise DriveError(f"{path}: lists no image; expected lines 'timestamp filename'")
     stamp_s = np.array(list(stamps.values()))
     _check_rising(stamp_s, list(stamps), path)
     return stamp_s, names
@@ -123,11 +115,13 @@ def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> N
     replace_text(path, "\n".join(["# timestamp filename", *lines]) + "\n")
 
 
-def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
-    for number, raw in enumerate(read_text(path, DriveError).splitlines(), start=1):
-        line = raw.strip()
-        if line and not line.startswith("#"):
-            yield number, line
+def _content_lines(path: Path, problem: str, expected: str) -> list[tuple[int, str]]:
+    """The lines that are neither empty nor comments, with their numbers; none of them is a ``problem``."""
+    lines = ((k, line.strip()) for k, line in enumerate(read_text(path, DriveError).splitlines(), start=1))
+    content = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    if not content:
+        raise DriveError(f"{path}: {problem}; expected lines '{expected}'")
+    return content
 
 
 def _parse_float(text: str, where: str) -> float:
@@ -159,9 +153,8 @@ def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
     if not len(stamp_s):
         raise DriveError(f"{where}: holds no pose; record some, or check what it is")
     if not np.isfinite(stamp_s).all():
-        raise DriveError(
-            f"{where}: {what} {int(np.argmin(np.isfinite(stamp_s))) + 1}: its time is not finite"
-        )
+        row = int(np.argmin(np.isfinite(stamp_s))) + 1
+        raise DriveError(f"{where}: {what} {row}: its time is not finite")
     late_s = np.maximum.accumulate(stamp_s) - stamp_s
     if late_s.max() >= _LATE_S:
         k = int(np.argmax(late_s >= _LATE_S))
@@ -215,3 +208,8 @@ def unit_of(stamp_s: FloatArray) -> str | None:
         if _QUICKEST_S <= apart / scale <= 1.0 and stamp_s[-1] / scale < _LATEST_S:
             return unit
     return None
+
+
+def span(stamp_s: FloatArray) -> str:
+    """The first and the last of some stamps, s, in words."""
+    return f"{stamp_s[0]:.3f} to {stamp_s[-1]:.3f} s"

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import logging
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
@@ -22,9 +15,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.io.calibration import trusted_calibrations
-from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
 from v2hdm.records import (
@@ -37,8 +28,8 @@ from v2hdm.records import (
     IntArray,
     Trajectory,
 )
-from v2hdm.report.outputs import result_folder, write_json
-from v2hdm.settings import check_workers
+from v2hdm.report import style
+from v2hdm.report.outputs import write_json
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
 _START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
@@ -101,8 +92,7 @@ class Localised:
         for state in self.states:
             c, s = np.cos(state.mean[2]), np.sin(state.mean[2])
             turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-            variance = np.diag(turn @ state.covariance[:3, :3] @ turn.T)
-            out.append(np.sqrt(variance + self.shared))
+            out.append(np.sqrt(np.diag(turn @ state.covariance[:3, :3] @ turn.T) + self.shared))
         return np.stack(out)
 
     @property
@@ -129,27 +119,36 @@ class Localised:
 
 def localize(
     hd_map: HdMap,
-    drive: Drive,
+    drive: Drive | str | Path,
     calibrations: Mapping[str, Calibration],
     *,
     detections: Sequence[ImageDetections] | None = None,
-    workers: int = 1,
+    workers: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Localised:
-    """Follow the vehicle through a drive by the map's markings; of the recorded poses only the first is used.
+    """Follow the vehicle through a drive by a map's markings; only the first recorded pose is used.
 
     Args:
         hd_map: in the frame of the drive's poses.
-        drive: with the images.
-        calibrations: of the map's cameras, by name.
+        drive: the drive, or its folder.
+        calibrations: of its cameras, by name, as a result has them.
         detections: of the drive's images, made here if not given.
-        workers: processes that detect.
+        workers: processes that detect; 0 takes one per core.
         progress: called as ``progress(done, total)`` images.
+
+    Returns:
+        ``states`` at ``stamp_s`` (F,), ``error`` against the recorded poses and ``sigma`` (F, 3): ahead, m,
+        to the left, m, and heading, rad.
 
     Raises:
         MapFileError: map, calibrations and drive do not belong together.
         MappingError: the images hold no marking.
+
+    >>> found = localize(result.map, port, result.calibrations, detections=result.detections)
+    >>> found.error.shape == found.sigma.shape == (len(found.stamp_s), 3)
+    True
     """
+    drive, workers = as_drive(drive), workers or os.cpu_count() or 1
     check_together(hd_map, calibrations, drive)
     if detections is None:
         detections = detect_all(
@@ -196,11 +195,8 @@ def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive
 
 def _yaw_variance(calibrations: Mapping[str, Calibration]) -> float:
     """Variance, rad^2, of the cameras' common turn about the vertical: that of their mean."""
-    variances = []
-    for one in calibrations.values():
-        up = one.cam_from_vehicle[:3, 2]
-        variances.append(0.0 if one.covariance is None else float(up @ one.covariance[3:, 3:] @ up))
-    return float(np.mean(variances))
+    known = [(one.cam_from_vehicle[:3, 2], one.covariance) for one in calibrations.values()]
+    return float(np.mean([0.0 if c is None else float(up @ c[3:, 3:] @ up) for up, c in known]))
 
 
 def _seen(
@@ -211,16 +207,9 @@ def _seen(
     out = []
     for row in np.flatnonzero(sightings.frame == frame).tolist():
         camera = names[sightings.camera[row]]
-        out.append(
-            Seen(
-                sightings.kinds[sightings.kind[row]],
-                drive.cameras[camera].info.intrinsic,
-                calibrations[camera].cam_from_vehicle,
-                sightings.corners_pinhole_px[row],
-                sightings.covariance_px[row],
-                informs[row],
-            )
-        )
+        kind, corners_px = sightings.kinds[sightings.kind[row]], sightings.corners_pinhole_px[row]
+        pose = (drive.cameras[camera].info.intrinsic, calibrations[camera].cam_from_vehicle)
+        out.append(Seen(kind, *pose, corners_px, sightings.covariance_px[row], informs[row]))
     return out
 
 
@@ -241,38 +230,6 @@ def _in_view(
         near = inside.all(axis=1) & (depth_m > 0) & (depth_m < _IN_VIEW_M)
         out[times[image.taken_s]] |= bool(near.reshape(-1, 4).all(axis=1).any())
     return out
-
-
-def localise_drive(parsed: argparse.Namespace) -> bool:
-    """Localise a drive in a map, print the figures and write them with poses and picture.
-
-    Args:
-        parsed: the arguments of :mod:`v2hdm.cli.localize`.
-
-    Returns:
-        Whether the map explains the drive.
-
-    Raises:
-        V2hdmError: map, calibrations or drive cannot be read or do not belong together.
-    """
-    check_workers(parsed.workers)
-    logging.basicConfig(format="%(message)s")
-    cv2.setNumThreads(1)
-    hd_map = read_geojson(parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map)
-    calibrations = trusted_calibrations(parsed.map if parsed.map.is_dir() else parsed.map.parent)
-    drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
-    check_together(hd_map, calibrations, drive)
-    folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
-    with result_folder(folder, "--output") as unfinished:
-        workers = parsed.workers or os.cpu_count() or 1
-        found = localize(hd_map, drive, calibrations, workers=workers, progress=_report_progress)
-        settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_localised(found, drive, unfinished)
-    for line in summary_lines(found):
-        print(line)
-    print(f"results in {folder}")
-    return found.explained
 
 
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
@@ -301,33 +258,26 @@ def summary_lines(found: Localised) -> list[str]:
     return lines
 
 
-def _report_progress(done: int, total: int) -> None:
-    if done == total or done % 50 == 0:
-        print(f"looked at {done} of {total} images", file=sys.stderr, flush=True)
-
-
 def save_errors(path: Path, found: Localised, sigma: FloatArray) -> None:
     """Draw the errors beside the recorded poses as PNG.
 
     Bands are two standard deviations (F, 3) of estimate and recorded pose together; frames in which the
     vehicle does not know where it is are crosses.
     """
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
-    axes = figure.subplots(3, 1, sharex=True)
-    for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
-        band = 2 * factor * sigma[:, k]
-        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
-        axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
-        if not known.all():
-            axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
-        limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
-        limit = max(limit, 2 * float(np.median(band)))
-        axis.set_ylim(-limit, limit)
-        axis.set_ylabel(f"{name}, {unit}")
-        axis.grid(alpha=0.3)
-    axes[0].legend(loc="upper right", ncols=3, fontsize=8)
-    axes[0].set_title("Localised by the map's markings, less the recorded pose")
-    axes[-1].set_xlabel("time, s")
-    figure.savefig(path, dpi=110)
+    with style.figure(path, 9, 6) as figure:
+        axes = figure.subplots(3, 1, sharex=True)
+        for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
+            band = 2 * factor * sigma[:, k]
+            axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
+            axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
+            if not known.all():
+                axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+            limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
+            limit = max(limit, 2 * float(np.median(band)))
+            axis.set_ylim(-limit, limit)
+            axis.set_ylabel(f"{name}, {unit}")
+            axis.grid(alpha=0.3)
+        axes[0].legend(loc="upper right", ncols=3, fontsize=8)
+        axes[0].set_title("Localised by the map's markings, less the recorded pose")
+        axes[-1].set_xlabel("time, s")

@@ -128,24 +128,25 @@ class Bundle:
 
 
 def full_model(
-    pose_noise: Sequence[PoseNoise], options: MappingOptions, poses: str, variance_factor: float = 1.0
+    pose_sigma: Sequence[PoseSigma], options: MappingOptions, poses: str, variance_factor: float = 1.0
 ) -> Model:
     """Every frame deviates from its recorded pose by the states of the pose model ``poses``."""
     solver = with_model(replace(_solver(options), coarse=False), MODELS[poses])
-    sigma = tuple(
-        PoseSigma(
-            position_m=one.position_m,
-            heading_rad=one.heading_rad,
-            roll_pitch_rad=one.roll_pitch_rad,
-            height_m=HEAVE_SIGMA_M,
-            position_drift=Drift(one.position_drift_m, one.position_drift_over_m),
-            heading_drift=Drift(one.heading_drift_rad, one.heading_drift_over_m),
-            roll_pitch_drift=Drift(one.roll_pitch_drift_rad, one.roll_pitch_drift_over_m),
-        )
-        for one in pose_noise
-    )
     sizes, survey = options.known_sizes, options.survey
-    return Model(sigma, options.model_floor_px, solver, variance_factor, sizes, survey)
+    return Model(tuple(pose_sigma), options.model_floor_px, solver, variance_factor, sizes, survey)
+
+
+def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
+    """How far a drive's recorded poses are off, the heave of its vehicle included."""
+    return PoseSigma(
+        position_m=pose_noise.position_m,
+        heading_rad=pose_noise.heading_rad,
+        roll_pitch_rad=pose_noise.roll_pitch_rad,
+        height_m=HEAVE_SIGMA_M,
+        position_drift=Drift(pose_noise.position_drift_m, pose_noise.position_drift_over_m),
+        heading_drift=Drift(pose_noise.heading_drift_rad, pose_noise.heading_drift_over_m),
+        roll_pitch_drift=Drift(pose_noise.roll_pitch_drift_rad, pose_noise.roll_pitch_drift_over_m),
+    )
 
 
 def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from v2hdm.adjust import Status, select_model
+from v2hdm.adjust import PoseSigma, Status, estimate_noise, select_model, solve
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -29,6 +29,7 @@ from v2hdm.mapping.bundle import (
     Bundle,
     coarse_model,
     full_model,
+    pose_sigma_of,
     solve_bundle,
 )
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
@@ -69,6 +70,7 @@ class Optimiser:
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)
+        self._pose_sigma = self._own_noise = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._options = options
         self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
@@ -99,7 +101,8 @@ class Optimiser:
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
-        return bundle
+        progress("noise of the poses")
+        return self._weigh_poses(bundle)
 
     def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
@@ -119,7 +122,7 @@ class Optimiser:
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
-        model = full_model(self._noise_of_visits, self._options, "clock", bundle.model.variance_factor)
+        model = full_model(self._pose_sigma, self._options, "clock", bundle.model.variance_factor)
         model = replace(model, clock_sigma_s=_LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
@@ -161,7 +164,7 @@ class Optimiser:
         self.growth = tuple(mapper.growth)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
         self._reweigh(bundle)
-        return bundle
+        return self._weigh_poses(bundle)
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which observations are used."""
@@ -215,13 +218,39 @@ class Optimiser:
         model = (
             coarse_model(rig, noises, options)
             if coarse
-            else full_model(noises, options, self.pose_model, self._variance_factor)
+            else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
         bundle = solve_bundle(self._sightings, association, usable, rig, self._cameras, model)
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
+
+    def _weigh_poses(self, bundle: Bundle) -> Bundle:
+        """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
+
+        The positions' stays as stated: images do not see what moves the vehicle and its map alike.
+        """
+        stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
+        self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
+        self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
+        bundle = self._solve(bundle.association, self._usable(bundle.association, bundle.rig), bundle.rig)
+        self._reweigh(bundle)
+        return bundle
+
+    @property
+    def pose_noise(self) -> dict[str, float]:
+        """How many times as large as stated the drive shows the noise of the poses to be, by kind."""
+        own = [self._own_noise, [pose_sigma_of(one) for one in self._noise_of_visits]]
+        kinds = ("position_m", "heading_rad", "roll_pitch_rad")
+        totals = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in own] for kind in kinds}
+        return {kind: found / stated for kind, (found, stated) in totals.items() if stated > 0}
+
+    def under_own_noise(self, bundle: Bundle) -> Bundle:
+        """``bundle`` solved under all noise of the poses that the drive shows, for tests of its inputs."""
+        start = bundle.solution.cam_from_vehicle
+        problem = replace(bundle.problem, pose_sigma=self._own_noise, cam_from_vehicle=start)
+        return replace(bundle, problem=problem, solution=solve(problem, bundle.model.solver))
 
     def _reweigh(self, bundle: Bundle) -> None:
         """Scale the observations' variances as their residuals under ``bundle`` say."""
@@ -240,6 +269,17 @@ class Optimiser:
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
+
+
+def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
+    """``stated``, with the noise of height, attitude or heading that a drive shows where that is larger."""
+    kinds = {
+        "height_m": ("height_m",),
+        "roll_pitch_rad": ("roll_pitch_rad", "roll_pitch_drift"),
+        "heading_rad": ("heading_rad", "heading_drift"),
+    }
+    larger = [names for kind, names in kinds.items() if getattr(own, kind) > getattr(stated, kind)]
+    return replace(stated, **{name: getattr(own, name) for names in larger for name in names})
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from v2hdm.adjust import Fault
+from v2hdm.adjust import Fault, sigmas_of
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 from v2hdm.site.candidates import Exclusion
@@ -28,8 +28,7 @@ class Contradiction:
 
     ``fault`` of ``cameras``, along ``axis`` 0 to 2 of the vehicle (survey, lever) or the map (slope, datum),
     ``about`` the class of a known size and its length, a surveyed point, or the visit of a clock. ``value``
-    is true minus stated, in s, m, rad or a share, with the ``sigma`` of this drive, inf where it is
-    unobservable; ``sigmas`` is the value in sigmas, by its chi-square.
+    is true minus stated, in s, m, rad or a share; the rest is as in :class:`v2hdm.adjust.ScoreTest`.
     """
 
     fault: Fault
@@ -38,7 +37,14 @@ class Contradiction:
     about: str
     value: float
     sigma: float
-    sigmas: float
+    p_value: float
+    gain: float
+    image_share: float
+
+    @property
+    def sigmas(self) -> float:
+        """The standard deviations at which a normal distribution has this p-value."""
+        return sigmas_of(self.p_value)
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class SolveEvidence:
         variance_factor: as in :class:`CameraFit`, of all cameras.
         along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
         window_s: (W,) when each window begins, s.
-        pose_innovations: RMS normalised innovation by state of a pose; at most 1 for right sigmas.
+        pose_noise: how many times as large as stated the drive shows the noise of the poses to be, by kind.
         worst_innovation: the largest of them all, in sigmas.
         worst_innovation_s: when, s.
         clock_s: by visit and camera the estimated clock offset and sigma, where the pose model has one.
@@ -83,7 +89,7 @@ class SolveEvidence:
     variance_factor: float
     along_route: FloatArray
     window_s: FloatArray
-    pose_innovations: Mapping[str, float]
+    pose_noise: Mapping[str, float]
     worst_innovation: float
     worst_innovation_s: float
     clock_s: Sequence[Mapping[str, tuple[float, float]]] = ({},)

@@ -13,7 +13,7 @@ evaluates them at Chebyshev nodes, the polynomial through these gives them at ev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,6 +30,7 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry import tensors
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.shots import Canvas, Lens, Shot
+from v2hdm.progress import Steps
 from v2hdm.records import FloatArray
 
 TILES_PX = (128, 64, 32, 16)
@@ -74,16 +75,11 @@ def blend(
     shots: Sequence[Shot],
     lenses: Mapping[str, Lens],
     device: str = "cpu",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
 ) -> Iterator[Sheet]:
     """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
 
-    Args:
-        canvas: what to fill.
-        shots: images in driving order.
-        lenses: their cameras.
-        device: of torch.
-        progress: called as ``progress(done, total)``, in images put onto sheets.
+    ``shots`` are in driving order; ``progress`` counts images put onto sheets.
 
     Raises:
         DriveError: an image is missing, damaged or of the wrong size.
@@ -92,7 +88,7 @@ def blend(
     plan = _plan(canvas, shots, lenses, tiling.side_px)
     full_weight = _full_weight(canvas, shots, lenses)
     order = [index for _, views in plan for index, _ in views]
-    sources = _Sources(shots, lenses, device).of(order)
+    sources = _sources(shots, lenses, device, order)
     done = 0
     for (row, column), views in plan:
         rows, columns = min(SHEET_PX, canvas.rows - row), min(SHEET_PX, canvas.columns - column)
@@ -166,41 +162,37 @@ class _Source:
     lens: Lens
 
 
-class _Sources:
-    """The images of shots, in any order; the next is decoded meanwhile, the last used stay decoded."""
+def _sources(
+    shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str, order: Sequence[int]
+) -> Iterator[_Source]:
+    """The images of shots in some order; the next is decoded meanwhile, the last used stay decoded."""
+    boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
+    trusts = {
+        name: torch.from_numpy(lenses[name].trust[box].copy()).to(device) for name, box in boxes.items()
+    }
 
-    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str):
-        self._shots, self._lenses, self._device = shots, lenses, device
-        self._boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
-        self._trust = {
-            name: torch.from_numpy(lens.trust[self._boxes[name]].copy()).to(device)
-            for name, lens in lenses.items()
-        }
-        self._decoded = lru_cache(maxsize=_KEPT_IMAGES)(self._decode)
-
-    def of(self, order: Sequence[int]) -> Iterator[_Source]:
-        """The images of these indices of shots."""
-        shots = [self._shots[index] for index in order]
-        with ThreadPoolExecutor(1) as decoder:
-            ahead = [decoder.submit(self._decoded, shot.path, shot.camera) for shot in shots[:1]]
-            for shot, following in zip(shots, [*shots[1:], None], strict=True):
-                pixels = ahead.pop().result()
-                if following is not None:
-                    ahead.append(decoder.submit(self._decoded, following.path, following.camera))
-                box, trust = self._boxes[shot.camera], self._trust[shot.camera]
-                values = torch.empty((4, *trust.shape), dtype=torch.float32, device=self._device)
-                values[:3] = torch.from_numpy(pixels).to(self._device).permute(2, 0, 1)
-                values[3] = trust
-                yield _Source(values, (box[1].start, box[0].start), self._lenses[shot.camera])
-
-    def _decode(self, path: Path, camera: str) -> np.ndarray:
-        pixels, lens = read_bgr(path), self._lenses[camera]
+    @lru_cache(maxsize=_KEPT_IMAGES)
+    def decoded(path: Path, camera: str) -> np.ndarray:
+        pixels, lens = read_bgr(path), lenses[camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
                 f"{path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {camera!r} has "
                 f"{lens.info.width}x{lens.info.height}; mend its camera_info or images"
             )
-        return pixels[self._boxes[camera]].copy()
+        return pixels[boxes[camera]].copy()
+
+    wanted = [shots[index] for index in order]
+    with ThreadPoolExecutor(1) as decoder:
+        ahead = [decoder.submit(decoded, shot.path, shot.camera) for shot in wanted[:1]]
+        for shot, following in zip(wanted, [*wanted[1:], None], strict=True):
+            pixels = ahead.pop().result()
+            if following is not None:
+                ahead.append(decoder.submit(decoded, following.path, following.camera))
+            box, trust = boxes[shot.camera], trusts[shot.camera]
+            values = torch.empty((4, *trust.shape), dtype=torch.float32, device=device)
+            values[:3] = torch.from_numpy(pixels).to(device).permute(2, 0, 1)
+            values[3] = trust
+            yield _Source(values, (box[1].start, box[0].start), lenses[shot.camera])
 
 
 class Tiling:
@@ -316,8 +308,6 @@ class _Sums:
 
 def _box(trust: np.ndarray) -> tuple[slice, slice]:
     """The rows and columns that are trusted at all, and one around them."""
-    rows, columns = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2),
-        slice(max(int(columns[0]) - 1, 0), int(columns[-1]) + 2),
-    )
+    trusted = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(max(int(one[0]) - 1, 0), int(one[-1]) + 2) for one in trusted)
+    return rows, columns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,6 @@ from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.extras import need
-from v2hdm.io.calibration import read_calibration
 from v2hdm.io.maps import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
@@ -31,9 +30,10 @@ from v2hdm.mosaic.sharpness import (
 )
 from v2hdm.mosaic.shots import Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
 from v2hdm.progress import Steps
-from v2hdm.records import Calibration, Drive, FloatArray, GeodeticOrigin
+from v2hdm.records import Drive, GeodeticOrigin
 from v2hdm.report.outputs import write_json
-from v2hdm.store.files import load_yaml, take_number, whole_file
+from v2hdm.report.page.facts import read_cameras
+from v2hdm.store.files import whole_file
 
 LARGEST_PICTURE_PX = 8192
 """Limit of either side of the picture, which graphics cards of computers and phones alike can draw."""
@@ -71,23 +71,9 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
     )
 
 
-class GeoTiff:
-    """A GeoTIFF that takes sheets one by one."""
-
-    def __init__(self, dataset: Any, rasterio: Any):
-        self._dataset, self._rasterio = dataset, rasterio
-
-    def put(self, sheet: Sheet) -> None:
-        """Write one sheet."""
-        rows, columns = sheet.rgba.shape[:2]
-        window = self._rasterio.windows.Window(sheet.column, sheet.row, columns, rows)
-        self._dataset.write(np.moveaxis(sheet.rgba[..., :3], 2, 0), window=window)
-        self._dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
-
-
 @contextmanager
-def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[GeoTiff]:
-    """A GeoTIFF of a canvas, tiled, JPEG within, with overviews and a mask; whole or not at all.
+def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
+    """What puts sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
 
     Raises:
         ConfigError: rasterio is not installed.
@@ -107,7 +93,14 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
         rasterio.MemoryFile(ext=".tif") as memory,
     ):
         with memory.open(**profile) as dataset:
-            yield GeoTiff(dataset, rasterio)
+
+            def put(sheet: Sheet) -> None:
+                rows, columns = sheet.rgba.shape[:2]
+                window = rasterio.windows.Window(sheet.column, sheet.row, columns, rows)
+                dataset.write(np.moveaxis(sheet.rgba[..., :3], 2, 0), window=window)
+                dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
+
+            yield put
         with rasterio.open(memory.name, "r+") as dataset:
             dataset.build_overviews(_OVERVIEWS, rasterio.enums.Resampling.average)
         memory.seek(0)
@@ -131,11 +124,8 @@ class Picture:
         rows, columns = (side // self.factor for side in sheet.rgba.shape[:2])
         row, column = sheet.row // self.factor, sheet.column // self.factor
         alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
-        reduced = cv2.resize(
-            np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2),
-            (columns, rows),
-            interpolation=cv2.INTER_AREA,
-        )
+        weighed = np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2)
+        reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
         seen = reduced[..., 3:]
         colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
         self._rgba[row : row + rows, column : column + columns] = np.round(
@@ -177,12 +167,8 @@ def write_mosaic(
 ) -> dict[str, Any]:
     """Write the mosaic of a run's ground into its folder; returns what stands in ``mosaic.json``.
 
-    Args:
-        folder: of the run: its map, calibrations and adjusted trajectory.
-        drive: what the run has mapped.
-        resolution_m: side of a pixel on the ground.
-        device: of torch.
-        progress: called as ``progress(done, total)``, in images put onto the ground.
+    ``folder`` holds the run's map, calibrations and adjusted trajectory, ``drive`` is what it has mapped.
+    ``resolution_m`` is the side of a pixel on the ground; ``progress`` counts images put onto the ground.
 
     Raises:
         MapFileError: the folder is no result, or not one of this drive.
@@ -204,51 +190,54 @@ def write_mosaic(
     picture = Picture(ground.canvas)
     with ExitStack() as stack:
         try:
-            tiff = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
+            put = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
         except ConfigError as missing:
             _log.warning("no GeoTIFF is written: %s", missing)
-            tiff = None
+            put = None
         for sheet in blend(ground.canvas, ground.after, ground.lenses, device, _half(progress, 0)):
-            if tiff is not None:
-                tiff.put(sheet)
+            if put is not None:
+                put(sheet)
             picture.put(sheet)
             measure("after", sheet)
     for sheet in blend(ground.canvas, ground.before, ground.lenses, device, _half(progress, 1)):
         measure("before", sheet)
     picture.write(folder / PICTURE)
-    sharpness = _sharpness(*edge_widths_m([edges["before"], edges["after"]]))
+    before_m, after_m = edge_widths_m([edges["before"], edges["after"]])
+    sharpness: dict[str, float | int] = {"edges": len(after_m)}
+    if len(after_m):
+        before, after = float(np.median(before_m)), float(np.median(after_m))
+        sharpness |= {"edge_width_before_m": before, "edge_width_after_m": after}
+        sharpness["after_over_before"] = before / after
     content = {
         "image": PICTURE,
         "bounds_m": ground.canvas.bounds_m,
         "resolution_m": picture.resolution_m,
-        "geotiff": None if tiff is None else TIFF,
+        "geotiff": None if put is None else TIFF,
         "geotiff_resolution_m": resolution_m,
         "crs": crs_of(drive.origin),
         "sharpness": sharpness,
     }
-    _compare(
-        folder / COMPARISON, ground, richest_place(drive, sides, edges["after"].contrast), sharpness, device
-    )
+    panels = []
+    for when, title, shots in (
+        ("before", "before: initial calibration, recorded poses", ground.before),
+        ("after", "after: optimised calibration, adjusted poses", ground.after),
+    ):
+        width = sharpness.get(f"edge_width_{when}_m")
+        caption = "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)"
+        panels.append(Panel(title, caption, shots))
+    pose = richest_place(drive, sides, edges["after"].contrast)
+    save_comparison(folder / COMPARISON, pose, panels, ground.lenses, device)
     write_json(folder / EXTENT, content)
     return content
 
 
-def _sharpness(before_m: FloatArray, after_m: FloatArray) -> dict[str, float | int]:
-    """The median width, m, of paint edges before and after, and how many times the one is the other."""
-    if not len(after_m):
-        return {"edges": 0}
-    widths = float(np.median(before_m)), float(np.median(after_m))
-    return {
-        "edges": len(after_m),
-        "edge_width_before_m": widths[0],
-        "edge_width_after_m": widths[1],
-        "after_over_before": widths[0] / widths[1],
-    }
-
-
 def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     """The ground that a run's images show, and the canvas around it; errors as :func:`write_mosaic`."""
-    calibrations, clock_s = _calibrations(folder)
+    cameras = read_cameras(folder)
+    if not cameras:
+        raise MapFileError(f"{folder}: no calibration_*.yaml in it; give the result folder of v2hdm map")
+    calibrations = {name: one.calibration for name, one in cameras.items()}
+    clock_s = {name: one.clock_offset_s or 0.0 for name, one in cameras.items()}
     missing = [name for name in drive.cameras if name not in calibrations]
     if len(missing) == len(drive.cameras):
         raise MapFileError(
@@ -276,35 +265,6 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     if not np.isfinite(seen).all():
         raise DriveError(f"drive {drive.name}: an ROI reaches the horizon; draw it nearer to the camera")
     return Ground(lenses, after, before, Canvas.around(seen, resolution_m, MULTIPLE_PX))
-
-
-def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float]]:
-    """By camera its calibration, and how much later than stamped its images were taken, s."""
-    files = sorted(folder.glob("calibration_*.yaml"))
-    if not files:
-        raise MapFileError(f"{folder}: no calibration_*.yaml in it; give the result folder of v2hdm map")
-    calibrations, clock_s = {}, {}
-    for file in files:
-        calibration = read_calibration(file)
-        calibrations[calibration.info.name] = calibration
-        clock_s[calibration.info.name] = take_number(
-            load_yaml(file, MapFileError).get("clock_offset_s", 0.0), f"{file}: clock_offset_s", MapFileError
-        )
-    return calibrations, clock_s
-
-
-def _compare(
-    path: Path, ground: Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
-) -> None:
-    panels = []
-    for when, title, shots in (
-        ("before", "before: initial calibration, recorded poses", ground.before),
-        ("after", "after: optimised calibration, adjusted poses", ground.after),
-    ):
-        width = sharpness.get(f"edge_width_{when}_m")
-        caption = "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)"
-        panels.append(Panel(title, caption, shots))
-    save_comparison(path, pose, panels, ground.lenses, device)
 
 
 def _half(progress: Steps | None, number: int) -> Steps | None:

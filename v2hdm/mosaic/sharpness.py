@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
 
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.blend import whole
@@ -161,34 +160,23 @@ def save_comparison(
     """Draw the ground about a pose (4, 4) as several sets of shots show it, side by side, as PNG."""
     canvas = close_up_canvas(map_from_vehicle)
     pictures = [whole(canvas, panel.shots, lenses, device) for panel in panels]
-    levels = _levels(pictures[-1])
+    last = pictures[-1]
+    grey = cv2.cvtColor(np.ascontiguousarray(last[..., :3]), cv2.COLOR_RGB2GRAY)[last[..., 3] > 0]
+    low, high = np.percentile(grey, (0.2, 99.8)) if grey.size else (0.0, 255.0)
     height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.8
     with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
         every = np.atleast_1d(fig.subplots(1, len(panels)))
         for axes, panel, rgba in zip(every, panels, pictures, strict=True):
-            shown = _brightened(rgba, levels)
+            shown = _brightened(rgba, low, max(high, low + 1))
             axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
             axes.set(title=panel.title, xlabel=panel.caption, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
-            _scale_bar(axes)
+            axes.plot([0.4, 0.4 + _BAR_M], [0.4, 0.4], color="white", lw=3, solid_capstyle="butt")
+            axes.text(0.4 + _BAR_M / 2, 0.52, f"{_BAR_M:g} m", color="white", ha="center", va="bottom")
 
 
-def _scale_bar(axes: Axes) -> None:
-    left, low = 0.4, 0.4
-    axes.plot([left, left + _BAR_M], [low, low], color="white", lw=3, solid_capstyle="butt")
-    axes.text(left + _BAR_M / 2, low + 0.12, f"{_BAR_M:g} m", color="white", ha="center", va="bottom")
-
-
-def _levels(rgba: np.ndarray) -> tuple[float, float]:
-    """Grey values of the darkest and the brightest ground."""
-    grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY)[rgba[..., 3] > 0]
-    low, high = np.percentile(grey, (0.2, 99.8)) if grey.size else (0.0, 255.0)
-    return float(low), float(max(high, low + 1))
-
-
-def _brightened(rgba: np.ndarray, levels: tuple[float, float]) -> np.ndarray:
+def _brightened(rgba: np.ndarray, low: float, high: float) -> np.ndarray:
     """The picture with its levels stretched; white where nothing was seen."""
-    low, high = levels
     stretched = np.clip((rgba[..., :3].astype(np.float32) - 0.5 * low) / (high - 0.5 * low), 0, 1)
     seen = rgba[..., 3:].astype(np.float32) / 255
     return np.asarray(1 - seen * (1 - stretched))

@@ -155,11 +155,8 @@ def adjusted_shots(
 ) -> list[Shot]:
     """The images of calibrated cameras under adjusted extrinsics and poses.
 
-    Args:
-        drive: the images; where its road was not flat, its poses have been laid flat.
-        calibrations: by camera.
-        clock_s: by camera, how much later than stamped its images were taken.
-        adjusted: the poses that a run has written, in the frame of the recorded ones.
+    ``clock_s`` is by camera how much later than stamped its images were taken. ``adjusted`` is in the frame
+    of the recorded poses; where the drive's road was not flat, its own have been laid flat.
     """
     images = [image for image in drive.images if image.camera in calibrations]
     taken_s = np.array([image.stamp_s + clock_s[image.camera] for image in images])

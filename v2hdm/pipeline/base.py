@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,7 @@ from scipy.spatial import cKDTree
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.maps import (
-    geojson_feature,
-    geojson_positions,
-    read_geojson,
-    read_verdict,
-    write_features,
-)
+from v2hdm.io.maps import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
@@ -41,8 +35,8 @@ LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)
 def read_base(path: Path) -> Base:
     """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
 
-    Raises:
-        MapFileError: It is missing, damaged, of an older version or another method, or its verdict is FAIL.
+    Raises MapFileError where it is missing, damaged, of an older version or another method, or its verdict is
+    FAIL.
     """
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
@@ -59,15 +53,12 @@ def read_base(path: Path) -> Base:
             f"map.base: {path}: does not say how sure its markings are, as maps of older versions and "
             "naive methods; map its drive anew"
         )
-    return Base(hd_map, _poses(trajectories), _left_out(excluded))
+    poses = [lay_flat(read_tum(one), _POSITION_SIGMA_M).trajectory.map_from_vehicle for one in trajectories]
+    return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), _left_out(excluded))
 
 
 def check_together(base: Base, drive: Drive, path: str) -> None:
-    """Refuse a map that is not of the drive's frame or site.
-
-    Raises:
-        MapFileError: The message names both.
-    """
+    """Raise MapFileError, which names both, for a map that is not of the drive's frame or site."""
     if base.hd_map.origin != drive.origin:
         raise MapFileError(
             f"map.base: the origin of {path} is {base.hd_map.origin} and that of drive {drive.name} "
@@ -90,15 +81,6 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
         return np.asarray(read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32))
 
     return grey
-
-
-def _poses(paths: Sequence[Path]) -> FloatArray:
-    """The vehicle's poses (F, 4, 4) at the images of an earlier map, its road laid flat."""
-    poses = [np.zeros((0, 4, 4))]
-    for path in paths:
-        trajectory = read_tum(path)
-        poses.append(lay_flat(trajectory, _POSITION_SIGMA_M).trajectory.map_from_vehicle)
-    return np.concatenate(poses)
 
 
 def _left_out(path: Path) -> tuple[tuple[str, FloatArray, int], ...]:
@@ -126,22 +108,9 @@ def changes_json(changes: Changes) -> dict[str, Any]:
 
 
 def _as_json(one: Change) -> dict[str, Any]:
-    def plain(values: FloatArray | None) -> list[Any] | None:
-        return None if values is None else values.tolist()
-
-    return {
-        "id": one.id,
-        "class": one.kind,
-        "fate": one.fate.value,
-        "before_map": plain(one.before),
-        "after_map": plain(one.after),
-        "shift_m": plain(one.shift_m),
-        "shift_sigma_m": plain(one.shift_sigma_m),
-        "probability": one.probability,
-        "views": one.views,
-        "found": one.found,
-        "sightings": one.sightings,
-    }
+    names = {"kind": "class", "before": "before_map", "after": "after_map"}
+    plain = {names.get(name, name): value for name, value in vars(one).items()} | {"fate": one.fate.value}
+    return {name: value.tolist() if hasattr(value, "tolist") else value for name, value in plain.items()}
 
 
 def write_changes(changes: Changes, hd_map: HdMap, folder: Path, route_map: FloatArray) -> None:

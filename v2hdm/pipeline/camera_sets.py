@@ -53,31 +53,21 @@ def map_camera_sets(
 ) -> dict[str, MappedSet]:
     """Map a drive with each set of cameras, where that is not known yet.
 
-    Args:
-        drive: what to map.
-        drive_key: of the drive and of what its images show.
-        detections: what was found in its images.
-        survey: control points for the mapping; check points, held against the finished map of all cameras.
-        base: an earlier map that is brought up to date with all cameras.
-        context: keeps the results, shows them, and maps the sets and what belongs to one visit of several.
-
-    Raises:
-        MappingError: no map can be made.
-        AdjustError: the adjustment fails.
+    ``drive_key`` is that of the drive and of what its images show. The check points of the survey are held
+    against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
+    no map can be made, AdjustError where the adjustment fails.
     """
-    sets, cache, executor = camera_sets(drive), context.cache, context.executor or IN_PROCESS
+    sets, cache, executor = camera_sets(drive), context.cache, context.executor
     begun = cache.key(drive_key, list(detections), survey.mapping)
+    # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
+    elsewhere = executor if len(sets) > 1 and survey.mapping.device == "cpu" else IN_PROCESS
     jobs = []
-    for number, (name, cameras) in enumerate(sets.items()):
-        last = number == len(sets) - 1
-        of_last = (base, survey.check) if last else None
-        work = partial(
-            _map_set, drive, detections, name, cameras, survey, base if last else None, last, executor
-        )
-        # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
-        shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
-        begin = partial(executor.begin if shared_out else IN_PROCESS.begin, work)
-        jobs.append((cache.key(begun, name, cameras, of_last), begin))
+    for name, cameras in sets.items():
+        last = name == list(sets)[-1]
+        now = base if last else None
+        work = partial(_map_set, drive, detections, name, cameras, survey, now, last, executor)
+        key = cache.key(begun, name, cameras, (base, survey.check) if last else None)
+        jobs.append((key, partial(elsewhere.begin, work)))
     context.progress("map", 0, len(sets))
     found = {}
     for name, mapped in zip(sets, cache.get_or_make_each(STAGE, MappedSet, jobs), strict=True):

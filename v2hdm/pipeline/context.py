@@ -12,13 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.progress import Progress, Steps, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
 
 if TYPE_CHECKING:  # loads torch, which a finished run does without
     from v2hdm.detection.batch import Detect
-    from v2hdm.executor import Executor
     from v2hdm.mapping.results import MethodResult
 
 _log = logging.getLogger(__name__)
@@ -43,17 +43,10 @@ class Viewer(Protocol):
 class Unwatched:
     """A :class:`Viewer` that shows nothing."""
 
-    def begun(self, folder: Path, drive: Drive) -> None:
+    def begun(self, *_: object) -> None:
         """Nothing."""
 
-    def detected(self, detections: Sequence[ImageDetections]) -> None:
-        """Nothing."""
-
-    def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
+    detected = mapped = close = begun
 
 
 @dataclass(frozen=True)
@@ -65,7 +58,7 @@ class Context:
         progress: shows how far the long steps are.
         viewer: is shown images, detections and maps as they come.
         detect: detects in images; None does so in processes of this machine.
-        executor: works on what can be parted of a run; None for this process.
+        executor: works on what can be parted of a run.
         workers: processes; 0 takes one per core.
         folder: takes what the viewer keeps of the run.
         seconds: how long each step took, s.
@@ -75,15 +68,10 @@ class Context:
     progress: Progress = silent
     viewer: Viewer = field(default_factory=Unwatched)
     detect: Detect | None = None
-    executor: Executor | None = None
+    executor: Executor = IN_PROCESS
     workers: int = 0
     folder: Path = Path()
     seconds: dict[str, float] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, cache: str | Path | None, progress: Progress = silent, workers: int = 0) -> Context:
-        """The surroundings of a call from Python; without a ``cache`` folder nothing is kept."""
-        return cls(StageCache(None if cache is None else Path(cache)), progress, workers=workers)
 
     @property
     def processes(self) -> int:

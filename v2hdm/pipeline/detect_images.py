@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, read_drive
-from v2hdm.records import CameraInfo, Drive
+from v2hdm.records import CameraInfo
 from v2hdm.store.inputs import note_input
 
 ROUGH_MOUNTING = (1.6, 5.0, 60.0)
@@ -40,25 +41,12 @@ _Frames = Iterator[tuple[Frame, RoadDetector | None]]
 """Frames to look at, and the detector for each as far as it is known before the first."""
 
 
-@dataclass(frozen=True)
-class Detected:
+class Detected(NamedTuple):
     """One image and what it shows: the frame, the camera's name, and markings and lanes on the road."""
 
     frame: Frame
     camera: str
     road: Road
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """A source, what is known of its camera, and how many of its images are wanted."""
-
-    source: str
-    camera: Path | None
-    camera_name: str | None
-    mounting: Sequence[float] | None
-    linear: bool
-    limit: int | None
 
 
 def detect_images(
@@ -97,81 +85,112 @@ def detect_images(
     >>> found.camera, found.frame.pixels.shape
     ('front', (360, 640, 3))
     """
-    named = None if camera is None else Path(camera)
-    asked = _Asked(
-        source=str(source),
-        camera=named,
-        camera_name=camera_name,
-        mounting=mounting,
-        linear=linear,
-        limit=limit,
-    )
-    lens = _lens(asked)
+    path = None if camera is None else Path(camera)
+    lens = _lens(path, camera_name, mounting)
+    if limit is not None and limit < 1:
+        raise ConfigError(f"--limit {limit}: give the number of images to stop after, 1 or more")
     if not isinstance(detector, Detector):
         options = replace(detector) if detector is not None else DetectorOptions()
-        if camera is None or lens is not None:
+        if path is None or lens is not None:
             options.max_range_m = _ROUGH_RANGE_M
         detector = Detector.load(options=options)
-    return _found(_frames(asked, detector, lens), asked, detector, lens, stopwatch or Stopwatch())
+    road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
+    rough = _Rough(detector, lens, path, mounting, linear)
+    frames = islice(_frames(str(source), road, rough), limit)
+    return _found(frames, rough, stopwatch or Stopwatch())
 
 
-def _lens(asked: _Asked) -> CameraInfo | None:
+def _lens(
+    camera: Path | None, camera_name: str | None, mounting: Sequence[float] | None
+) -> CameraInfo | None:
     """The intrinsics of ``--camera`` where they are all that the file holds, as other tools write it."""
-    if asked.camera is None:
-        if asked.camera_name is not None:
+    if camera is None:
+        if camera_name is not None:
             raise ConfigError("--camera-name: names a camera in the file of --camera; add that")
         return None
-    if not is_calibration(asked.camera):
-        return read_intrinsics(asked.camera, asked.camera_name, "--camera-name")
-    if asked.camera_name is not None:
-        raise ConfigError(f"--camera-name: {asked.camera} is the calibration of one camera; drop it")
-    if asked.mounting is not None:
+    if not is_calibration(camera):
+        return read_intrinsics(camera, camera_name, "--camera-name")
+    if camera_name is not None:
+        raise ConfigError(f"--camera-name: {camera} is the calibration of one camera; drop it")
+    if mounting is not None:
         raise ConfigError(
             "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
         )
     return None
 
 
-def _frames(asked: _Asked, detector: Detector, lens: CameraInfo | None) -> _Frames:
+class _Rough(NamedTuple):
+    """The detector, and what is known of a camera without a calibration."""
+
+    detector: Detector
+    lens: CameraInfo | None
+    file: Path | None
+    mounting: Sequence[float] | None
+    linear: bool
+
+    def road(self, frame: Frame, seen_pitch_deg: float | None = None) -> RoadDetector:
+        """A detector for the camera of ``frame``; it says what it takes the mounting to be."""
+        height_m, pitch_deg, fov_deg = self.mounting or ROUGH_MOUNTING
+        if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
+            raise ConfigError(
+                f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
+                "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
+            )
+        lens = self.lens
+        if lens is not None:
+            fov_deg = float(2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsic[0, 0])))
+        if seen_pitch_deg is not None:
+            print(
+                f"the lines of {frame.name} and images before it meet on a horizon: taking the camera to "
+                f"look {seen_pitch_deg:.1f} deg down, not {pitch_deg:g}, from here on",
+                file=sys.stderr,
+            )
+            pitch_deg = seen_pitch_deg
+        elif self.mounting is None:
+            known = "no --camera" if lens is None else f"no mounting in {self.file}"
+            print(
+                f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide "
+                "(--mounting says otherwise); positions in px only",
+                file=sys.stderr,
+            )
+        rows, columns = frame.pixels.shape[:2]
+        name = "camera" if lens is None else lens.name
+        calibration = rough_calibration(name, columns, rows, height_m, pitch_deg, fov_deg)
+        if lens is not None:
+            calibration = replace(calibration, info=lens)
+        return RoadDetector(self.detector, camera_from_calibration(calibration, self.linear))
+
+
+def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
     """The frames of whatever the source is."""
-    if asked.limit is not None and asked.limit < 1:
-        raise ConfigError(f"--limit {asked.limit}: give the number of images to stop after, 1 or more")
-    road = None
-    if asked.camera is not None and lens is None:
-        road = RoadDetector.calibrated(detector, asked.camera, asked.linear)
-    path = Path(asked.source)
-    if asked.source.isdecimal():
+    path = Path(source)
+    if source.isdecimal():
         if path.exists():
             raise ConfigError(
                 f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
                 "or start from another folder for the camera"
             )
-        info = lens or (road and road.camera.info)
-        frames = camera_frames(int(asked.source), (info.width, info.height) if info else None)
+        info = rough.lens or (road and road.camera.info)
+        frames = camera_frames(int(source), (info.width, info.height) if info else None)
         return ((frame, road) for frame in frames)
     if not path.exists():
         raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
-    if path.is_dir():
-        paths = list_images(path)
-        if paths:
-            for image in paths:
-                note_input(image)
-            return ((frame, road) for frame in image_frames(paths))
-        if any(reader.accepts(path) for reader in READERS.values()):
-            return _drive_frames(path, detector, road, lens)
+    paths = list_images(path) if path.is_dir() else [path]
+    is_drive = any(READERS[name][0](path) for name in (READERS if path.is_dir() else ("bag",)))
+    if is_drive and paths in ([], [path]):
+        note_input(path)
+        return _drive_frames(path, road, rough)
+    if not paths:
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
-    note_input(path)
-    if READERS["bag"].accepts(path):
-        return _drive_frames(path, detector, road, lens)
-    frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
-    return ((frame, road) for frame in frames)
+    for image in paths:
+        note_input(image)
+    is_video = not path.is_dir() and path.suffix.lower() not in IMAGE_SUFFIXES
+    return ((frame, road) for frame in (video_frames(path) if is_video else image_frames(paths)))
 
 
-def _drive_frames(
-    path: Path, detector: Detector, road: RoadDetector | None, lens: CameraInfo | None
-) -> _Frames:
-    """The images of a drive; if a calibration was given, those of its camera."""
-    if lens is not None:
+def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Frames:
+    """The images of a drive, each read when its turn comes; if a calibration was given, of its camera."""
+    if rough.lens is not None:
         raise ConfigError(
             "--camera: this file holds intrinsics alone, and a drive has its own; drop --camera, or name the "
             "file as camera_info in drive.yaml"
@@ -179,7 +198,7 @@ def _drive_frames(
     drive = read_drive(path)
     for image in drive.images:
         note_input(image.path)
-    roads = {name: RoadDetector(detector, camera) for name, camera in drive.cameras.items()}
+    roads = {name: RoadDetector(rough.detector, camera) for name, camera in drive.cameras.items()}
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
@@ -187,28 +206,17 @@ def _drive_frames(
                 f"{path}: no camera '{name}', as the calibration calls it; this drive has {', '.join(roads)}"
             )
         roads = {name: road}
-    return _frames_of(drive, roads)
+    return (
+        (replace(frame, name=f"{image.camera}_{frame.name}", stamp_s=image.stamp_s), roads[image.camera])
+        for image in drive.images
+        if image.camera in roads
+        for frame in image_frames([image.path])
+    )
 
 
-def _frames_of(drive: Drive, roads: Mapping[str, RoadDetector]) -> _Frames:
-    """Each of the images, read when its turn comes, with the detector of its camera."""
-    for image in drive.images:
-        if image.camera in roads:
-            (frame,) = image_frames([image.path])
-            name = f"{image.camera}_{frame.name}"
-            yield replace(frame, name=name, stamp_s=image.stamp_s), roads[image.camera]
-
-
-def _found(
-    all_frames: _Frames,
-    asked: _Asked,
-    detector: Detector,
-    lens: CameraInfo | None,
-    stopwatch: Stopwatch,
-) -> Iterator[Detected]:
+def _found(frames: _Frames, rough: _Rough, stopwatch: Stopwatch) -> Iterator[Detected]:
     """Every frame with what it shows."""
-    frames = islice(all_frames, asked.limit)
-    rough: RoadDetector | None = None
+    guessed: RoadDetector | None = None
     vote = PitchVote()
     while True:
         with stopwatch.image():
@@ -218,53 +226,15 @@ def _found(
                 stopwatch.discard()
                 return
             if road is None:
-                road = rough = rough or _rough_road(frame, asked, detector, lens)
+                road = guessed = guessed or rough.road(frame)
             _check_size(frame, road)
             found = road.detect(frame.pixels)
         yield Detected(frame, road.camera.info.name, found)
-        if road is not rough:
+        if road is not guessed:
             continue
-        pitch_rad = vote.add([lane.image for lane in found.lanes], detector.road_camera(road.camera))
+        pitch_rad = vote.add([lane.image for lane in found.lanes], rough.detector.road_camera(road.camera))
         if pitch_rad is not None:
-            rough = _rough_road(frame, asked, detector, lens, float(np.rad2deg(pitch_rad)))
-
-
-def _rough_road(
-    frame: Frame,
-    asked: _Asked,
-    detector: Detector,
-    lens: CameraInfo | None,
-    seen_pitch_deg: float | None = None,
-) -> RoadDetector:
-    """A detector for a camera of unknown mounting; it says what it takes that to be."""
-    height_m, pitch_deg, fov_deg = asked.mounting or ROUGH_MOUNTING
-    if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
-        raise ConfigError(
-            f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
-            "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
-        )
-    if lens is not None:
-        fov_deg = float(2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsic[0, 0])))
-    if seen_pitch_deg is not None:
-        print(
-            f"the lines of {frame.name} and images before it meet on a horizon: taking the camera to look "
-            f"{seen_pitch_deg:.1f} deg down, not {pitch_deg:g}, from here on",
-            file=sys.stderr,
-        )
-        pitch_deg = seen_pitch_deg
-    elif asked.mounting is None:
-        known = "no --camera" if lens is None else f"no mounting in {asked.camera}"
-        print(
-            f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide "
-            "(--mounting says otherwise); positions in px only",
-            file=sys.stderr,
-        )
-    rows, columns = frame.pixels.shape[:2]
-    name = "camera" if lens is None else lens.name
-    calibration = rough_calibration(name, columns, rows, height_m, pitch_deg, fov_deg)
-    if lens is not None:
-        calibration = replace(calibration, info=lens)
-    return RoadDetector(detector, camera_from_calibration(calibration, asked.linear))
+            guessed = rough.road(frame, float(np.rad2deg(pitch_rad)))
 
 
 def _check_size(frame: Frame, road: RoadDetector) -> None:

@@ -40,15 +40,8 @@ def detect_in_pieces(
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order, where that is not known yet.
 
-    Args:
-        drive: what to look at.
-        contents: of its images.
-        options: detector settings.
-        context: keeps what was found; its viewer is shown first all that is known, then image by image.
-        detect: takes the place of processes of this machine.
-
-    Raises:
-        V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
+    The viewer is shown first all that is known, then image by image; ``detect`` takes the place of processes
+    of this machine. Raises V2hdmError as :func:`v2hdm.detection.batch.detect_all`.
     """
     cache, progress, show = context.cache, context.steps("detect"), context.viewer.detected
     detector_key = cache.key(options, model_key(options))

@@ -47,7 +47,6 @@ def evaluate(
     truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
     reference: dict[str, Any] = {}
-    growth: dict[str, list[tuple[int, float]]] = {}
     for done, (name, by_method) in enumerate(methods.items()):
         progress(done, len(methods))
         cameras = next(iter(by_method.values())).cameras
@@ -57,26 +56,33 @@ def evaluate(
             for method, result in by_method.items()
         }
         if truth is not None:
-            ideal = _naive_under_true_extrinsic(drive, detections, cameras, truth, options)
+            # The best that any calibration could make of the naive strategy.
+            infos = {camera: drive.cameras[camera].info for camera in cameras}
+            ipms = {one: ipm_from_extrinsic(infos[one], truth.cam_from_vehicle[one]) for one in cameras}
+            ideal = run_naive("true extrinsic", Inputs(drive, detections, cameras, options), ipms)
             reference[name] = {"naive_true_extrinsic": map_figures(ideal.hd_map, truth, expected)}
     progress(len(methods), len(methods))
-    if truth is not None:
-        growth = _growth(list(methods.values())[-1], truth)
+    growth = {} if truth is None else _growth(list(methods.values())[-1], truth)
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
         metrics |= {"reference": reference, "disturbances": truth.disturbances, "growth": growth}
     headlines = [headline(name, by_method) for name, by_method in results.items()]
-    certainty = list(methods.values())[-1]["Opt"].certainty.values()
-    return Judgement(metrics, [*_disturbances(truth), *headlines, *certainty], growth, truth)
+    if truth is not None and truth.disturbances:
+        disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
+        headlines.insert(0, f"disturbances: {disturbed}")
+    headlines += list(methods.values())[-1]["Opt"].certainty.values()
+    return Judgement(metrics, headlines, growth, truth)
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:
     """The figures of a method that need no truth."""
     reasons = Counter(exclusion.reason for exclusion in result.excluded)
+    covariances = [one.covariance_m2 for one in result.hd_map.markings]
+    variance = [np.trace(one) / 8 for one in covariances if one is not None]  # of a corner's coordinate
     figures: dict[str, Any] = {
         "excluded": len(result.excluded),
         "excluded_for": dict(reasons.most_common()),
-        "median_sigma_m": _median_sigma_m(result.hd_map),
+        "median_sigma_m": float(np.sqrt(np.median(variance))) if variance else float("nan"),
     }
     if result.reprojection_rmse_px is not None:
         figures["reprojection_rmse_px"] = result.reprojection_rmse_px
@@ -86,26 +92,6 @@ def _own_figures(result: MethodResult) -> dict[str, Any]:
     if result.diagnostics:
         figures["diagnostics"] = dict(result.diagnostics)
     return figures
-
-
-def _median_sigma_m(hd_map: HdMap) -> float:
-    """Median over the markings of the standard deviation of a corner's coordinate, nan where unknown."""
-    variance = [np.trace(m.covariance_m2) / 8 for m in hd_map.markings if m.covariance_m2 is not None]
-    return float(np.sqrt(np.median(variance))) if variance else float("nan")
-
-
-def _naive_under_true_extrinsic(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    cameras: Sequence[str],
-    truth: Truth,
-    options: MappingOptions,
-) -> MethodResult:
-    """The best that any calibration could make of the naive strategy."""
-    ipms = {
-        name: ipm_from_extrinsic(drive.cameras[name].info, truth.cam_from_vehicle[name]) for name in cameras
-    }
-    return run_naive("true extrinsic", Inputs(drive, detections, cameras, options), ipms)
 
 
 def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
@@ -132,13 +118,10 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
         if optimised is None:
             continue
         for name, calibration in optimised.calibrations.items():
-            found: dict[str, Any] = extrinsic_figures(
-                calibration.cam_from_vehicle,
-                extrinsic_from_ipm(
-                    drive.cameras[name].info, drive.cameras[name].ipm[drive.cameras[name].initial_ipm]
-                ),
-                truth.cam_from_vehicle[name] if truth else None,
-            )
+            camera = drive.cameras[name]
+            initial = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+            true = truth.cam_from_vehicle[name] if truth else None
+            found: dict[str, Any] = extrinsic_figures(calibration.cam_from_vehicle, initial, true)
             found["certainty"] = optimised.certainty.get(name, "")
             found |= _clocks(drive, optimised, name)
             if calibration.covariance is not None:
@@ -156,16 +139,9 @@ def _clocks(drive: Drive, optimised: MethodResult, camera: str) -> dict[str, Any
     """A camera's clock offset and its sigma; of joined drives one a drive, by its name."""
     offsets: dict[str, dict[str, float | None]] = {"clock_offset_s": {}, "clock_sigma_s": {}}
     for visit, clocks in zip(drive.visits, optimised.clocks, strict=True):
-        if camera in clocks:
-            offsets["clock_offset_s"][visit.name] = clocks[camera].value_s
-            sigma_s = clocks[camera].sigma_s
-            offsets["clock_sigma_s"][visit.name] = sigma_s if np.isfinite(sigma_s) else None
+        if (clock := clocks.get(camera)) is not None:
+            offsets["clock_offset_s"][visit.name] = clock.value_s
+            offsets["clock_sigma_s"][visit.name] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
     if drive.joined:
         return dict(offsets)
     return {key: value for key, by_name in offsets.items() for value in by_name.values()}
-
-
-def _disturbances(truth: Truth | None) -> list[str]:
-    if truth is None or not truth.disturbances:
-        return []
-    return ["disturbances: " + ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())]

@@ -9,7 +9,6 @@ from functools import partial
 
 from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
-from v2hdm.executor import IN_PROCESS
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
@@ -23,13 +22,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Inspection:
-    """A drive as it is mapped, and the findings so far.
+    """A drive as it is mapped, its cameras as it describes them, and all findings before the run.
 
-    Attributes:
-        drive: with the clocks that the ground contradicts corrected, and the ground's better start.
-        given: cameras as the drive describes them.
-        ground: of each visit, by camera, what the bare ground says.
-        findings: of all checks before the run.
+    In ``drive`` the clocks that the ground contradicts are corrected, and cameras begin where the ground puts
+    them; ``ground`` is of each visit, by camera, what the bare ground says.
     """
 
     drive: Drive
@@ -49,14 +45,7 @@ class Inspection:
 
 
 def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[int, int], None]) -> Inspection:
-    """Check a drive and correct what can be corrected.
-
-    Args:
-        drive: as it was read.
-        max_gap_s: longest gap between two poses that is interpolated across, s.
-        workers: processes to work in.
-        progress: called with how many cameras are done, and of how many.
-    """
+    """Check a drive and correct what can be corrected; ``max_gap_s`` bounds the gaps between poses."""
     ground = estimate_cameras(drive, workers, progress)
     findings = tuple(input_findings(drive, ground))
     for finding in findings:
@@ -72,29 +61,20 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
 def inspect_each(
     drives: Sequence[Drive], contents: Contents, max_gap_s: float, context: Context
 ) -> list[Inspection]:
-    """As :func:`inspect` of each drive, or what it found before of the same, with the same lines in the log.
-
-    Args:
-        drives: as they were read.
-        contents: of their images.
-        max_gap_s: as there.
-        context: keeps what is found, inspects, and shows how far the checks of each drive are.
-    """
-    jobs, executor, cache = [], context.executor or IN_PROCESS, context.cache
+    """As :func:`inspect` of each drive, or what it found before of the same, with the same log."""
+    jobs, cache = [], context.cache
     for drive in drives:
         steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
         work = partial(inspect, drive, max_gap_s, context.processes, steps)
-        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(executor.begin, work)))
+        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(context.executor.begin, work)))
     return list(cache.get_or_make_each("check", Inspection, jobs))
 
 
 def join(inspections: Sequence[Inspection]) -> Inspection:
     """Several drives, each inspected by itself, as one; findings name the drive that they are of.
 
-    A camera that the bare ground of two drives puts on two mountings is two cameras.
-
-    Raises:
-        DriveError: they are not of one frame or site.
+    A camera that the bare ground of two drives puts on two mountings is two cameras. Raises DriveError where
+    they are not of one frame or site.
     """
     if len(inspections) == 1:
         return inspections[0]
@@ -129,10 +109,9 @@ def _started(drive: Drive, inspections: Sequence[Inspection]) -> dict[str, Camer
 def _has_moved(camera: str, before: Inspection, after: Inspection) -> bool:
     """Whether the ground of two drives says that a camera sits elsewhere, by the odds of the drift alarm."""
     found = [one.ground[0].get(camera) for one in (before, after)]
-    calibrations = [one.calibration for one in found if one is not None and one.status is GroundStatus.FOUND]
-    if len(calibrations) < 2 or any(one is None or one.covariance is None for one in calibrations):
-        return False
+    known = [one.calibration for one in found if one is not None and one.status is GroundStatus.FOUND]
+    sure = [one for one in known if one is not None and one.covariance is not None]
     try:
-        return movement(*(one for one in calibrations if one is not None)).moved
+        return len(sure) == 2 and movement(*sure).moved
     except MapFileError:  # the lenses differ, which the descriptions say as well
         return False

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
@@ -14,9 +13,6 @@ from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.records import Drive, Image
 from v2hdm.store.cache import key_of
 from v2hdm.store.files import file_digest
-
-if TYPE_CHECKING:
-    pass  # loads torch, which a finished result does not need
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
 def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
     """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
     asked = replace(
-        config, name=run_name(config), output="", cache="", local_cache="", cache_gb=0.0, resume=True,
+        config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True,
         workers=0, drive=replace(config.drive, path=None, cache=""),
     )  # fmt: skip
     files: list[Path] = []
@@ -65,13 +61,12 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
         files += [hd_map, *trajectories, excluded]
     if config.mapping.survey.file is not None:
         files.append(Path(config.mapping.survey.file))
-    for drive in drives:
-        if drive.truth_dir is not None:
-            files += sorted(drive.truth_dir.rglob("*"))
+    truths = [drive.truth_dir for drive in drives if drive.truth_dir is not None]
+    files += [path for truth in truths for path in sorted(truth.rglob("*"))]
     read = [(str(path), file_digest(path)) for path in files if path.is_file()]
-    paths = [drive.root.resolve() for drive in drives]
+    of_drives = [contents.key(drive) for drive in drives]
     return key_of(
-        code, asked, model_key(config.detector), paths, [contents.key(drive) for drive in drives], read
+        code, asked, model_key(config.detector), [drive.root.resolve() for drive in drives], of_drives, read
     )
 
 

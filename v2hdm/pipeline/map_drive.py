@@ -15,13 +15,12 @@ from v2hdm.detection.batch import detect_images
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.errors import AdjustError, MappingError, V2hdmError
-from v2hdm.executor import IN_PROCESS
-from v2hdm.io.drive import ReadOptions, join_drives, read_drive
+from v2hdm.errors import AdjustError, MappingError
+from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
-from v2hdm.pipeline.config import check_choice
+from v2hdm.pipeline.config import ACCURACY_GOAL_CM, check_choice
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
@@ -31,8 +30,9 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.site.changes import Base
+from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
+from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_result
 from v2hdm.verdict.results.survey import check_known_sizes
 
@@ -57,6 +57,7 @@ def map_drive(
     detector: Detector | DetectorOptions | None = None,
     reading: ReadOptions | None = None,
     base: Path | str | None = None,
+    accuracy_goal_cm: float = ACCURACY_GOAL_CM,
     name: str | None = None,
     cache: Path | str | None = None,
     progress: Progress = silent,
@@ -71,6 +72,7 @@ def map_drive(
         detector: the detector, or its settings.
         reading: how folders are read.
         base: the map.geojson of an earlier result, which the drive brings up to date.
+        accuracy_goal_cm: the 95 % radius, cm, within which map and calibrations have to be known for a PASS.
         name: of the result; None takes that of the drive.
         cache: folder that keeps what each stage has found for the next call; None keeps nothing.
         progress: shows how far the long steps are, ``progress(task, done, total)``.
@@ -85,9 +87,10 @@ def map_drive(
         DriveError: the drive cannot be read.
         MapFileError: ``base`` cannot be used.
         DetectorError: the detector cannot be used.
+        ConfigError: ``accuracy_goal_cm`` or another setting is out of range.
         MappingError: there is nothing to map, although no check of the drive has failed.
 
-    >>> result = map_drive(port, workers=1)
+    >>> result = map_drive(port, accuracy_goal_cm=10.0, workers=1)
     >>> result.verdict.status.value
     'PASS'
     >>> {marking.kind for marking in result.map.markings} <= {"diamond", "lane_dash", "stop_line"}
@@ -95,39 +98,44 @@ def map_drive(
     >>> result.calibrations["front"].cam_from_vehicle.shape
     (4, 4)
     """
-    context = context or Context.of(cache, progress, workers)
+    kept = StageCache(None if cache is None else Path(cache))
+    context = context or Context(kept, progress, workers=workers)
     options, reading = options or MappingOptions(), reading or ReadOptions()
     settings = detector.options if isinstance(detector, Detector) else detector
     settings = settings or DetectorOptions.for_mapping()
     sources = [drive] if isinstance(drive, Source) else list(drive)
-    check_choice(options, len(sources), base is not None)
+    check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
-    earlier, survey = _given(read.whole, options, base)
-    checked = _check(read, reading, context)
-    about = describe_run(name or read.whole.name, read.whole, _paths(sources), reading)
+    earlier = None if base is None else read_base(Path(base))
+    if earlier is not None:
+        check_together(earlier, read.whole, str(base))
+    survey = take_survey(read.whole, options)
+    with context.timed("check"):
+        checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+    paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
+    about = describe_run(name or read.whole.name, read.whole, paths, reading)
     unjudged = Result(
         about, read.drives, read.contents, checked.drive_as_described, context.seconds, options.device
     )
     try:
         with closing(context.viewer):
             detections = _detect(checked.drive, read.contents, settings, context)
-            sets = _associate_and_adjust(checked.drive, read.contents, detections, survey, earlier, context)
+            with context.timed("map"):
+                key = read.contents.key(checked.drive)
+                sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
     except (MappingError, AdjustError) as failure:
         if not checked.has_failed:
             raise
-        return _without_map(unjudged, checked, failure)
-    return _judge(unjudged, checked, detections, sets, survey, context)
+        failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
+        verdict = Verdict.of([*checked.findings, failed])
+        return replace(unjudged, verdict=verdict, figures={"results": {}})
+    return _judge(unjudged, checked, detections, sets, survey, accuracy_goal_cm, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
-    """Read several drives, each by the executor of ``context``, and join them.
-
-    Raises:
-        DriveError: one cannot be read, or they do not belong together.
-    """
-    executor = context.executor or IN_PROCESS
+    """Read several drives, each by the executor of ``context``, and join them; raises DriveError."""
     with context.timed("read"):
-        begun = [executor.begin(partial(_read_one, one, options)) for one in sources]
+        begun = [context.executor.begin(partial(_read_one, one, options)) for one in sources]
         found = [wait() for wait in begun]
     for drive, _ in found:
         _log.info(
@@ -139,25 +147,8 @@ def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) 
 
 
 def _read_one(source: Source, options: ReadOptions) -> tuple[Drive, Contents]:
-    drive = source if isinstance(source, Drive) else read_drive(Path(source), options)
+    drive = as_drive(source, options)
     return drive, Contents.of([drive])
-
-
-def _paths(sources: Sequence[Source]) -> list[Path]:
-    return [one.root if isinstance(one, Drive) else Path(one) for one in sources]
-
-
-def _given(drive: Drive, options: MappingOptions, base: Path | str | None) -> tuple[Base | None, Survey]:
-    """The earlier map and the survey: what does not belong to the drive is refused before any long work."""
-    earlier = None if base is None else read_base(Path(base))
-    if earlier is not None:
-        check_together(earlier, drive, str(base))
-    return earlier, take_survey(drive, options)
-
-
-def _check(read: Read, reading: ReadOptions, context: Context) -> Inspection:
-    with context.timed("check"):
-        return join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
 
 
 def _detect(
@@ -177,24 +168,13 @@ def _detect(
     return detections
 
 
-def _associate_and_adjust(
-    drive: Drive,
-    contents: Contents,
-    detections: Sequence[ImageDetections],
-    survey: Survey,
-    base: Base | None,
-    context: Context,
-) -> dict[str, MappedSet]:
-    with context.timed("map"):
-        return map_camera_sets(drive, contents.key(drive), detections, survey, base, context)
-
-
 def _judge(
     result: Result,
     checked: Inspection,
     detections: Sequence[ImageDetections],
     sets: dict[str, MappedSet],
     survey: Survey,
+    goal_cm: float,
     context: Context,
 ) -> Result:
     methods = {name: one.methods for name, one in sets.items()}
@@ -202,14 +182,13 @@ def _judge(
     with context.timed("judge"):
         found = check_result(checked.drive, methods, checked.ground)
         unfit = check_known_sizes(survey.mapping.known_sizes, best)
-        verdict = Verdict.of([*checked.findings, *found, *unfit, *check_survey(survey, best, compared)])
+        reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.control else "poses")
+        surveyed = check_survey(survey, best, compared)
+        verdict = Verdict.of([*checked.findings, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
         judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
-    figures = {
-        **judgement.metrics,
-        **({} if best.changes is None else {"changes": changes_json(best.changes)}),
-    }
-    figures["seconds"] = context.seconds
+    changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
+    figures = {**judgement.metrics, **changes, "seconds": context.seconds}
     headlines = tuple(judgement.headlines)
     if compared is not None:
         figures["check_points"] = compared.figures()
@@ -224,9 +203,3 @@ def _judge(
         judgement=judgement,
         check_points=compared,
     )
-
-
-def _without_map(result: Result, checked: Inspection, failure: V2hdmError) -> Result:
-    """The result of a drive whose checks failed and of which no map came."""
-    failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
-    return replace(result, verdict=Verdict.of([*checked.findings, failed]), figures={"results": {}})

@@ -33,36 +33,33 @@ from v2hdm.pipeline.camera_sets import BEST
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.keys import Contents
-from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory, Visit
+from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.figures import save_birdseye, save_growth
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
 from v2hdm.store.files import replace_text
+from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
 
 
 def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
     """The beginning of ``metrics.json``: name, version, date (UTC), the drive at ``paths`` as it was read."""
+    stamp_s = [image.stamp_s for image in drive.images]
+    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     return {
         "name": name,
         "version": __version__,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "drive": _drive(drive, paths, options),
+        "drive": {
+            **told_of(drive, paths, options),
+            "duration_s": round(float(np.ptp(stamp_s)), 3),
+            "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
+            "position_sigma_m": drive.pose_noise.position_m,
+            "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
+        },
         "versions": {"v2hdm": __version__, **library_versions()},
-    }
-
-
-def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
-    stamp_s = [image.stamp_s for image in drive.images]
-    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
-    return {
-        **told_of(drive, paths, options),
-        "duration_s": round(float(np.ptp(stamp_s)), 3),
-        "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
-        "position_sigma_m": drive.pose_noise.position_m,
-        "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
     }
 
 
@@ -83,20 +80,15 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
         stem = f"trajectory_{visit.name}" if drive.joined else "trajectory"
         stamp_s, before = poses.stamp_s[own], poses.before[own]
         moved = np.linalg.inv(before) @ poses.map_from_vehicle[own]
-        write_tum(Trajectory(stamp_s, _recorded(visit, stamp_s, before) @ moved), folder / f"{stem}.tum")
+        recorded = before  # laid flat, where the visit has no others
+        if visit.recorded is not None:
+            recorded, _ = interpolate(visit.recorded, stamp_s, float("inf"))
+        write_tum(Trajectory(stamp_s, recorded @ moved), folder / f"{stem}.tum")
         rows = [
             f"{stamp:.9f},{int(seen)}," + ",".join(f"{value:.6g}" for value in sigma)
             for stamp, seen, sigma in zip(stamp_s, poses.seen[own], poses.sigma[own], strict=True)
         ]
         replace_text(folder / f"{stem}_sigma.csv", "\n".join([_HEADER, *rows]) + "\n")
-
-
-def _recorded(visit: Visit, stamp_s: FloatArray, before: FloatArray) -> FloatArray:
-    """The poses (F, 4, 4) as recorded, those laid flat where the visit has no others."""
-    if visit.recorded is None:
-        return before
-    recorded, _ = interpolate(visit.recorded, stamp_s, float("inf"))
-    return recorded
 
 
 _log = logging.getLogger(__name__)
@@ -206,8 +198,10 @@ class Result:
 
         if self.judgement is not None:
             _write_map(folder, self, formats, self.judgement)
-            if all_maps:
-                _write_maps(folder / "maps", self.drive, self.methods)
+            for name, methods in self.methods.items() if all_maps else ():
+                for method, made in methods.items():
+                    path = folder / "maps" / f"{name}_{method}.geojson"
+                    write_geojson(with_heights(made.hd_map, self.drive.road), path)
         write_json(folder / "metrics.json", self.metrics)
         if mosaic and self.methods:
             with context.timed("mosaic"):
@@ -226,7 +220,11 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: 
         clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
         path = folder / f"calibration_{name}.yaml"
         write_calibration(calibration, path, clock_s=clock_s, verdict=verdict, about=about)
-        _write_calibration_forms(calibration, about, path)
+        for form in CALIBRATION_FORMATS:  # of other tools, into a folder named like the file
+            try:
+                write_calibration_as(form, calibration, about, path.with_suffix(""), calibration.info.name)
+            except MapFileError as error:
+                _log.info("no %s calibration is written: %s", form, error)
     write_trajectories(result.trajectory, drive, folder)
     if best.residuals is not None:
         write_residuals(best.residuals, folder / RESIDUALS)
@@ -234,7 +232,12 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: 
         write_changes(best.changes, best.hd_map, folder, _route(drive))
     if result.check_points is not None:
         write_check_points(result.check_points, folder / "check_points.csv")
-    _write_exclusions(folder / "excluded.geojson", drive, result.methods)
+    excluded = [
+        ExcludedMarking(one.kind, one.position_map, one.sightings, one.reason, name)
+        for name, methods in result.methods.items()
+        for one in methods[BEST].excluded
+    ]
+    write_exclusions(excluded, folder / "excluded.geojson", drive.origin, drive.road)
     maps = {name: one.hd_map for name, one in list(result.methods.values())[-1].items()}
     save_birdseye(folder / "birdseye.png", maps, BEST, _route(drive), judgement.truth)
     if any(judgement.growth.values()):
@@ -246,9 +249,8 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: 
 
 def _route(drive: Drive) -> FloatArray:
     """Positions (N, 2) of the vehicle, with a nan between one visit and the next."""
-    images = drive.images
-    places = np.array([image.map_from_vehicle[:2, 3] for image in images])
-    ends = np.flatnonzero(np.diff([image.visit for image in images])) + 1
+    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    ends = np.flatnonzero(np.diff([image.visit for image in drive.images])) + 1
     return np.insert(places, ends, np.nan, axis=0)
 
 
@@ -265,32 +267,6 @@ def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
             lane = replace(lane, points_map=lane.points_map[::-1], heights_m=heights)
         lanes.append(lane)
     return replace(hd_map, lanes=tuple(lanes))
-
-
-def _write_calibration_forms(calibration: Calibration, about: Provenance, path: Path) -> None:
-    """The calibration in the forms of other tools, into a folder named like ``path``."""
-    for name in CALIBRATION_FORMATS:
-        try:
-            write_calibration_as(name, calibration, about, path.with_suffix(""), calibration.info.name)
-        except MapFileError as error:
-            _log.info("no %s calibration is written: %s", name, error)
-
-
-def _write_exclusions(path: Path, drive: Drive, sets: CameraSets) -> None:
-    """Write the candidates that the best method left out, of every camera set."""
-    excluded = [
-        ExcludedMarking(one.kind, one.position_map, one.sightings, one.reason, name)
-        for name, methods in sets.items()
-        for one in methods[BEST].excluded
-    ]
-    write_exclusions(excluded, path, drive.origin, drive.road)
-
-
-def _write_maps(folder: Path, drive: Drive, sets: CameraSets) -> None:
-    folder.mkdir()
-    for name, methods in sets.items():
-        for method, result in methods.items():
-            write_geojson(with_heights(result.hd_map, drive.road), folder / f"{name}_{method}.geojson")
 
 
 def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) -> None:
@@ -310,9 +286,8 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
 
 def _fullest_image(drive: Drive, name: str, detections: Sequence[ImageDetections]) -> Image:
     """The image of a camera in which most corners were found; its first one where there are none."""
-    images = [index for index, image in enumerate(drive.images) if image.camera == name]
-    corners = dict.fromkeys(images, 0)
+    corners = {index: 0 for index, image in enumerate(drive.images) if image.camera == name}
     for found in detections:
         if found.image in corners:
             corners[found.image] = sum(int(marking.corner_valid.sum()) for marking in found.markings)
-    return drive.images[max(images, key=corners.__getitem__)]
+    return drive.images[max(corners, key=corners.__getitem__)]

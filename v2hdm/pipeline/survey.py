@@ -28,13 +28,10 @@ _NAMED = 5
 
 @dataclass(frozen=True)
 class Survey:
-    """A survey as a run uses it.
+    """A survey as a run uses it: settings of the mapping with its control points, and its check points.
 
-    Attributes:
-        mapping: the settings of the mapping, with the control points in place of the file.
-        check: points that are kept from the mapping.
-        points: all points of the file.
-        elsewhere: where they would lie, had the file meant something else, by what (N, 2).
+    ``points`` are all of the file, ``elsewhere`` where they would lie, had it meant something else, by what
+    (N, 2).
     """
 
     mapping: MappingOptions
@@ -50,11 +47,7 @@ class Survey:
 
 
 def table_of(options: SurveyOptions) -> SurveyTable | None:
-    """The file of a survey as it states its points; None where there is none.
-
-    Raises:
-        DriveError: It cannot be read.
-    """
+    """The file of a survey as it states its points, None where there is none; raises DriveError."""
     if options.file is None:
         return None
     return read_survey(Path(options.file), options.crs, options.geoid_m, options.sigma_m)
@@ -63,9 +56,8 @@ def table_of(options: SurveyOptions) -> SurveyTable | None:
 def take_survey(drive: Drive, options: MappingOptions) -> Survey:
     """The survey of a drive, before anything is estimated.
 
-    Raises:
-        DriveError: The file cannot be read, or none of its points is where the drive could see it; says how
-            else the file may be meant.
+    Raises DriveError where the file cannot be read, or none of its points is where the drive could see it;
+    says how else the file may be meant.
     """
     table = table_of(options.survey)
     if table is None:

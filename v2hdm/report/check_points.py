@@ -113,6 +113,7 @@ class CheckTable:
         degrees = 2 * len(self.compared)
         rmse_x_m, rmse_y_m = (float(np.sqrt(np.mean(off_m**2))) for off_m in self.off_m.T)
         mean_x_m, mean_y_m = self.off_m.mean(axis=0).tolist()
+        heights_m = np.array([one.off_height_m for one in self.compared if one.off_height_m is not None])
         return out | {
             "rmse_m": self.rmse_m,
             "rmse_x_m": rmse_x_m,
@@ -126,7 +127,13 @@ class CheckTable:
             "degrees_of_freedom": degrees,
             "nees": self.squared / degrees,
             "probability": float(chi2.sf(self.squared, degrees)),
-            "height": self._height_figures(),
+            "height": {
+                "compared": len(heights_m),
+                "mean_z_m": float(np.mean(heights_m)),
+                "rmse_z_m": float(np.sqrt(np.mean(heights_m**2))),
+            }
+            if len(heights_m)
+            else {"compared": 0, "because": "the survey, or the map of this drive, has no heights"},
         }
 
     @property
@@ -145,16 +152,6 @@ class CheckTable:
 
     def _percentile_m(self) -> float:
         return float(np.percentile([one.distance_m for one in self.compared], 100 * INSIDE))
-
-    def _height_figures(self) -> dict[str, Any]:
-        off_m = [one.off_height_m for one in self.compared if one.off_height_m is not None]
-        if not off_m:
-            return {"compared": 0, "because": "the survey, or the map of this drive, has no heights"}
-        return {
-            "compared": len(off_m),
-            "mean_z_m": float(np.mean(off_m)),
-            "rmse_z_m": float(np.sqrt(np.mean(np.square(off_m)))),
-        }
 
 
 def squared(off_m: FloatArray, covariance_m2: FloatArray) -> float:
@@ -195,14 +192,15 @@ def compare(
             unmatched.append((point, why))
             continue
         marking, corner = divmod(int(matched[k]), 4)
-        found = hd_map.markings[marking]
+        found, height_m = hd_map.markings[marking], point.height_m
         off_height_m = None
-        if found.heights_m is not None and point.height_m is not None:
-            off_height_m = float(found.heights_m[corner] - point.height_m)
+        if found.heights_m is not None and height_m is not None:
+            off_height_m = float(found.heights_m[corner] - height_m)
         off = found.corners_map[corner] - point.position_map
         covariance = joint(np.array([marking]), np.array([corner]))
-        one = CheckedPoint(point, marking, ids[marking], found.kind, corner, off, covariance, off_height_m)
-        compared.append(one)
+        compared.append(
+            CheckedPoint(point, marking, ids[marking], found.kind, corner, off, covariance, off_height_m)
+        )
     if not compared:
         return CheckTable((), tuple(unmatched), np.zeros((0, 0)))
     of_map = joint(*np.array([(one.marking, one.corner) for one in compared]).T)
@@ -217,19 +215,13 @@ def write_check_points(table: CheckTable, path: Path) -> None:
     rows.writerow(COLUMNS)
     for one in table.compared:
         point = one.point
-        sigma = np.sqrt(np.diag(one.covariance_m2))
-        own_sigma = np.sqrt(np.diag(one.map_covariance_m2))
-        rows.writerow(
-            [
-                *(point.id, point.description, *_metres(point.position_map)),
-                *(one.marking_id, one.kind, one.corner + 1),
-                *_metres([*one.off_m, one.distance_m, *sigma, *own_sigma]),
-                f"{one.normalised:.3f}",
-                "yes" if one.is_inside else "no",
-                "" if one.off_height_m is None else _metres([one.off_height_m])[0],
-                "",
-            ]
-        )
+        sigma, own_sigma = (np.sqrt(np.diag(of)) for of in (one.covariance_m2, one.map_covariance_m2))
+        cells: list[object] = [point.id, point.description, *_metres(point.position_map)]
+        cells += [one.marking_id, one.kind, one.corner + 1]
+        cells += _metres([*one.off_m, one.distance_m, *sigma, *own_sigma])
+        cells += [f"{one.normalised:.3f}", "yes" if one.is_inside else "no"]
+        height = [] if one.off_height_m is None else [one.off_height_m]
+        rows.writerow([*cells, *(_metres(height) or [""]), ""])
     for point, why in table.unmatched:
         empty = [""] * (len(COLUMNS) - 5)
         rows.writerow([point.id, point.description, *_metres(point.position_map), *empty, why])

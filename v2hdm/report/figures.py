@@ -53,13 +53,9 @@ def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -
     with style.figure(path, 7.5, 4.2) as fig:
         axes = fig.subplots()
         for method, points in growth.items():
-            counts, errors = np.array(points, dtype=np.float64).reshape(-1, 2).T
-            if not len(counts):
-                continue
-            look = {"ls": style.LINE.get(method, "-"), "color": style.METHOD.get(method, "k")}
-            axes.plot(
-                counts, 100 * errors, marker=style.MARKER.get(method, "."), ms=4.5, label=method, **look
-            )
+            if points:
+                counts, errors = np.array(points, dtype=np.float64).T
+                axes.plot(counts, 100 * errors, ms=4.5, label=method, **style.line_of(method))
         style.set_logarithmic(axes, "y")
         axes.set(xlabel="markings mapped so far", ylabel="corner RMSE (cm)")
         axes.set_title("Growth of the error with the map")
@@ -67,8 +63,7 @@ def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -
 
 
 def _draw_truth(axes: Axes, truth: Truth) -> None:
-    polygons = [m.corners_map for m in truth.map.markings]
-    lanes = [lane.points_map for lane in truth.map.lanes]
+    polygons, lanes = [m.corners_map for m in truth.map.markings], [one.points_map for one in truth.map.lanes]
     paint = PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.4, label="truth")
     axes.add_collection(paint)
     axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
@@ -172,11 +167,15 @@ def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     way = metrics.way_along(place)
     chosen = np.unique(np.searchsorted(way, np.linspace(0, way[-1], _ARROWS)))
     length = 0.05 * max(float(np.ptp(place, axis=0).max()), 1e-9)
-    axes.quiver(
-        *place[chosen].T, *(length * poses[chosen, :2, 0]).T,
-        angles="xy", scale_units="xy", scale=1, width=0.0028, color="white", edgecolor="#1b1e21",
-        linewidth=0.7, zorder=3,
-    )  # fmt: skip
+    look: dict[str, Any] = {
+        "color": "white",
+        "edgecolor": "#1b1e21",
+        "linewidth": 0.7,
+        "width": 0.0028,
+        "zorder": 3,
+    }
+    arrows = (length * poses[chosen, :2, 0]).T
+    axes.quiver(*place[chosen].T, *arrows, angles="xy", scale_units="xy", scale=1, **look)
 
 
 _AROUND_M = 2.0  # ground around a change in its close-up, m
@@ -217,7 +216,8 @@ def _site(axes: Axes, changes: Changes, hd_map: HdMap, route_map: FloatArray) ->
     _draw_map(axes, hd_map)
     for fate, colour in _COLOURS.items():
         own = changes.of(fate)
-        places = np.array([_outline(one).mean(axis=0) for one in own]).reshape(-1, 2)
+        outlines = [one.before if one.after is None else one.after for one in own]
+        places = np.array([one.mean(axis=0) for one in outlines if one is not None]).reshape(-1, 2)
         marker = {Fate.MOVED: "o", Fate.VANISHED: "x", Fate.NEW: "+"}[fate]
         face = "none" if fate is Fate.MOVED else colour
         label = f"{len(own)} {fate.value}"
@@ -239,10 +239,9 @@ def _move_close_up(axes: Axes, one: Change, changes: Changes, hd_map: HdMap) -> 
     for other in changes.changes:
         colour = _COLOURS.get(other.fate)
         for corners, line in ((other.before, "--"), (other.after, "-")):
-            if corners is not None and other.fate in _COLOURS:
-                axes.add_patch(
-                    Polygon(corners, closed=True, fill=False, edgecolor=colour, lw=1.4, ls=line, zorder=3)
-                )
+            if corners is not None and colour:
+                look: dict[str, Any] = {"edgecolor": colour, "lw": 1.4, "ls": line, "zorder": 3}
+                axes.add_patch(Polygon(corners, closed=True, fill=False, **look))
     begin, end = one.before.mean(axis=0), one.after.mean(axis=0)
     axes.annotate("", xy=end, xytext=begin, arrowprops={"arrowstyle": "->", "color": "#2d3439", "lw": 1.4})
     sigma_cm = 100 * float(np.sqrt(np.mean(one.shift_sigma_m**2)))
@@ -258,12 +257,6 @@ def _draw_map(axes: Axes, hd_map: HdMap) -> None:
     polygons = [one.corners_map for one in hd_map.markings]
     axes.add_collection(PolyCollection(polygons, facecolors="#c9d3da", edgecolors="#9aa4ad", lw=0.4))
     axes.autoscale_view()
-
-
-def _outline(one: Change) -> FloatArray:
-    corners = one.before if one.after is None else one.after
-    assert corners is not None
-    return corners
 
 
 def _distance_m(one: Change) -> float:

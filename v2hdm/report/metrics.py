@@ -68,8 +68,6 @@ def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray
         if image.camera not in cameras:
             continue
         candidates = np.flatnonzero(truth.visibility[i] >= FULLY_VISIBLE)
-        if candidates.size == 0:
-            continue
         corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners_map[candidates])
         inside = inside_convex(drive.cameras[image.camera].roi_vehicle, corners_vehicle).all(axis=1)
         sightings[candidates[inside]] += 1
@@ -126,12 +124,9 @@ def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatAr
 
 def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> ExtrinsicMetrics:
     """Compare two extrinsics (4 x 4 each)."""
-    difference = cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T
-    centres = [camera_centre(t) for t in (cam_from_vehicle, true_cam_from_vehicle)]
-    return ExtrinsicMetrics(
-        rotation_error_deg=float(np.rad2deg(Rotation.from_matrix(difference).magnitude())),
-        translation_error_m=float(np.linalg.norm(centres[0] - centres[1])),
-    )
+    turn = Rotation.from_matrix(cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T)
+    shift_m = camera_centre(cam_from_vehicle) - camera_centre(true_cam_from_vehicle)
+    return ExtrinsicMetrics(float(np.rad2deg(turn.magnitude())), float(np.linalg.norm(shift_m)))
 
 
 def rms(errors: FloatArray) -> float:
@@ -295,7 +290,11 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
         if by_class[DIAMOND]["expected"]:
             figures |= {name: by_class[DIAMOND][name] for name in ("expected", "recall")}
         figures["by_class"] = by_class
-    figures["lanes"] = _lane_figures(hd_map, truth)
+    if truth is not None:
+        figures["lanes"] = asdict(lane_metrics(hd_map.lanes, truth))
+    else:
+        length = float(sum(length_m(lane.points_map) for lane in hd_map.lanes))
+        figures["lanes"] = {"lanes": len(hd_map.lanes), "length_m": length}
     figures["dash_spacing"] = asdict(dash_spacing(hd_map))
     return figures
 
@@ -308,8 +307,7 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
     """
     turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
     yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)
-    centres = [camera_centre(t) for t in (estimate, initial)]
-    shift_m = centres[0] - centres[1]
+    shift_m = camera_centre(estimate) - camera_centre(initial)
     figures = {"yaw_change_deg": yaw, "pitch_change_deg": pitch, "roll_change_deg": roll}
     figures |= {f"{axis}_change_m": float(value) for axis, value in zip("xyz", shift_m, strict=True)}
     if true is not None:
@@ -347,12 +345,3 @@ def _own_words(figures: Mapping[str, Any]) -> str:
         listed = ", ".join(f"{count} {reason}" for reason, count in reasons)
         words += f"; {figures['excluded']} candidates left out, most often: {listed}"
     return words
-
-
-def _lane_figures(hd_map: HdMap, truth: Truth | None) -> dict[str, Any]:
-    if truth is not None:
-        return asdict(lane_metrics(hd_map.lanes, truth))
-    return {
-        "lanes": len(hd_map.lanes),
-        "length_m": float(sum(length_m(lane.points_map) for lane in hd_map.lanes)),
-    }

@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.store.files import replace_text
-from v2hdm.store.results import result_folder
-
-__all__ = ["result_folder", "write_json"]
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

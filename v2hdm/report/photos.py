@@ -121,10 +121,8 @@ def save_grid(
             draw_lines(canvas, project_line(camera.info, cam_from_vehicle, line), pen)
         draw_lines(canvas, [_horizon(camera.info, cam_from_vehicle)], replace(pen, width=2))
         legend.append((pen, _WORDS[name]))
-    closed = np.vstack([camera.roi_vehicle, camera.roi_vehicle[:1]])
-    parts, first = np.linspace(0, 1, 40)[:, None], next(iter(mountings.values()))
-    dense = np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(closed)])
-    draw_lines(canvas, project_line(camera.info, first, dense), _ROI)
+    first = next(iter(mountings.values()))
+    draw_lines(canvas, project_outline(camera.info, first, camera.roi_vehicle), _ROI)
     legend.append((_ROI, "roi_vehicle, by the guess"))
     for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
         _label(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
@@ -137,6 +135,12 @@ def project_line(
     """The pieces (N, 2), recorded px, of a dense ground line (M, 2) that lie in and near the image."""
     pinhole, depth_m = project_ground(info.intrinsic, cam_from_vehicle, line_vehicle)
     return _visible_pieces(info, pinhole, depth_m > _NEAREST_M, 0.15)
+
+
+def project_outline(info: CameraInfo, cam_from_vehicle: FloatArray, outline: FloatArray) -> list[FloatArray]:
+    """The pieces (N, 2), recorded px, of a polygon (M, 2) of the ground that lie in and near the image."""
+    sides = zip(outline, np.roll(outline, -1, axis=0), strict=True)
+    return project_line(info, cam_from_vehicle, np.concatenate([np.linspace(a, b, 40) for a, b in sides]))
 
 
 def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
@@ -236,19 +240,14 @@ def save_overlay(
     for name, pinhole_px_from_map in views.items():
         pen = OVERLAY.get(name, _BEFORE)
         for line in lines:
-            draw_lines(canvas, _project_map_line(line, info, position_map, pinhole_px_from_map), pen)
+            # Densified, for lenses bend it.
+            dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
+            near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
+            pieces = _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
+            draw_lines(canvas, pieces, pen)
         said = "found by the run" if name in OVERLAY else "that the run began with"
         legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
     _write_image(path, with_legend(canvas, legend))
-
-
-def _project_map_line(
-    line_map: FloatArray, info: CameraInfo, position_map: FloatArray, pinhole_px_from_map: FloatArray
-) -> list[FloatArray]:
-    """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
-    dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line_map)])
-    near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-    return _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
 
 
 def _visible_pieces(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -46,7 +47,14 @@ LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", 
 MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
 """Marker of each method."""
 
-_RC: dict[Any, Any] = {
+
+def line_of(method: str) -> dict[str, Any]:
+    """Colour, marker and line style of a method as keywords of ``plot``."""
+    marker, line = MARKER.get(method, "."), LINE.get(method, "-")
+    return {"color": METHOD.get(method, "k"), "marker": marker, "ls": line}
+
+
+RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10,
     "axes.spines.top": False,
@@ -68,7 +76,7 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
 
     It has a canvas of its own and never touches pyplot's global state.
     """
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
         FigureCanvasAgg(fig)
         yield fig
@@ -86,6 +94,20 @@ def set_image_axes(axes: Axes, left: float, right: float, bottom: float, top: fl
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)")
 
 
+def draw_arrows(
+    axes: Axes, places: FloatArray, arrows: FloatArray, longest: float, span: float, **look: Any
+) -> None:
+    """Draw arrows (N, 2) at places (N, 2) so that the ``longest`` spans ``span``, with a key in px above."""
+    if not len(places):  # matplotlib cannot draw the key of no arrows
+        return
+    longest = max(longest, 1e-3)
+    drawn = axes.quiver(*places.T, *arrows.T, angles="xy", scale_units="xy", scale=longest / span, **look)
+    power = 10.0 ** np.floor(np.log10(longest))
+    key_px = max(step for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9)) * power
+    size = {"size": mpl.rcParams["font.size"] - 1}
+    axes.quiverkey(drawn, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", fontproperties=size)
+
+
 def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
     """Show the square about a point (2,) that reaches ``half`` to each side."""
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
@@ -93,10 +115,8 @@ def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
 
 def set_logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     """A logarithmic axis with a grid, whose 1, 2 and 5 have labels."""
+    axes.set(**{f"{which}scale": "log"})
     axis = axes.xaxis if which == "x" else axes.yaxis
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(
-        lambda value, _: f"{value:g}" if f"{value:g}".lstrip("0.")[:1] in ("2", "5") else ""
-    )
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:g}".lstrip("0.")[:1] in ("2", "5") else "")
     axes.grid(axis=which, which="both", color=GRID)

@@ -25,20 +25,31 @@ METHODS: Mapping[str, str] = {
 """The methods of the paper (IROS 2023), in the order of its tables."""
 
 
-_AGAINST_TRUTH = ("recall", "false", "corner RMSE (cm)", "bias (cm)")
-_WITHOUT_TRUTH = ("sigma (cm)", "reprojection (px)")
+_Column = tuple[str, int, float]  # key in metrics.json, digits behind the point, factor
+_AGAINST_TRUTH: Mapping[str, _Column] = {
+    "recall": ("recall", 3, 1.0),
+    "false": ("false_markings", 0, 1.0),
+    "corner RMSE (cm)": ("corner_rmse_m", 1, 100.0),
+    "bias (cm)": ("corner_bias_m", 1, 100.0),
+}
+_WITHOUT_TRUTH: Mapping[str, _Column] = {
+    "sigma (cm)": ("median_sigma_m", 1, 100.0),
+    "reprojection (px)": ("reprojection_rmse_px", 2, 1.0),
+}
 
 
 def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
     """Method x camera set: markings, recall and corner errors, from ``metrics.json``'s ``results``."""
     has_truth = any("recall" in row for rows in results.values() for row in rows.values())
-    headings = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
-    table = new_table(title, ("method", "cameras"), ("markings", *headings))
-    methods = sorted({m for rows in results.values() for m in rows}, key=lambda m: (_order(m), m))
-    for method in methods:
+    columns = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
+    table = new_table(title, ("method", "cameras"), ("markings", *columns))
+    others = sorted({method for rows in results.values() for method in rows} - set(METHODS))
+    for method in (*METHODS, *others):
         for cameras, rows in results.items():
             if method in rows:
-                table.add_row(method, cameras, *_cells(rows[method], has_truth))
+                found = rows[method]
+                cells = [_number(found.get(key), digits, by) for key, digits, by in columns.values()]
+                table.add_row(method, cameras, str(found["markings"]), *cells)
         table.add_section()
     return table
 
@@ -53,23 +64,7 @@ def new_table(
     return table
 
 
-def _order(method: str) -> int:
-    return list(METHODS).index(method) if method in METHODS else len(METHODS)
-
-
-def _cells(row: Mapping[str, float], has_truth: bool) -> list[str]:
-    if not has_truth:
-        sigma, reprojection = row.get("median_sigma_m"), row.get("reprojection_rmse_px")
-        return [str(row["markings"]), _number(sigma, 1, 100.0), _number(reprojection, 2)]
-    return [
-        str(row["markings"]),
-        _number(row.get("recall"), 3),
-        str(row.get("false_markings", "-")),
-        *(_number(row.get(key), 1, 100.0) for key in ("corner_rmse_m", "corner_bias_m")),
-    ]
-
-
-def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
+def _number(value: float | None, digits: int, factor: float) -> str:
     return "-" if value is None or math.isnan(value) else f"{factor * value:.{digits}f}"
 
 
@@ -103,14 +98,11 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
         lines = progress_lines(lambda line: plain(console, line))
         yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
         return
-    columns = (
-        TextColumn("{task.description:<20}", markup=False),
-        TextColumn("{task.fields[stage]:<16}", markup=False),
-        BarColumn(30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as bars:
+    texts = [
+        TextColumn(text, markup=False) for text in ("{task.description:<20}", "{task.fields[stage]:<16}")
+    ]
+    bar = (BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*texts, *bar, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
         def advance(drive: str, stage: str, done: int, total: int) -> None:

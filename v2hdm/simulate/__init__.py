@@ -41,16 +41,14 @@ def simulate_port(
         ConfigError: no port has this name, or the settings make none.
         DriveError: the folder cannot be written.
     """
-    config = _shipped(port) if isinstance(port, str) else port
-    if seed is not None:
-        config = replace(config, seed=seed)
+    if isinstance(port, str):
+        # In the package when installed, else the checkout's.
+        conf = next(one for one in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if one.is_dir())
+        files = {path.stem: path for path in sorted(conf.glob("run/port*.yaml"))}
+        if port not in files:
+            raise ConfigError(
+                f"there is no port {port!r}; choose from {', '.join(files)}, or give a PortConfig"
+            )
+        port = msgspec.convert(load_yaml(files[port], ConfigError)["simulate"], PortConfig)
+    config = port if seed is None else replace(port, seed=seed)
     return read_drive(rendered_drive(config, Path(folder), workers, progress or (lambda done, total: None)))
-
-
-def _shipped(name: str) -> PortConfig:
-    # In the package when installed, else the checkout's.
-    runs = next(one for one in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if one.is_dir()) / "run"
-    files = {path.stem: path for path in sorted(runs.glob("port*.yaml"))}
-    if name not in files:
-        raise ConfigError(f"there is no port {name!r}; choose from {', '.join(files)}, or give a PortConfig")
-    return msgspec.convert(load_yaml(files[name], ConfigError)["simulate"], PortConfig)

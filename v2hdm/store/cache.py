@@ -26,11 +26,9 @@ from v2hdm.errors import ConfigError
 from v2hdm.extras import need
 from v2hdm.store.files import file_digest
 from v2hdm.store.lock import HOST, STAGES, in_use
-from v2hdm.store.remote import RemoteFolder
 
 _log = logging.getLogger(__name__)
 _Value = TypeVar("_Value")
-_Answer = TypeVar("_Answer")
 Line = tuple[str, int, str]
 """Name of a logger, level, message."""
 
@@ -59,10 +57,7 @@ class CodecError(ValueError):
 def encode(value: Any) -> bytes:
     """The bytes of dataclasses, enumerations, paths, numpy arrays and plain values.
 
-    Equal values of one type and order have equal bytes.
-
-    Raises:
-        TypeError: it holds something that cannot be kept.
+    Equal values of one type and order have equal bytes. Raises TypeError for what cannot be kept.
     """
     data: bytes = _encoder().encode(value)
     return data
@@ -71,8 +66,7 @@ def encode(value: Any) -> bytes:
 def decode(data: bytes, kind: type[_Value]) -> _Value:
     """The value of type ``kind`` that :func:`encode` made ``data`` of; arrays are laid out row by row.
 
-    Raises:
-        CodecError: the bytes are of no such value.
+    Raises CodecError where the bytes are of no such value.
     """
     codec = _codec()
     try:
@@ -137,27 +131,20 @@ def library_versions() -> dict[str, str]:
 
 
 class StageCache:
-    """The entries of a cache folder, and of the store ``behind`` it, of which it holds copies then.
+    """The entries of a cache folder.
 
     The results of a stage have always been through the codec, and the log lines of their making are logged
     again: a run that goes on with entries cannot tell them from results of its own.
 
     Args:
         folder: of the cache; None keeps nothing.
-        behind: holds entries of the same names.
         resume: whether entries are taken; otherwise everything is made anew, and kept.
     """
 
-    def __init__(self, folder: Path | None, behind: RemoteFolder | None = None, resume: bool = True) -> None:
-        self.folder, self._behind, self._resume = folder, behind, resume
-        self._can_write = folder is not None
+    def __init__(self, folder: Path | None, resume: bool = True) -> None:
+        self.folder, self._resume, self._can_write = folder, resume, folder is not None
         self.hits: list[str] = []
         """Stages whose entries were there."""
-
-    @property
-    def local(self) -> StageCache:
-        """The folder alone: for what is true of this machine's folders only."""
-        return StageCache(self.folder)
 
     def in_use(self) -> AbstractContextManager[None]:
         """Protect from pruning what is read or written within."""
@@ -169,7 +156,7 @@ class StageCache:
 
     def path(self, stage: str, key: str) -> Path:
         """Where the entry of a stage belongs."""
-        return (self.folder or Path()) / entry_name(stage, key)
+        return (self.folder or Path()) / STAGES / stage / f"{key}{ENDING}"
 
     def get_or_make(self, stage: str, key: str, kind: type[_Value], make: Callable[[], _Value]) -> _Value:
         """The result of a stage, of type ``kind``: its entry, or else what ``make`` makes."""
@@ -194,15 +181,25 @@ class StageCache:
 
     def get(self, stage: str, key: str, kind: type[_Value]) -> _Value | None:
         """The entry of a stage under ``key``; None where there is none that is whole."""
-        data = self._read(stage, key) if self._resume and self.folder is not None else None
-        if data is None:
+        path = self.path(stage, key)
+        if not self._resume or self.folder is None or not path.is_file():  # a pipe would be waited for
             return None
         try:
-            lines, content = decode(data, tuple[list[Line], bytes])
-            value = decode(content, kind)
-        except CodecError:
-            self._drop(stage, key)
+            content = checked(path.read_bytes())
+            lines, kept = decode(content or b"", tuple[list[Line], bytes])
+            value = decode(kept, kind)
+        except FileNotFoundError:
             return None
+        except OSError as failure:
+            _log.warning("%s: cannot be read (%s); it is made anew", path, failure.strerror)
+            return None
+        except CodecError:
+            _log.warning("%s: is damaged; it is made anew", path)
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+            return None
+        with suppress(OSError):  # a cache that may only be read
+            os.utime(path)
         log_again(lines)
         self.hits.append(stage)
         return value
@@ -214,51 +211,18 @@ class StageCache:
 
         Where nothing can be written, a warning says so, once.
         """
-        content = encode(value)
-        if self.folder is not None:
-            entry = encode((lines or [], content))
-            entry = _HEAD + hashlib.sha256(entry).digest() + entry
-            self._write(stage, key, entry)
-            self._ask_behind(lambda behind: behind.write(entry_name(stage, key), entry))
-        return decode(content, kind)
-
-    def _read(self, stage: str, key: str) -> bytes | None:
-        """The content of an entry, which is copied from the store behind where it is only there."""
-        path, data = self.path(stage, key), None
-        try:
-            data = path.read_bytes() if path.is_file() else None  # a pipe would be waited for
-        except FileNotFoundError:
-            pass
-        except OSError as failure:
-            _log.warning("%s: cannot be read (%s); it is made anew", path, failure.strerror)
-        if data is not None and checked(data) is None:
-            self._drop(stage, key)
-            return None
-        if data is not None:
-            with suppress(OSError):  # a cache that may only be read
-                os.utime(path)
-            return checked(data)
-        data = self._ask_behind(lambda behind: behind.read(entry_name(stage, key)))
-        if data is not None and checked(data) is None:
-            self._drop(stage, key)
-        elif data is not None:
-            self._write(stage, key, data)
-            return checked(data)
-        return None
-
-    def _write(self, stage: str, key: str, entry: bytes) -> None:
-        path = self.path(stage, key)
+        content, path = encode(value), self.path(stage, key)
         partial = path.with_name(f".{HOST}-{secrets.token_hex(8)}.part")
-        if not self._can_write:
-            return
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with partial.open("xb") as stream:
-                    stream.write(entry)
-                partial.replace(path)
-            finally:
-                partial.unlink(missing_ok=True)
+            if self._can_write:
+                entry = encode((lines or [], content))
+                path.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    with partial.open("xb") as stream:
+                        stream.write(_HEAD + hashlib.sha256(entry).digest() + entry)
+                    partial.replace(path)
+                finally:
+                    partial.unlink(missing_ok=True)
         except OSError as failure:
             self._can_write = False
             _log.warning(
@@ -266,29 +230,7 @@ class StageCache:
                 "another cache=",
                 path.parents[1], failure.strerror,
             )  # fmt: skip
-
-    def _drop(self, stage: str, key: str) -> None:
-        path = self.path(stage, key)
-        _log.warning("%s: is damaged; it is made anew", path)
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        self._ask_behind(lambda behind: behind.remove(entry_name(stage, key)))
-
-    def _ask_behind(self, question: Callable[[RemoteFolder], _Answer]) -> _Answer | None:
-        """The answer of the store behind; one that fails is reported once and left alone from then on."""
-        if self._behind is None:
-            return None
-        try:
-            return question(self._behind)
-        except ConfigError as failure:
-            self._behind = None
-            _log.warning("%s; the run goes on without that cache", failure)
-            return None
-
-
-def entry_name(stage: str, key: str) -> str:
-    """The path of an entry within its cache."""
-    return f"{STAGES}/{stage}/{key}{ENDING}"
+        return decode(content, kind)
 
 
 def checked(data: bytes) -> bytes | None:

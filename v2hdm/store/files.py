@@ -21,28 +21,10 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.safe.texts import read_json, read_text, read_yaml, shown
+from v2hdm.io.safe.texts import read_json, read_yaml, shown
+from v2hdm.io.safe.texts import read_text as read_text
 from v2hdm.records import FloatArray
 from v2hdm.store.inputs import refuse_input
-
-__all__ = [
-    "check_keys",
-    "dump_yaml",
-    "file_digest",
-    "forget_stdout",
-    "load_json",
-    "load_yaml",
-    "observed_writes",
-    "read_text",
-    "refuse_url",
-    "replace_text",
-    "take_array",
-    "take_choice",
-    "take_mapping",
-    "take_number",
-    "take_text",
-    "whole_file",
-]
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _LARGEST = sys.float_info.max
@@ -66,11 +48,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A hidden name beside ``path`` to write to, which takes its place when the block succeeds.
 
     Readers see the old file or the whole new one. After an error nothing new is left. The folder is created
-    when absent.
-
-    Raises:
-        ConfigError: ``path`` is an input of this command, or no plain file.
-        OSError: it cannot be written there; the error names ``path``.
+    when absent. Raises ConfigError where ``path`` is an input of this command, or no plain file, OSError,
+    which names it, where it cannot be written.
     """
     refuse_url(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,8 +76,8 @@ def refuse_url(path: Path) -> None:
     """Raise ConfigError for a URL that was taken for a path: it would be a folder called ``s3:``."""
     if _URL.match(str(path)):
         raise ConfigError(
-            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm map and "
-            "v2hdm.fleet; give a path on this machine"
+            f"{path}: no URL is written to here, only as output= of v2hdm map and v2hdm fleet; "
+            "give a path on this machine"
         )
 
 
@@ -117,9 +96,8 @@ def file_digest(path: Path) -> str:
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.safe.texts.read_yaml`.
 
-    Raises:
-        V2hdmError: of type ``error``, when the file is missing, has a syntax error (with its line)
-            or holds anything but a mapping.
+    Raises ``error`` when the file is missing, has a syntax error (with its line) or holds anything but a
+    mapping.
     """
     content = read_yaml(path, error)
     if not isinstance(content, dict):
@@ -205,8 +183,3 @@ def take_choice(content: object, choices: Collection[str], where: str, error: ty
     if not isinstance(content, str) or content not in choices:
         raise error(f"{where}: expected one of {', '.join(choices)}, got {shown(content)}")
     return content
-
-
-def forget_stdout() -> None:
-    """Keep Python from writing at its end what could not be written before."""
-    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123

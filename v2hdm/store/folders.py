@@ -59,10 +59,7 @@ def size_of(folder: Path) -> int | None:
 def remove_ours(folder: Path) -> None:
     """Remove our files from a folder, and the folder where nothing else is in it.
 
-    Those at its top go first: without them it is neither a drive nor an import.
-
-    Raises:
-        OSError: a file cannot be removed.
+    Those at its top go first: without them it is neither a drive nor an import. Raises OSError.
     """
     for path in sorted(_ours(folder), key=lambda path: (len(path.parts), path)):
         path.unlink(missing_ok=True)
@@ -100,8 +97,7 @@ def _listed(folder: Path) -> dict[str, Any]:
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
     """Where the import of a stream of some source files belongs: named by a hash of all that it is made of.
 
-    Raises:
-        DriveError: a source cannot be looked at.
+    Raises DriveError where a source cannot be looked at.
     """
     try:
         stats = [(file.name, file.stat()) for file in files]

@@ -66,12 +66,15 @@ def warn_if_changed(path: Path, data: bytes) -> None:
     It is read all the same: a map that was corrected by hand is a map.
     """
     with suppress(OSError, RuntimeError):
-        path = path.resolve()
+        path, digest, written = path.resolve(), hashlib.sha256(data).hexdigest(), set()
         folder = next((one for one in path.parents[:_DEEPEST] if (one / LIST).is_file()), None)
         if folder is None:
             return
-        written = _written(folder / LIST, path.relative_to(folder).as_posix())
-        digest = hashlib.sha256(data).hexdigest()
+        for line in (folder / LIST).read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
+            with suppress(ValueError, TypeError, LookupError, RecursionError):  # a torn or foreign line
+                entry = json.loads(line)
+                if entry["file"] == path.relative_to(folder).as_posix():
+                    written.add(str(entry["sha256"]))
         if written and digest not in written and (path, digest) not in _reported:
             _reported.add((path, digest))
             _log.warning(
@@ -79,14 +82,3 @@ def warn_if_changed(path: Path, data: bytes) -> None:
                 "make it anew",
                 path,
             )
-
-
-def _written(listing: Path, name: str) -> set[str]:
-    """Digests of everything written under a name; a torn or foreign line holds none."""
-    found = set()
-    for line in listing.read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
-        with suppress(ValueError, TypeError, LookupError, RecursionError):
-            entry = json.loads(line)
-            if entry["file"] == name:
-                found.add(str(entry["sha256"]))
-    return found

@@ -53,8 +53,16 @@ def take_lock(stream: IO[str]) -> bool:
 @contextmanager
 def in_use(cache: Path) -> Iterator[None]:
     """Protect from pruning what is used in a cache within this block, if anything can be written there."""
-    path, here = cache / IN_USE / f"{secrets.token_hex(8)}{_ENDING}", cache.resolve()
-    stream = _created(path)
+    path, here, stream = cache / IN_USE / f"{secrets.token_hex(8)}{_ENDING}", cache.resolve(), None
+    for _ in range(_TRIES):  # whoever leaves may remove the folder meanwhile
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream = path.open("x", encoding="utf-8")
+            break
+        except FileNotFoundError:
+            continue
+        except OSError:
+            break
     if stream is None:
         yield
         return
@@ -84,32 +92,11 @@ def unused_before(cache: Path) -> float:
     earliest = time.time()
     for path in (cache / IN_USE).glob(f"*{_ENDING}"):
         with suppress(OSError):  # given up meanwhile
-            began_s = path.stat().st_mtime
-            if _is_left(path):
+            began_s, is_left = path.stat().st_mtime, False
+            with suppress(OSError), path.open(encoding="utf-8") as stream:  # unreadable counts as held
+                is_left = take_lock(stream)
+            if is_left:
                 path.unlink(missing_ok=True)
             else:
                 earliest = min(earliest, began_s)
     return earliest
-
-
-def _created(path: Path) -> IO[str] | None:
-    for _ in range(_TRIES):  # whoever leaves may remove the folder meanwhile
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            return path.open("x", encoding="utf-8")
-        except FileNotFoundError:
-            continue
-        except OSError:
-            break
-    return None
-
-
-def _is_left(path: Path) -> bool:
-    """Whether the process that held a lock has ended; one that cannot be looked at counts as held."""
-    try:
-        with path.open(encoding="utf-8") as stream:
-            return take_lock(stream)
-    except FileNotFoundError:
-        return True
-    except OSError:
-        return False

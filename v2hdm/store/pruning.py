@@ -8,17 +8,15 @@ from __future__ import annotations
 import logging
 import re
 import shutil
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from v2hdm.store.cache import ENDING, checked
+from v2hdm.store.cache import ENDING
 from v2hdm.store.folders import LIST, is_stale, remove_ours, size_of
 from v2hdm.store.lock import STAGES, unused_before
-from v2hdm.store.remote import RemoteFolder
 
 _log = logging.getLogger(__name__)
 _ENTRY = re.compile(rf"[0-9a-f]{{64}}{re.escape(ENDING)}")
@@ -33,35 +31,17 @@ LEFT = "left by killed runs"
 
 @dataclass(frozen=True)
 class Item:
-    """One thing that a cache keeps.
-
-    Attributes:
-        kind: a stage, or one of the kinds above.
-        path: of the file or folder; of an object, within its store.
-        size: in bytes.
-        used_s: its last use, s since 1970; at a store, when it was written.
-        read, remove: its bytes, and its end; what is gone already is removed.
-    """
+    """One thing that a cache keeps: its kind, size in bytes, last use (s since 1970), and its end."""
 
     kind: str
     path: Path
     size: int
     used_s: float
-    read: Callable[[], bytes]
     remove: Callable[[], None]
 
 
-def items_of(cache: Path | RemoteFolder) -> list[Item]:
-    """Everything that is ours in a cache, what was not used for longest first.
-
-    Raises:
-        ConfigError: the store failed.
-    """
-    found = _items_on_disk(cache) if isinstance(cache, Path) else _items_at_store(cache)
-    return sorted(found, key=lambda item: (item.used_s, item.path))
-
-
-def _items_on_disk(cache: Path) -> list[Item]:
+def items_of(cache: Path) -> list[Item]:
+    """Everything that is ours in a cache, what was not used for longest first."""
     found = []
     for path in (cache / STAGES).glob("*/*"):
         kind = path.parent.name if _ENTRY.fullmatch(path.name) else LEFT
@@ -69,53 +49,35 @@ def _items_on_disk(cache: Path) -> list[Item]:
             continue
         with suppress(OSError):  # another process has removed it
             about, remove = path.stat(), partial(path.unlink, missing_ok=True)
-            found.append(Item(kind, path, about.st_size, about.st_mtime, path.read_bytes, remove))
+            found.append(Item(kind, path, about.st_size, about.st_mtime, remove))
     for folder in cache.glob(".*.part"):
         with suppress(OSError):
             if _PARTIAL.fullmatch(folder.name) and folder.is_dir() and is_stale(folder):
                 left = sum(one.stat().st_size for one in folder.rglob("*"))
-                remove = partial(shutil.rmtree, folder)
-                found.append(Item(LEFT, folder, left, folder.stat().st_mtime, bytes, remove))
+                found.append(Item(LEFT, folder, left, folder.stat().st_mtime, partial(shutil.rmtree, folder)))
     for listing in cache.glob(f"*/{LIST}"):
         folder, size = listing.parent, size_of(listing.parent)
         with suppress(OSError):
             if size is not None:
-                used_s, remove = listing.stat().st_mtime, partial(remove_ours, folder)
-                found.append(Item(DRIVES, folder, size, used_s, listing.read_bytes, remove))
-    return found
+                used_s = listing.stat().st_mtime
+                found.append(Item(DRIVES, folder, size, used_s, partial(remove_ours, folder)))
+    return sorted(found, key=lambda item: (item.used_s, item.path))
 
 
-def _items_at_store(cache: RemoteFolder) -> list[Item]:
-    found = []
-    for name, about in cache.listed().items():
-        path = Path(name)
-        if path.parts[:1] == (STAGES,) and len(path.parts) == 3 and _ENTRY.fullmatch(path.name):
-            read, remove = partial(_read, cache, name), partial(cache.remove, name)
-            found.append(Item(path.parts[1], path, about.size, about.written_s, read, remove))
-    return found
-
-
-def _read(cache: RemoteFolder, name: str) -> bytes:
-    return cache.read(name) or b""
-
-
-def prune(cache: Path | RemoteFolder, limit: float) -> list[Item]:
+def prune(cache: Path, limit: float) -> list[Item]:
     """Remove what was not used for longest until the rest has ``limit`` bytes; returns what was removed.
 
     What killed runs have left goes in any case. More than the limit stays where runs in progress use it.
     """
-    before_s = unused_before(cache) if isinstance(cache, Path) else time.time()
-    items = items_of(cache)
-    size, removed = sum(item.size for item in items), []
+    before_s, items, removed = unused_before(cache), items_of(cache), []
+    size = sum(item.size for item in items)
     for item in items:
         if item.used_s >= before_s or (size <= limit and item.kind != LEFT):
             continue
-        try:
+        with suppress(OSError):  # not ours to remove: on a shared folder, another user's
             item.remove()
-        except OSError:  # not ours to remove: on a shared folder, another user's
-            continue
-        size -= item.size
-        removed.append(item)
+            size -= item.size
+            removed.append(item)
     return removed
 
 
@@ -128,14 +90,3 @@ def prune_to_limit(cache: Path, limit_gb: float) -> None:
             "%s: removed %d entries of %.1f GB that were not used for longest (cache_gb=%g)",
             cache, len(removed), size_gb, limit_gb,
         )  # fmt: skip
-
-
-def remove_damaged(items: Sequence[Item]) -> list[Item]:
-    """Read all entries among some items and remove those that are damaged; returns these."""
-    damaged = []
-    for item in items:
-        with suppress(OSError):
-            if item.kind not in (DRIVES, LEFT) and checked(item.read()) is None:
-                item.remove()
-                damaged.append(item)
-    return damaged

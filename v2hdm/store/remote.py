@@ -1,28 +1,31 @@
-"""Folders at object stores, by URL: objects are read, written whole, created once, listed and removed.
+"""Folders at object stores, by URL: a drive is downloaded once, a finished result uploaded, its list last.
 
 A put replaces an object at once or not at all, and an object can be created once; nothing else is asked of a
-store. Whatever fails there is one line. A drive at a store is downloaded once.
+store. Whatever fails there is one line.
+
+The list, ``.v2hdm-results.jsonl``, names our objects with their hashes and versions. During an upload there
+is ``.v2hdm-unfinished.jsonl`` instead, which names its writer, what was ours and what will be: by the two our
+objects are known from those of others, which are never touched, and a second writer is refused.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import logging
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from datetime import datetime
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import unquote
 
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.extras import need
+from v2hdm.store.files import file_digest
 from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, finish_entry, is_whole, note_use
+from v2hdm.store.inputs import LIST
 
-_Answer = TypeVar("_Answer")
 Report = Callable[[int, int], None]
 """Called as ``report(done, total)`` with numbers of objects."""
 
@@ -41,16 +44,14 @@ _PACKAGES = {
 _NOTHING = ".v2hdm-nothing"
 """A prefix that nobody writes to: cheap to list."""
 
-_WAITS_S = (1.0, 4.0)
-"""Between the tries of a call that may work the next time, beside those that the packages make themselves."""
-
 _AT_ONCE = 32
 """Objects of one call, downloaded side by side."""
 
-_FINAL = (errno.EINVAL, errno.EPERM, errno.ENAMETOOLONG, errno.EMSGSIZE)
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
-_TIMES = ("LastModified", "last_modified", "updated", "modified", "created")
 _MESSAGE_LETTERS = 200
+
+UNFINISHED = ".v2hdm-unfinished.jsonl"
+_ABOUT = {"about": "objects that v2hdm wrote here; a rerun replaces these and no others"}
 
 
 def is_url(place: str) -> bool:
@@ -61,8 +62,7 @@ def is_url(place: str) -> bool:
 def place_of(text: str, option: str) -> Path | RemoteFolder:
     """The folder or the store that the setting ``option`` names; ``file://`` names a folder.
 
-    Raises:
-        ConfigError: it is no place that we can write to.
+    Raises ConfigError where it is no place that we can write to.
     """
     if not is_url(text):
         return Path(text)
@@ -76,17 +76,16 @@ def place_of(text: str, option: str) -> Path | RemoteFolder:
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """An object as it is listed: bytes, a token that changes with it, when it was written (s since 1970)."""
+    """An object as it is listed: bytes, and a token that changes with it."""
 
     size: int
     token: str
-    written_s: float
 
 
 class RemoteFolder:
     """The objects below one URL, by what their names are there.
 
-    Every call is tried again where that may help, and raises a :class:`ConfigError` that names the URL.
+    Whatever fails raises a :class:`ConfigError` that names the URL; what speaks to the store has tried again.
     """
 
     def __init__(self, files: Any, root: str, url: str, option: str) -> None:
@@ -97,8 +96,7 @@ class RemoteFolder:
     def at(cls, url: str, option: str) -> RemoteFolder:
         """The objects below a URL.
 
-        Raises:
-            ConfigError: it names no store that we know, or what speaks to it is not installed.
+        Raises ConfigError where it names no store that we know, or what speaks to it is not installed.
         """
         protocol, rest = url.split("://", 1)
         if protocol not in _PACKAGES:
@@ -126,7 +124,9 @@ class RemoteFolder:
 
     def check(self) -> None:
         """Ask once, so that what is wrong is reported before any work: as :meth:`listed`."""
-        self._in_bucket("", lambda: self._find(f"{self._root}/{_NOTHING}"))
+        with self._asked(in_bucket=True):
+            self._files.invalidate_cache()
+            self._files.find(f"{self._root}/{_NOTHING}", detail=True)
 
     def below(self, name: str) -> RemoteFolder:
         """The objects whose names begin with ``name`` and a slash."""
@@ -134,23 +134,19 @@ class RemoteFolder:
 
     def read(self, name: str) -> bytes | None:
         """The content of an object; None where there is none."""
-        try:
-            data: bytes = self._call(name, lambda: self._files.cat_file(f"{self._root}/{name}"))
-        except FileNotFoundError:
-            return None
-        return data
+        with suppress(FileNotFoundError), self._asked(name):
+            data: bytes = self._files.cat_file(f"{self._root}/{name}")
+            return data
+        return None
 
     def fetch(self, places: Mapping[str, Path]) -> None:
-        """Copy objects, by name, to files.
-
-        Raises:
-            ConfigError: one is not there, or the store failed.
-        """
+        """Copy objects, by name, to files; raises ConfigError where one is not there."""
         for path in places.values():
             path.parent.mkdir(parents=True, exist_ok=True)
         names = [f"{self._root}/{name}" for name in places]
         try:
-            self._call("", lambda: self._files.get(names, [str(path) for path in places.values()]))
+            with self._asked():
+                self._files.get(names, [str(path) for path in places.values()])
         except FileNotFoundError as failure:
             raise ConfigError(
                 f"{self.url}: {_first_line(failure)} went while it was copied; start again"
@@ -158,7 +154,7 @@ class RemoteFolder:
 
     def write(self, name: str, content: bytes | Path) -> None:
         """Put an object, given as bytes or as a file, in whatever one of that name has been."""
-        self._in_bucket(name, lambda: self._put(name, content, "overwrite"))
+        self._put(name, content, "overwrite")
 
     def create(self, name: str, content: bytes | Path) -> bool:
         """Put an object where there is none of that name; whether there was none.
@@ -166,93 +162,65 @@ class RemoteFolder:
         Where an earlier try may have worked whose answer was lost, the object there is compared.
         """
         try:
-            self._in_bucket(name, lambda: self._put(name, content, "create"))
+            self._put(name, content, "create")
         except FileExistsError:
             return self.read(name) == (content if isinstance(content, bytes) else content.read_bytes())
         return True
 
-    def listed(self) -> dict[str, RemoteFile]:
-        """All objects, by name.
+    def _put(self, name: str, content: bytes | Path, mode: str) -> None:
+        with self._asked(name, in_bucket=True):
+            if isinstance(content, bytes):
+                self._files.pipe_file(f"{self._root}/{name}", content, mode=mode)
+            else:
+                self._files.put_file(str(content), f"{self._root}/{name}", mode=mode)
 
-        Raises:
-            ConfigError: there is no such bucket, or it cannot be listed.
-        """
-        begin = f"{self._root}/"
-        found = self._in_bucket("", lambda: self._find(self._root))
-        return {name[len(begin) :]: _listed(one) for name, one in found.items() if name.startswith(begin)}
+    def listed(self) -> dict[str, RemoteFile]:
+        """All objects, by name; raises ConfigError where there is no such bucket."""
+        with self._asked(in_bucket=True):
+            self._files.invalidate_cache()
+            found = self._files.find(self._root, detail=True)
+        listed = {}
+        for path, about in found.items():
+            if path.startswith(f"{self._root}/"):
+                token = next((str(about[key]) for key in _TOKENS if about.get(key) is not None), "")
+                listed[path[len(self._root) + 1 :]] = RemoteFile(int(about["size"]), token.strip('"'))
+        return listed
 
     def remove(self, name: str) -> None:
         """Remove an object, if it is there."""
+        with self._asked(name), suppress(FileNotFoundError, KeyError):  # the latter of the store in memory
+            self._files.rm_file(f"{self._root}/{name}")
+
+    @contextmanager
+    def _asked(self, name: str = "", in_bucket: bool = False) -> Iterator[None]:
+        """Make of what fails within one line; an object that is or is not there is raised as it is."""
         try:
-            self._call(name, lambda: self._rm(f"{self._root}/{name}"))
+            yield
+        except FileExistsError:
+            raise
         except FileNotFoundError:
-            return
-
-    def _put(self, name: str, content: bytes | Path, mode: str) -> None:
-        path = f"{self._root}/{name}"
-        if isinstance(content, bytes):
-            self._files.pipe_file(path, content, mode=mode)
-        else:
-            self._files.put_file(str(content), path, mode=mode)
-
-    def _rm(self, path: str) -> None:
-        try:
-            self._files.rm_file(path)
-        except KeyError:  # of the store in memory
-            raise FileNotFoundError(path) from None
-
-    def _find(self, path: str) -> dict[str, Any]:
-        self._files.invalidate_cache()
-        found: dict[str, Any] = self._files.find(path, detail=True)
-        return found
-
-    def _in_bucket(self, name: str, work: Callable[[], _Answer]) -> _Answer:
-        try:
-            return self._call(name, work)
-        except FileNotFoundError:
+            if not in_bucket:
+                raise
             raise ConfigError(
                 f"{self.url}: no such bucket or container; make it, or give another {self._option}"
             ) from None
-
-    def _call(self, name: str, work: Callable[[], _Answer]) -> _Answer:
-        where = f"{self.url}/{name}" if name else self.url
-        for wait_s in (*_WAITS_S, None):
-            try:
-                return work()
-            except (FileNotFoundError, FileExistsError):
-                raise
-            except Exception as failure:  # each package has errors of its own
-                refused = isinstance(failure, PermissionError) or "Credential" in type(failure).__name__
-                final = refused or (isinstance(failure, OSError) and failure.errno in _FINAL)
-                if wait_s is None or final:
-                    advice = f"check the network and start again, or give another {self._option}"
-                    if refused:
-                        advice = "check the credentials, as the package that speaks to the store takes them"
-                    raise ConfigError(f"{where}: does not work ({_first_line(failure)}); {advice}") from None
-                _log.warning("%s: %s; trying again in %g s", where, _first_line(failure), wait_s)
-                time.sleep(wait_s)
-        raise AssertionError
+        except Exception as failure:  # each package has errors of its own
+            advice = f"check the network and start again, or give another {self._option}"
+            if isinstance(failure, PermissionError) or "Credential" in type(failure).__name__:
+                advice = "check the credentials, as the package that speaks to the store takes them"
+            where = f"{self.url}/{name}" if name else self.url
+            raise ConfigError(f"{where}: does not work ({_first_line(failure)}); {advice}") from None
 
 
 def _first_line(failure: Exception) -> str:
     return " ".join(str(failure).split())[:_MESSAGE_LETTERS] or type(failure).__name__
 
 
-def _listed(about: dict[str, Any]) -> RemoteFile:
-    token = next((str(about[key]) for key in _TOKENS if about.get(key) is not None), "")
-    written = next((about[key] for key in _TIMES if about.get(key) is not None), 0.0)
-    if isinstance(written, str):
-        written = datetime.fromisoformat(written)
-    written_s = written.timestamp() if isinstance(written, datetime) else float(written)
-    return RemoteFile(int(about["size"]), token.strip('"'), written_s)
-
-
 def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
     """The folder in ``cache`` that holds what is below a URL now, copied once for each content it has had.
 
-    Raises:
-        DriveError: there is no drive, a name of it leads out of its folder, or the copy cannot be written.
-        ConfigError: the store failed.
+    Raises DriveError where there is no drive, a name of it leads out of its folder, or the copy cannot be
+    written.
     """
     there = {name: one for name, one in drive.listed().items() if not name.endswith("/")}
     if not there:
@@ -284,3 +252,138 @@ def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
     finally:
         drop_entry(entry)
     return entry / called
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A line of a list: an object of ours; ``token`` is empty where it may not have been put."""
+
+    file: str
+    sha256: str
+    size: int
+    token: str = ""
+
+    @classmethod
+    def of(cls, name: str, content: bytes | Path) -> _Entry:
+        if isinstance(content, bytes):
+            return cls(name, _digest(content), len(content))
+        return cls(name, file_digest(content), content.stat().st_size)
+
+    def is_of(self, there: RemoteFile, place: RemoteFolder) -> bool:
+        """Whether an object there is this one: by its token, else by its content."""
+        known = self.token and there.token == self.token
+        return there.size == self.size and (known or _digest(place.read(self.file) or b"") == self.sha256)
+
+
+def is_whole_at(place: RemoteFolder) -> bool:
+    """Whether there is a finished result at a store whose objects are all there as they were put."""
+    listing = place.read(LIST)
+    if listing is None:
+        return False
+    there, (_, entries) = place.listed(), _entries(place, LIST, listing)
+    return bool(entries) and all(
+        one.file in there and (one.size, one.token) == (there[one.file].size, there[one.file].token)
+        for one in entries
+    )
+
+
+def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
+    """Our objects that are at a place where ``writer`` may put a result.
+
+    Raises ConfigError where there are objects and none is ours, one of ours was changed, or another writer
+    has begun to put a result there.
+    """
+    there = place.listed()
+    found = {name: _entries(place, name, place.read(name)) for name in (LIST, UNFINISHED) if name in there}
+    if there and not found:
+        raise ConfigError(f"{place} holds objects that are no results of ours: give another place")
+    if UNFINISHED in found and found[UNFINISHED][0] not in ("", writer):
+        raise _of_another(place, found[UNFINISHED][0])
+    entries = [one for _, listed in found.values() for one in listed]
+    ours: dict[str, _Entry] = {}
+    for name in {one.file for one in entries} & set(there):
+        known = (one for one in entries if one.file == name)
+        mine = next((one for one in known if one.is_of(there[name], place)), None)
+        if mine is None:
+            raise ConfigError(
+                f"{place}/{name}: was changed after we wrote it and is not replaced; move it, or "
+                "give another place"
+            )
+        ours[name] = mine
+    return ours
+
+
+def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: str, report: Report) -> None:
+    """Put a result in the place of an earlier one, whose objects that stay the same stay.
+
+    ``contents`` are objects by name, as bytes or as files. The same ``writer`` may go on after it was
+    stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where another's object has a
+    name of ours.
+    """
+    new = {name: _Entry.of(name, content) for name, content in contents.items()}
+    listing, ours = place.read(LIST), refuse_upload(place, writer)
+    for name in sorted(set(new) & set(place.listed()) - set(ours)):
+        raise _foreign(place, name)
+    begun = _listing([*ours.values(), *new.values()], writer)
+    if not place.create(UNFINISHED, begun):
+        holder, _ = _entries(place, UNFINISHED, place.read(UNFINISHED))
+        if holder not in ("", writer):
+            raise _of_another(place, holder)
+        place.write(UNFINISHED, begun)
+    if place.read(LIST) != listing:
+        place.remove(UNFINISHED)
+        raise ConfigError(f"{place}: another process has just put a result there; start again")
+    place.remove(LIST)
+    for name in sorted(set(ours) - set(new)):
+        place.remove(name)
+    for number, (name, content) in enumerate(contents.items()):
+        report(number, len(contents))
+        if name in ours and ours[name].sha256 != new[name].sha256:
+            place.write(name, content)
+        elif name not in ours and not place.create(name, content):
+            raise _foreign(place, name)
+    there, put = place.listed(), []
+    for name, one in new.items():
+        if name not in there or there[name].size != one.size:
+            raise ConfigError(f"{place}/{name}: is not there as it was put; start again")
+        put.append(replace(one, token=there[name].token))
+    place.write(LIST, _listing(put))
+    place.remove(UNFINISHED)
+    report(len(contents), len(contents))
+
+
+def contents_of(folder: Path) -> dict[str, bytes | Path]:
+    """The files of a result folder but its list, by name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / LIST)
+    return {path.relative_to(folder).as_posix(): path for path in files}
+
+
+def _entries(place: RemoteFolder, name: str, listing: bytes | None) -> tuple[str, list[_Entry]]:
+    """The writer that a list names, empty where it names none, and its entries."""
+    try:
+        head, *lines = [json.loads(line) for line in (listing or b"{}").decode().splitlines()]
+        return str(head.get("writer", "")), [
+            _Entry(str(one["file"]), str(one["sha256"]), int(one["size"]), str(one["token"])) for one in lines
+        ]
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        raise ConfigError(f"{place}/{name}: is damaged; give another place") from None
+
+
+def _listing(entries: Iterable[_Entry], writer: str = "") -> bytes:
+    head = _ABOUT | ({"writer": writer} if writer else {})
+    return "".join(json.dumps(one) + "\n" for one in [head, *map(asdict, entries)]).encode()
+
+
+def _foreign(place: RemoteFolder, name: str) -> ConfigError:
+    return ConfigError(f"{place}/{name}: is no object of ours; move it, or give another place")
+
+
+def _of_another(place: RemoteFolder, writer: str) -> ConfigError:
+    return ConfigError(
+        f"{place} is being written by {writer}, or was when that was stopped; wait for it, start it there "
+        f"again, or, where it is dead, remove {UNFINISHED}"
+    )
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -13,7 +13,8 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
@@ -29,33 +30,163 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 """The disk is at fault, whatever was being written."""
 
 
+class _Target:
+    """A folder of results, and the option that errors name it by."""
+
+    def __init__(self, shown: Path, option: str) -> None:
+        """Where ``shown`` leads; a folder that cannot be put aside is refused before any work."""
+        refuse_url(shown)
+        self.shown, self.option = shown, option
+        try:
+            self.path = shown.resolve()
+        except (OSError, RuntimeError, ValueError):
+            raise ConfigError(f"output folder {shown}: leads nowhere; give another {option}") from None
+        if self.path.is_mount():
+            raise ConfigError(f"output folder {shown} is a disk of its own; give a folder within it")
+        if self.path.exists() and not self.path.is_dir():
+            raise ConfigError(f"output folder {shown} is a file; give another {option}")
+
+    def hidden(self, kind: str) -> Path:
+        """A name beside it."""
+        return self.path.with_name(f".{self.path.name}.{kind}")
+
+    @contextmanager
+    def explained(self, only: tuple[int, ...] = ()) -> Iterator[None]:
+        """Make of an OSError, perhaps only of some kinds, the output folder's in one line."""
+        try:
+            yield
+        except OSError as failure:
+            if only and failure.errno not in only:
+                raise
+            raise ConfigError(
+                f"output folder {self.shown} cannot be written: {failure.strerror}; nothing new is left: "
+                f"free space or give another {self.option}"
+            ) from None
+
+    def listed(self) -> dict[str, list[str]] | None:
+        """Digests of our files by name, the last one last; None if it is empty, an error if not ours."""
+        if not self.path.exists() or not any(self.path.iterdir()):
+            return None
+        if not (self.path / LIST).is_file():
+            raise ConfigError(
+                f"output folder {self.shown} holds files that are no results of ours: give another "
+                f"{self.option}"
+            )
+        listed: dict[str, list[str]] = {}
+        try:
+            for line in (self.path / LIST).read_text(encoding="utf-8").splitlines()[1:]:
+                entry = json.loads(line)
+                listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
+        except (ValueError, TypeError, LookupError, RecursionError):
+            raise ConfigError(f"{self.shown / LIST}: is damaged; give another {self.option}") from None
+        return listed
+
+    @contextmanager
+    def parents(self) -> Iterator[None]:
+        """Make the folders that it is to lie in; those that end up empty go again."""
+        missing = [parent for parent in self.path.parents if not parent.exists()]
+        with self.explained():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield
+        finally:
+            for parent in missing:
+                with suppress(OSError):
+                    parent.rmdir()
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold its lock, a file beside it, until the block or the process ends."""
+        path = self.hidden("lock")
+        with self.explained():
+            while True:
+                stream = path.open("a+", encoding="utf-8")
+                if not take_lock(stream):
+                    stream.seek(0)
+                    holder = stream.read(200).strip()
+                    stream.close()
+                    raise ConfigError(
+                        f"output folder {self.shown} is being written by {holder or 'another process'}; wait "
+                        f"for it, or give another {self.option}"
+                    )
+                # The last holder may have removed the file between our opening and locking it.
+                with suppress(OSError):
+                    if os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+                        break
+                stream.close()
+        try:
+            with self.explained():
+                stream.truncate(0)
+                stream.write(f"process {os.getpid()} on {HOST}\n")
+                stream.flush()
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                stream.close()
+
+    def recover(self, unfinished: Path, previous: Path) -> None:
+        """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
+        for left in (unfinished, previous):
+            if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
+                raise ConfigError(
+                    f"{left}: is in the way of our work and not ours; move it, or give another {self.option}"
+                )
+        if previous.exists() and not self.path.exists():
+            previous.replace(self.path)
+        for left in (unfinished, previous):
+            if left.exists():
+                shutil.rmtree(left)
+
+    def bring_over(self, new: Path, ours: set[str]) -> None:
+        """Give what the user has put into the earlier result to the ``new`` one as well."""
+        for root, folders, files in os.walk(self.path):
+            here = Path(root)
+            links = [name for name in folders if (here / name).is_symlink()]
+            all_there = map(here.joinpath, (*files, *links))
+            theirs = [path for path in all_there if path.relative_to(self.path).as_posix() not in ours]
+            if theirs or not (files or folders):
+                (new / here.relative_to(self.path)).mkdir(parents=True, exist_ok=True)
+            for path in theirs:
+                place = new / path.relative_to(self.path)
+                while place.exists() or place.is_symlink():
+                    place = place.with_name(f"{place.stem}.kept{place.suffix}")
+                    _log.warning("%s is not ours; it is kept as %s", path, place.name)
+                try:
+                    os.link(path, place, follow_symlinks=False)
+                except OSError:  # a file system without links
+                    shutil.copy2(path, place, follow_symlinks=False)
+
+
 @contextmanager
 def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
     """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
 
     An earlier result stays untouched until then; after an error nothing new is left. Files of the user's in
-    an earlier result are kept. Errors name the ``option`` that says which folder it is.
-
-    Raises:
-        ConfigError: The folder cannot be written, holds something that is no earlier result of ours, or
-            another process is writing it.
+    an earlier result are kept. Raises ConfigError, which names the ``option`` of the folder, where it cannot
+    be written, holds something that is no earlier result of ours, or another process is writing it.
     """
-    with locked_folder(folder, option) as target:
-        unfinished, previous = _hidden(target, "part"), _hidden(target, "previous")
-        with _explained(folder, option):
-            _recover(target, unfinished, previous, option)
-            listed = _listed(target, folder, option)
-            _refuse_changed(target, folder, listed or {}, option)
+    with _locked(folder, option) as there:
+        target, unfinished, previous = there.path, there.hidden("part"), there.hidden("previous")
+        with there.explained():
+            there.recover(unfinished, previous)
+            listed = there.listed()
+            for name, digests in (listed or {}).items():
+                if (target / name).is_file() and file_digest(target / name) not in digests:
+                    raise ConfigError(
+                        f"{folder / name}: was changed after we wrote it and is not replaced; move it, or "
+                        f"give another {option}"
+                    )
             unfinished.mkdir()
             _write_list(unfinished, [])
         try:
-            with _explained(folder, option, _FULL):
+            with there.explained(_FULL):
                 yield unfinished
-            with _explained(folder, option):
+            with there.explained():
                 files = sorted(path for path in unfinished.rglob("*") if path.is_file() and path.name != LIST)
                 _write_list(unfinished, files)
                 if listed is not None:
-                    _bring_over(target, unfinished, {LIST, *listed})
+                    there.bring_over(unfinished, {LIST, *listed})
                     target.replace(previous)
                 elif target.exists():
                     target.rmdir()
@@ -70,102 +201,88 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
 def added_to(folder: Path, option: str) -> Iterator[Path]:
     """A finished result to write further files into, each listed before it is there.
 
-    Raises:
-        ConfigError: the folder is no result of ours, a file that is to be replaced in it is not ours, it
-            cannot be written, or another process is writing it; the ``option`` says which folder it is.
+    Raises ConfigError where the folder is no result of ours, a file that is to be replaced in it is not ours,
+    it cannot be written, or another process is writing it.
     """
-    with locked_folder(folder, option) as target:
-        with _explained(folder, option):
-            if _listed(target, folder, option) is None:
+    with _locked(folder, option) as there:
+        with there.explained():
+            if there.listed() is None:
                 raise ConfigError(f"{folder}: is no result of ours; give another {option}")
         with listed_files(folder, option):
-            yield target
+            yield there.path
 
 
 @contextmanager
 def listed_files(folder: Path, option: str) -> Iterator[None]:
     """Within, each file that is written whole into a folder of ours is put on its list before it is there.
 
-    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well.
-
-    Raises:
-        ConfigError: a file that is to be replaced is not ours, or the folder cannot be written.
+    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well. Raises
+    ConfigError where a file that is to be replaced is not ours, or the folder cannot be written.
     """
-    target = _resolved(folder, option)
-    ours = _listed(target, folder, option) or {}
+    there = _Target(folder, option)
+    ours = there.listed() or {}
 
     def list_file(partial: Path, path: Path) -> None:
-        if not (place := path.resolve()).is_relative_to(target):
+        if not (place := path.resolve()).is_relative_to(there.path):
             return
-        name = place.relative_to(target).as_posix()
+        name = place.relative_to(there.path).as_posix()
         if path.exists() and file_digest(path) not in ours.get(name, ()):
             raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
         digest = file_digest(partial)
-        _append(target / LIST, json.dumps({"file": name, "sha256": digest}) + "\n")
+        _append(there.path / LIST, json.dumps({"file": name, "sha256": digest}) + "\n")
         ours.setdefault(name, []).append(digest)
 
-    with _explained(folder, option, _FULL), observed_writes(list_file):
+    with there.explained(_FULL), observed_writes(list_file):
         yield
 
 
+@dataclass(frozen=True)
 class GrowingFolder:
     """A folder whose files are written one by one, each at once."""
 
-    def __init__(self, target: Path, shown: Path, option: str) -> None:
-        self._target, self._shown, self._option = target, shown, option
-
-    @property
-    def has_files(self) -> bool:
-        """Whether any file of it is ours."""
-        return any((self._target / name).is_file() for name in files_of_result(self._target))
+    _there: _Target
 
     def write(self, name: str, data: bytes) -> None:
-        """Write the file ``name``.
-
-        Raises:
-            ConfigError: it cannot be written, or there is a file of this name that is not ours.
-        """
-        with _explained(self._shown, self._option), whole_file(self._target / name) as partial:
+        """Write the file ``name``; raises ConfigError where that is not ours or cannot be."""
+        with self._there.explained(), whole_file(self._there.path / name) as partial:
             partial.write_bytes(data)
 
 
 @contextmanager
 def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
-    """``folder`` to write single files into, each listed before it is there.
-
-    Raises:
-        ConfigError: as :func:`result_folder`.
-    """
-    with locked_folder(folder, option) as target:
-        with _explained(folder, option):
-            is_new = _listed(target, folder, option) is None
+    """``folder`` to write single files into, each listed first; errors as :func:`result_folder`."""
+    with _locked(folder, option) as there:
+        target = there.path
+        with there.explained():
+            is_new = there.listed() is None
             target.mkdir(exist_ok=True)
             if is_new:
                 _write_list(target, [])
-        growing = GrowingFolder(target, folder, option)
         try:
             with listed_files(folder, option):
-                yield growing
+                yield GrowingFolder(there)
         finally:
-            if is_new and not growing.has_files:
+            if is_new and not any((target / name).is_file() for name in files_of_result(target)):
                 (target / LIST).unlink(missing_ok=True)
                 with suppress(OSError):
                     target.rmdir()
 
 
 @contextmanager
+def _locked(folder: Path, option: str) -> Iterator[_Target]:
+    there = _Target(folder, option)
+    with there.parents(), there.locked():
+        yield there
+
+
+@contextmanager
 def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
     """Where ``folder`` leads, which no other process of ours writes within this block.
 
-    Raises:
-        ConfigError: one does already, which the message names; or it is nothing that can be replaced.
+    Raises ConfigError where one does already, which it names, or the folder is nothing that can be replaced.
     """
-    target = _resolved(folder, option)
-    with ExitStack() as stack:
-        with _explained(folder, option):
-            stack.enter_context(_parents(target))
-            stack.enter_context(_locked(target, folder, option))
-        yield target
+    with _locked(folder, option) as there:
+        yield there.path
 
 
 def files_of_result(folder: Path) -> dict[str, str]:
@@ -174,7 +291,7 @@ def files_of_result(folder: Path) -> dict[str, str]:
     Raises:
         ConfigError: its list is damaged.
     """
-    return {name: digests[-1] for name, digests in (_listed(folder, folder, "output=") or {}).items()}
+    return {name: digests[-1] for name, digests in (_Target(folder, "output=").listed() or {}).items()}
 
 
 def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
@@ -190,128 +307,6 @@ def drop_result(folder: Path) -> None:
         for name in [*files_of_result(folder), LIST]:
             (folder / name).unlink(missing_ok=True)
         remove_empty(folder)
-
-
-@contextmanager
-def _explained(folder: Path, option: str, only: tuple[int, ...] = ()) -> Iterator[None]:
-    """Report failures of the disk, all or those of ``only`` some kinds, as the output folder's."""
-    try:
-        yield
-    except OSError as failure:
-        if only and failure.errno not in only:
-            raise
-        raise ConfigError(
-            f"output folder {folder} cannot be written: {failure.strerror}; nothing new is left: free space "
-            f"or give another {option}"
-        ) from None
-
-
-def _resolved(folder: Path, option: str) -> Path:
-    """Where ``folder`` leads; a folder that cannot be put aside is refused before any work."""
-    refuse_url(folder)
-    try:
-        target = folder.resolve()
-    except (OSError, RuntimeError, ValueError):
-        raise ConfigError(f"output folder {folder}: leads nowhere; give another {option}") from None
-    if target.is_mount():
-        raise ConfigError(f"output folder {folder} is a disk of its own; give a folder within it")
-    if target.exists() and not target.is_dir():
-        raise ConfigError(f"output folder {folder} is a file; give another {option}")
-    return target
-
-
-def _hidden(target: Path, kind: str) -> Path:
-    return target.with_name(f".{target.name}.{kind}")
-
-
-@contextmanager
-def _parents(target: Path) -> Iterator[None]:
-    """Make the folders that ``target`` is to lie in; those that end up empty go again."""
-    missing = [parent for parent in target.parents if not parent.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    finally:
-        for parent in missing:
-            with suppress(OSError):
-                parent.rmdir()
-
-
-@contextmanager
-def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
-    """Hold the lock of ``target``, a file beside it, until the block or the process ends."""
-    path = _hidden(target, "lock")
-    while True:
-        stream = path.open("a+", encoding="utf-8")
-        if not take_lock(stream):
-            stream.seek(0)
-            holder = stream.read(200).strip()
-            stream.close()
-            raise ConfigError(
-                f"output folder {shown} is being written by {holder or 'another process'}; wait for it, or "
-                f"give another {option}"
-            )
-        # The last holder may have removed the file between our opening and locking it.
-        with suppress(OSError):
-            if os.path.samestat(os.fstat(stream.fileno()), path.stat()):
-                break
-        stream.close()
-    try:
-        stream.seek(0)
-        stream.truncate()
-        stream.write(f"process {os.getpid()} on {HOST}\n")
-        stream.flush()
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        with suppress(OSError):
-            stream.close()
-
-
-def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> None:
-    """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
-    for left in (unfinished, previous):
-        if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
-            raise ConfigError(
-                f"{left}: is in the way of our work and not ours; move it, or give another {option}"
-            )
-    if previous.exists() and not target.exists():
-        previous.replace(target)
-    for left in (unfinished, previous):
-        if left.exists():
-            shutil.rmtree(left)
-
-
-def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
-    """Digests of our files in ``target`` by their names, the last at the end; None if it is empty.
-
-    Raises:
-        ConfigError: it holds something and is not ours.
-    """
-    if not target.exists() or not any(target.iterdir()):
-        return None
-    marker = target / LIST
-    if not marker.is_file():
-        raise ConfigError(
-            f"output folder {shown} holds files that are no results of ours: give another {option}"
-        )
-    listed: dict[str, list[str]] = {}
-    try:
-        for line in marker.read_text(encoding="utf-8").splitlines()[1:]:
-            entry = json.loads(line)
-            listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
-    except (ValueError, TypeError, LookupError, RecursionError):
-        raise ConfigError(f"{shown / LIST}: is damaged; give another {option}") from None
-    return listed
-
-
-def _refuse_changed(target: Path, shown: Path, listed: Mapping[str, list[str]], option: str) -> None:
-    for name, digests in listed.items():
-        if (target / name).is_file() and file_digest(target / name) not in digests:
-            raise ConfigError(
-                f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
-                f"another {option}"
-            )
 
 
 def _write_list(folder: Path, files: list[Path]) -> None:
@@ -331,26 +326,3 @@ def _append(path: Path, line: str) -> None:
     except OSError:
         os.truncate(path, size)
         raise
-
-
-def _bring_over(earlier: Path, new: Path, ours: set[str]) -> None:
-    """Give what the user has put into an ``earlier`` result to the ``new`` one as well."""
-    for root, folders, files in os.walk(earlier):
-        here = Path(root)
-        links = [name for name in folders if (here / name).is_symlink()]
-        theirs = [
-            path
-            for path in map(here.joinpath, (*files, *links))
-            if path.relative_to(earlier).as_posix() not in ours
-        ]
-        if theirs or not (files or folders):
-            (new / here.relative_to(earlier)).mkdir(parents=True, exist_ok=True)
-        for path in theirs:
-            place = new / path.relative_to(earlier)
-            while place.exists() or place.is_symlink():
-                place = place.with_name(f"{place.stem}.kept{place.suffix}")
-                _log.warning("%s is not ours; it is kept as %s", path, place.name)
-            try:
-                os.link(path, place, follow_symlinks=False)
-            except OSError:  # a file system without links
-                shutil.copy2(path, place, follow_symlinks=False)

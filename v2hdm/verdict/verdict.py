@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+GOAL = "coarse"
+"""The check whether map and calibrations are as good as ``accuracy_goal_cm`` asks."""
+
 
 class Status(Enum):
     """How a check ended; the verdict on a run is the worst of its checks."""
@@ -97,10 +100,23 @@ class Verdict:
         """The checks that were answered, within their limits."""
         return tuple(f for f in self.findings if f.status is Status.PASS and not f.is_unobservable)
 
+    @property
+    def headline(self) -> str:
+        """How good the map is, and in which frame, after the status; empty where no map was judged.
+
+        >>> result.verdict.headline.startswith("PASS: 95 % of ")
+        True
+        """
+        how_good = next((one.says for one in self.findings if (one.check, one.about) == (GOAL, "map")), "")
+        if how_good and self.status is Status.FAIL:
+            how_good = f"no accuracy can be promised, see {self.findings[0].check} ({self.findings[0].about})"
+        return how_good and f"{self.status.value}: {how_good.split(': ')[0]}"
+
     def as_json(self) -> dict[str, Any]:
         """The verdict as an object of ``metrics.json``: raised, unobservable and passed checks apart."""
         return {
             "status": self.status.value,
+            "headline": self.headline,
             "findings": [finding.as_json() for finding in self.raised],
             "untold": [finding.as_json() for finding in self.unobservable],
             "passed": [finding.as_json() for finding in self.passed],
@@ -110,7 +126,8 @@ class Verdict:
     def lines(self) -> tuple[str, ...]:
         """The verdict, raised findings and unobservable checks, one line each, for a terminal."""
         raised = {0: "nothing raised", 1: "1 finding"}.get(len(self.raised), f"{len(self.raised)} findings")
-        summary = f"verdict: {self.status.value} ({raised}, {len(self.passed)} checks passed)"
+        counted = f"{self.status.value} ({raised}, {len(self.passed)} checks passed)"
+        summary = f"verdict: {self.headline.replace(self.status.value, counted, 1) or counted}"
         return (summary, *(finding.line for finding in _joined((*self.raised, *self.unobservable))))
 
 

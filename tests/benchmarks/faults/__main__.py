@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.benchmarks.faults.disks import calls_that_fail, full_disks, readonly_disks
+from tests.benchmarks.faults.doors import Doors
 from tests.benchmarks.faults.files import (
     damaged_caches,
     damaged_images,
@@ -35,7 +36,6 @@ from tests.benchmarks.faults.files import (
     faulty_frames,
 )
 from tests.benchmarks.faults.running import Kind, Order
-from tests.faults.doors import Doors
 
 KINDS: dict[str, Kind] = {
     "calls": calls_that_fail,

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.benchmarks.faults.doors import cache_defects
+from tests.benchmarks.faults.failing_calls import Failure, why_not
+from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.running import Order, Row, folder_in, row_of
-from tests.faults.doors import HERE, Expected, Situation, cache_defects
-from tests.faults.failing_calls import Failure, why_not
-from tests.faults.forked import Forked
+from tests.benchmarks.faults.situations import HERE, Expected, Situation
 from tests.faults.judge import Case, Ran, judge, judge_again
 
 _PAGE = 4096

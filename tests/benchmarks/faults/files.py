@@ -9,17 +9,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from tests.benchmarks.faults.damage import damage
 from tests.benchmarks.faults.disks import expected_of
+from tests.benchmarks.faults.doors import cache_defects, map_arguments
+from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.running import Order, Row, folder_in, in_fork, row_of
+from tests.benchmarks.faults.situations import HERE, Expected, Situation
 from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.frames import frame_faults
 from tests.benchmarks.wrong_inputs import Outcome as Mapped
 from tests.benchmarks.wrong_inputs import judge as judge_map
 from tests.benchmarks.wrong_inputs import map_drive
-from tests.faults.damage import damage
-from tests.faults.doors import HERE, Expected, Situation, cache_defects, map_arguments
-from tests.faults.forked import Forked
 from tests.faults.judge import Case, Outcome, judge
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.mapping.options import MappingOptions

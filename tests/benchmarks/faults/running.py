@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.faults.doors import Doors
+from tests.benchmarks.faults.doors import Doors
 from tests.faults.judge import Outcome
 
 

@@ -1,7 +1,5 @@
 """A page in the distribution's Chromium, watched."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,15 +1,9 @@
 """The report in a browser: it draws, answers the pointer, and asks for nothing beyond itself."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-from tests.report.page.browser import Watched, browser_path, opened
+from tests.report.page.browser import browser_path, opened
 from tests.report.page.folder import NASTY, NASTY_NAME, PLACES, make_result
 from v2hdm.report.page.document import write_page
 
@@ -31,14 +25,14 @@ PAINTED = """() => [...document.querySelectorAll("#map canvas")].map((canvas) =>
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     drive = make_result(folder)
     return write_page(folder / "result", drive)
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser():
     path = browser_path()
     from playwright.sync_api import sync_playwright
 
@@ -48,7 +42,7 @@ def browser() -> Iterator[Any]:
         launched.close()
 
 
-def is_quiet(watched: Watched) -> None:
+def is_quiet(watched):
     """No error on the console, no request but that for the page itself."""
     assert watched.said == []
     assert [url for url in watched.requests if not url.startswith(("file:", "data:"))] == []
@@ -56,9 +50,7 @@ def is_quiet(watched: Watched) -> None:
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), WINDOWS)
-def test_the_map_is_drawn_and_fits_its_window(
-    browser: Any, report: Path, width: int, height: int, scheme: str
-) -> None:
+def test_the_map_is_drawn_and_fits_its_window(browser, report, width, height, scheme):
     with opened(browser, report, width, height, scheme) as watched:
         page = watched.page
         assert page.evaluate(PAINTED) > 300
@@ -68,7 +60,7 @@ def test_the_map_is_drawn_and_fits_its_window(
         is_quiet(watched)
 
 
-def test_every_layer_changes_the_picture_when_it_is_switched(browser: Any, report: Path) -> None:
+def test_every_layer_changes_the_picture_when_it_is_switched(browser, report):
     with opened(browser, report) as watched:
         page = watched.page
         page.evaluate(ON_SCREEN, PLACES[0].tolist())
@@ -87,9 +79,7 @@ def test_every_layer_changes_the_picture_when_it_is_switched(browser: Any, repor
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
-def test_pointing_names_the_marking_and_selecting_shows_its_images(
-    browser: Any, report: Path, width: int, height: int
-) -> None:
+def test_pointing_names_the_marking_and_selecting_shows_its_images(browser, report, width, height):
     with opened(browser, report, width, height) as watched:
         page = watched.page
         assert page.locator("#suspicious .shots figure").count() == 1
@@ -115,7 +105,7 @@ def test_pointing_names_the_marking_and_selecting_shows_its_images(
         is_quiet(watched)
 
 
-def test_the_outline_lies_on_the_paint_of_its_picture(browser: Any, report: Path) -> None:
+def test_the_outline_lies_on_the_paint_of_its_picture(browser, report):
     with opened(browser, report) as watched:
         page = watched.page
         shots = page.evaluate("JSON.parse(document.getElementById('pictures').textContent).m1")
@@ -142,9 +132,7 @@ def test_the_outline_lies_on_the_paint_of_its_picture(browser: Any, report: Path
         assert np.abs(np.sort(seen[:, 0]) - np.sort(mapped[:, 0])).max() < 1.0
 
 
-def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(
-    browser: Any, report: Path
-) -> None:
+def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(browser, report):
     with opened(browser, report) as watched:
         page = watched.page
         page.locator("#map").scroll_into_view_if_needed()
@@ -161,7 +149,7 @@ def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(
         is_quiet(watched)
 
 
-def test_names_of_people_are_text_and_never_markup(browser: Any, tmp_path: Path) -> None:
+def test_names_of_people_are_text_and_never_markup(browser, tmp_path):
     drive = make_result(tmp_path, name=NASTY_NAME, kind=NASTY_NAME, status="FAIL")
     path = write_page(tmp_path / "result", drive)
     with opened(browser, path) as watched:
@@ -176,7 +164,7 @@ def test_names_of_people_are_text_and_never_markup(browser: Any, tmp_path: Path)
         is_quiet(watched)
 
 
-def test_colours_by_accuracy_have_a_scale_in_centimetres(browser: Any, report: Path) -> None:
+def test_colours_by_accuracy_have_a_scale_in_centimetres(browser, report):
     with opened(browser, report) as watched:
         page = watched.page
         page.select_option("#colour", "absolute")

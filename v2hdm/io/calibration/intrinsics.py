@@ -28,7 +28,6 @@ _END_OF_MESSAGE = re.compile(r"\n---\s*$")  # ``ros2 topic echo`` ends with a se
 _BROWN_CONRADY = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
 _BEYOND = {14: (12, "tilted sensor"), 12: (8, "thin prism")}
 _COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
-_KALIBR_KEYS = ("camera_model", "intrinsics", "distortion_model", "resolution")
 _KALIBR_PROJECTIONS = {
     "omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)",
 }  # fmt: skip
@@ -56,11 +55,11 @@ class Document:
 
 @dataclass(frozen=True)
 class IntrinsicsFormat:
-    """One format: ``accepts`` a file by a look at it, ``names`` its cameras, ``read`` one of them."""
+    """One format: ``accepts`` a file by a look at it, ``read`` one of the cameras that ``names`` lists."""
 
     accepts: Callable[[Document], bool]
-    names: Callable[[Document], list[str]]
     read: Callable[[Document, str], CameraInfo]
+    names: Callable[[Document], list[str]] = Document.only_camera
 
 
 def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
@@ -71,9 +70,8 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     named among several, or its lens is beyond ours.
     """
     if path.suffix.lower() == ".bin":
-        raise DriveError(
-            f"{path}: is binary; write COLMAP's model as text (model_converter --output_type TXT)"
-        )
+        advice = "write COLMAP's model as text (model_converter --output_type TXT)"
+        raise DriveError(f"{path}: is binary; {advice}")
     document = _read_document(path)
     chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
     if chosen is None:
@@ -88,7 +86,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
 
 def is_calibration(path: Path) -> bool:
     """Whether the file is a calibration of ours, which says where the camera sits, too."""
-    return _is_own(_read_document(path))
+    return INTRINSICS["V2HDM calibration"].accepts(_read_document(path))
 
 
 def _read_document(path: Path) -> Document:
@@ -102,11 +100,10 @@ def _read_document(path: Path) -> Document:
     elif start.startswith("{"):
         content = parse_json(start, str(path), DriveError)
     elif path.suffix.lower() != ".txt" and start:
-        # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag says no more than the
-        # keys.
+        # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag adds nothing to the keys.
         plain = start.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
         content = parse_yaml(_END_OF_MESSAGE.sub("\n", plain), str(path), DriveError)
-    return Document(path, text, content if isinstance(content, dict) else {})
+    return Document(path, text, _mapping(content))
 
 
 def _of_xml(path: Path, text: str) -> dict[str, Any]:
@@ -118,15 +115,13 @@ def _of_xml(path: Path, text: str) -> dict[str, Any]:
         raise DriveError(f"{path}: line {failure.position[0]}: XML syntax error; restore the file") from None
     if root.tag != "opencv_storage":
         raise DriveError(f"{path}: expected OpenCV's <opencv_storage>, got <{root.tag}>; name another file")
-    return {node.tag: _xml_value(node) for node in root}
-
-
-def _xml_value(node: ET.Element) -> object:
-    if node.get("type_id") == "opencv-matrix":
-        entry: dict[str, object] = {child.tag: _scalar(child.text) for child in node}
-        entry["data"] = [_scalar(word) for word in (node.findtext("data") or "").split()]
-        return entry
-    return _scalar(node.text)
+    entries: dict[str, Any] = {}
+    for node in root:
+        entries[node.tag] = _scalar(node.text)
+        if node.get("type_id") == "opencv-matrix":
+            entries[node.tag] = {child.tag: _scalar(child.text) for child in node}
+            entries[node.tag]["data"] = [_scalar(word) for word in (node.findtext("data") or "").split()]
+    return entries
 
 
 def _scalar(text: str | None) -> object:
@@ -141,8 +136,7 @@ def _scalar(text: str | None) -> object:
 def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
     """Our model for OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]."""
     values = list(coefficients) or [0.0] * 5
-    while len(values) in _BEYOND:
-        count = len(values)
+    while (count := len(values)) in _BEYOND:
         first, lens = _BEYOND[count]
         if any(values[first:]):
             raise DriveError(
@@ -150,15 +144,37 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
                 "5 or 8 coefficients"
             )
         values = values[:first]
-    if len(values) not in _BROWN_CONRADY:
-        raise DriveError(f"{where}: {len(values)} distortion coefficients; expected 4, 5 or 8")
-    return _complete(_BROWN_CONRADY[len(values)], values)
+    if count not in _BROWN_CONRADY:
+        raise DriveError(f"{where}: {count} distortion coefficients; expected 4, 5 or 8")
+    return _complete(_BROWN_CONRADY[count], values)
+
+
+def _equidistant(coefficients: Sequence[float], where: str) -> _Lens:
+    if len(coefficients) != 4:
+        raise DriveError(
+            f"{where}: a fisheye lens has 4 coefficients, got {len(coefficients)}; restore the file"
+        )
+    return _complete("equidistant", coefficients)
 
 
 def _complete(model: str, coefficients: Sequence[float]) -> _Lens:
     """A lens whose further coefficients are zero."""
     missing = DISTORTION_COEFFICIENTS[model] - len(coefficients)
     return model, (*map(float, coefficients), *(0.0,) * missing)
+
+
+def _mapping(content: object) -> dict[str, Any]:
+    return content if isinstance(content, dict) else {}
+
+
+def _beyond(where: str, lens: str, instead: str) -> DriveError:
+    return DriveError(f"{where}: its lens is {lens}, which is beyond our models; calibrate with {instead}")
+
+
+def _need(entries: Mapping[str, Any], keys: Sequence[str], where: str, advice: str) -> None:
+    for key in keys:
+        if key not in entries:
+            raise DriveError(f"{where}: missing key '{key}'; {advice}")
 
 
 def _camera(
@@ -175,53 +191,23 @@ def _matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-@dataclass(frozen=True)
-class _ColmapModel:
-    """A model of COLMAP's: its numbers of focal lengths and coefficients, and the lens of ours that it is."""
-
-    focals: int
-    coefficients: int
-    lens: Callable[[Sequence[float]], _Lens]
-
-
-def _radial(coefficients: Sequence[float]) -> _Lens:
-    return _complete("plumb_bob", coefficients)
-
-
-def _opencv_lens(coefficients: Sequence[float]) -> _Lens:
-    return _brown_conrady(coefficients, "COLMAP")
-
-
-def _equidistant(coefficients: Sequence[float]) -> _Lens:
-    return _complete("equidistant", coefficients)
-
-
-COLMAP_MODELS: Mapping[str, _ColmapModel] = {
-    "SIMPLE_PINHOLE": _ColmapModel(1, 0, _radial),
-    "PINHOLE": _ColmapModel(2, 0, _radial),
-    "SIMPLE_RADIAL": _ColmapModel(1, 1, _radial),
-    "RADIAL": _ColmapModel(1, 2, _radial),
-    "OPENCV": _ColmapModel(2, 4, _opencv_lens),
-    "FULL_OPENCV": _ColmapModel(2, 8, _opencv_lens),
-    "OPENCV_FISHEYE": _ColmapModel(2, 4, _equidistant),
-    "SIMPLE_RADIAL_FISHEYE": _ColmapModel(1, 1, _equidistant),
-    "RADIAL_FISHEYE": _ColmapModel(1, 2, _equidistant),
+COLMAP_MODELS: Mapping[str, tuple[int, int, str]] = {
+    "SIMPLE_PINHOLE": (1, 0, "plumb_bob"),
+    "PINHOLE": (2, 0, "plumb_bob"),
+    "SIMPLE_RADIAL": (1, 1, "plumb_bob"),
+    "RADIAL": (1, 2, "plumb_bob"),
+    "OPENCV": (2, 4, "plumb_bob"),
+    "FULL_OPENCV": (2, 8, "rational_polynomial"),
+    "OPENCV_FISHEYE": (2, 4, "equidistant"),
+    "SIMPLE_RADIAL_FISHEYE": (1, 1, "equidistant"),
+    "RADIAL_FISHEYE": (1, 2, "equidistant"),
 }
-"""COLMAP's models that are lenses of ours."""
+"""COLMAP's models: their numbers of focal lengths and coefficients, and the lens of ours that each is."""
 
 
 def _colmap_lines(document: Document) -> list[tuple[int, str]]:
     lines = ((number, line.strip()) for number, line in enumerate(document.text.splitlines(), 1))
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
-
-
-def _is_colmap(document: Document) -> bool:
-    lines = _colmap_lines(document)
-    return bool(lines) and bool(_COLMAP_LINE.match(lines[0][1]))
-
-
-def _colmap_names(document: Document) -> list[str]:
-    return [line.split()[0] for _, line in _colmap_lines(document)]
 
 
 def _read_colmap(document: Document, name: str) -> CameraInfo:
@@ -230,27 +216,22 @@ def _read_colmap(document: Document, name: str) -> CameraInfo:
     if not _COLMAP_LINE.match(line):
         raise DriveError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS; restore the file")
     _, kind, width, height, *words = line.split()
-    model = COLMAP_MODELS.get(kind)
-    if model is None:
+    if kind not in COLMAP_MODELS:
+        known = ", ".join(COLMAP_MODELS)
         raise DriveError(
-            f"{where}: COLMAP's {kind} is beyond our lens models; calibrate with one of: "
-            f"{', '.join(COLMAP_MODELS)}"
+            f"{where}: COLMAP's {kind} is beyond our lens models; calibrate with one of: {known}"
         )
+    focals, coefficients, model = COLMAP_MODELS[kind]
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
         values = np.array([np.nan])
-    expected = model.focals + 2 + model.coefficients
-    if len(values) != expected or not np.isfinite(values).all():
-        raise DriveError(f"{where}: {kind} has {expected} parameters; restore the file")
-    cx, cy = values[model.focals : model.focals + 2] - 0.5
+    if len(values) != focals + 2 + coefficients or not np.isfinite(values).all():
+        raise DriveError(f"{where}: {kind} has {focals + 2 + coefficients} parameters; restore the file")
+    matrix = _matrix(values[0], values[focals - 1], *(values[focals : focals + 2] - 0.5))
+    lens = _complete(model, values[focals + 2 :].tolist())
     return _camera(
-        name,
-        (int(width), int(height)),
-        (f"{where}: WIDTH", f"{where}: HEIGHT"),
-        _matrix(values[0], values[model.focals - 1], cx, cy),
-        model.lens(values[model.focals + 2 :].tolist()),
-        where,
+        name, (int(width), int(height)), [f"{where}: WIDTH", f"{where}: HEIGHT"], matrix, lens, where
     )
 
 
@@ -264,73 +245,41 @@ def _kalibr_names(document: Document) -> list[str]:
 
 def _read_kalibr(document: Document, name: str) -> CameraInfo:
     where, entry = f"{document.path}: {name}", document.entries[name]
-    for key in _KALIBR_KEYS:
-        if key not in entry:
-            raise DriveError(f"{where}: missing key '{key}'; take the camchain that Kalibr wrote")
+    needed = ("camera_model", "intrinsics", "distortion_model", "resolution")
+    _need(entry, needed, where, "take the camchain that Kalibr wrote")
     projection = take_text(entry["camera_model"], f"{where}, camera_model", DriveError)
     if projection != "pinhole":
-        raise DriveError(
-            f"{where}: its lens is {_KALIBR_PROJECTIONS.get(projection, repr(projection))}, which is beyond "
-            "our models; calibrate with pinhole-radtan or pinhole-equi"
-        )
+        lens_name = _KALIBR_PROJECTIONS.get(projection, repr(projection))
+        raise _beyond(where, lens_name, "pinhole-radtan or pinhole-equi")
     model = take_text(entry["distortion_model"], f"{where}, distortion_model", DriveError)
     given, at = entry.get("distortion_coeffs"), f"{where}, distortion_coeffs"
     values = [] if given in (None, []) else take_array(given, (-1,), at, DriveError).tolist()
     if model in ("equidistant", "equi"):
-        if len(values) != 4:
-            raise DriveError(f"{at}: {model} has 4 coefficients, got {len(values)}")
-        lens = _equidistant(values)
+        lens = _equidistant(values, at)
     elif model in ("radtan", "none"):
         lens = _brown_conrady([] if model == "none" else values, at)
     else:
-        raise DriveError(
-            f"{where}: its lens is '{model}', which is beyond our models; calibrate with pinhole-radtan or "
-            "pinhole-equi"
-        )
+        raise _beyond(where, repr(model), "pinhole-radtan or pinhole-equi")
     size = take_array(entry["resolution"], (2,), f"{where}, resolution", DriveError).tolist()
     numbers = take_array(entry["intrinsics"], (4,), f"{where}, intrinsics", DriveError)
     return _camera(name, size, [f"{where}, resolution"] * 2, _matrix(*numbers.tolist()), lens, where)
 
 
-def _is_opencv(document: Document) -> bool:
-    entry = document.lower.get("camera_matrix")
-    return isinstance(entry, dict) and "dt" in entry
-
-
 def _read_opencv(document: Document, name: str) -> CameraInfo:
-    where, entries = str(document.path), document.lower
+    where, entries, sides = str(document.path), document.lower, ("image_width", "image_height")
     if "xi" in entries:
-        raise DriveError(
-            f"{where}: its lens is omnidirectional (xi), which is beyond our models; calibrate with "
-            "cv2.calibrateCamera or cv2.fisheye.calibrate"
-        )
-    if "distortion_coefficients" not in entries:
-        raise DriveError(
-            f"{where}: missing key 'distortion_coefficients'; add it, zeros for a pinhole camera"
-        )
-    sides = ("image_width", "image_height")
-    for key in sides:
-        if key not in entries:
-            raise DriveError(f"{where}: missing key '{key}'; add the size of the images it was made from")
+        raise _beyond(where, "omnidirectional (xi)", "cv2.calibrateCamera or cv2.fisheye.calibrate")
+    _need(entries, ["distortion_coefficients"], where, "add it, zeros for a pinhole camera")
+    _need(entries, sides, where, "add the size of the images it was made from")
     intrinsic = take_matrix(entries["camera_matrix"], f"{where}: camera_matrix")
     if intrinsic.shape != (3, 3):
         raise DriveError(f"{where}: camera_matrix: expected 3 x 3; restore the file")
     at = f"{where}: distortion_coefficients"
     values = take_matrix(entries["distortion_coefficients"], at).ravel().tolist()
-    if entries.get("fisheye_model") or entries.get("distortion_model") == "equidistant":
-        if len(values) != 4:
-            raise DriveError(
-                f"{at}: OpenCV's fisheye has 4 coefficients, got {len(values)}; restore the file"
-            )
-        lens = _equidistant(values)
-    else:
-        lens = _brown_conrady(values, at)
+    is_fisheye = entries.get("fisheye_model") or entries.get("distortion_model") == "equidistant"
+    lens = _equidistant(values, at) if is_fisheye else _brown_conrady(values, at)
     size = [entries[key] for key in sides]
     return _camera(name, size, [f"{where}: {key}" for key in sides], intrinsic, lens, where)
-
-
-def _is_own(document: Document) -> bool:
-    return isinstance(document.entries.get("camera_matrix"), list)
 
 
 def _read_own(document: Document, name: str) -> CameraInfo:
@@ -346,24 +295,15 @@ def _read_own(document: Document, name: str) -> CameraInfo:
     return info
 
 
-def _is_message(document: Document) -> bool:
-    return {"height", "width", "distortion_model"} <= set(document.entries)
-
-
 def _message_names(document: Document) -> list[str]:
     """Its only camera, by the frame of its header."""
-    header = document.entries.get("header")
-    frame = header.get("frame_id") if isinstance(header, dict) else None
-    return [str(frame or document.path.stem)]
+    return [str(_mapping(document.entries.get("header")).get("frame_id") or document.path.stem)]
 
 
 def _read_message(document: Document, name: str) -> CameraInfo:
     where, entries = str(document.path), document.lower
-    for key in ("k", "d"):
-        if key not in entries:
-            raise DriveError(f"{where}: missing key '{key}'; write the message to the file again")
-    region = entries.get("roi")
-    region = region if isinstance(region, dict) else {}
+    _need(entries, ("k", "d"), where, "write the message to the file again")
+    region = _mapping(entries.get("roi"))
     fields = SimpleNamespace(
         k=take_array(entries["k"], (9,), f"{where}: k", DriveError),
         d=take_array(entries["d"], (-1,), f"{where}: d", DriveError) if entries["d"] else np.empty(0),
@@ -377,20 +317,23 @@ def _read_message(document: Document, name: str) -> CameraInfo:
     return info_of(fields, name, where)
 
 
-def _is_camera_info(document: Document) -> bool:
-    return bool({"camera_name", "distortion_model", "camera_matrix"} & set(document.entries))
-
-
-def _read_camera_info(document: Document, name: str) -> CameraInfo:
-    return take_camera_info(document.entries, str(document.path))
-
-
 INTRINSICS: Mapping[str, IntrinsicsFormat] = {
-    "COLMAP cameras.txt": IntrinsicsFormat(_is_colmap, _colmap_names, _read_colmap),
-    "Kalibr camchain": IntrinsicsFormat(lambda one: bool(_kalibr_names(one)), _kalibr_names, _read_kalibr),
-    "V2HDM calibration": IntrinsicsFormat(_is_own, Document.only_camera, _read_own),
-    "OpenCV": IntrinsicsFormat(_is_opencv, Document.only_camera, _read_opencv),
-    "ROS CameraInfo message": IntrinsicsFormat(_is_message, _message_names, _read_message),
-    "ROS camera_info": IntrinsicsFormat(_is_camera_info, Document.only_camera, _read_camera_info),
+    "COLMAP cameras.txt": IntrinsicsFormat(
+        lambda one: any(_COLMAP_LINE.match(line) for _, line in _colmap_lines(one)[:1]),
+        _read_colmap,
+        lambda one: [line.split()[0] for _, line in _colmap_lines(one)],
+    ),
+    "Kalibr camchain": IntrinsicsFormat(lambda one: bool(_kalibr_names(one)), _read_kalibr, _kalibr_names),
+    "V2HDM calibration": IntrinsicsFormat(
+        lambda one: isinstance(one.entries.get("camera_matrix"), list), _read_own
+    ),
+    "OpenCV": IntrinsicsFormat(lambda one: "dt" in _mapping(one.lower.get("camera_matrix")), _read_opencv),
+    "ROS CameraInfo message": IntrinsicsFormat(
+        lambda one: {"height", "width", "distortion_model"} <= set(one.entries), _read_message, _message_names
+    ),
+    "ROS camera_info": IntrinsicsFormat(
+        lambda one: bool({"camera_name", "distortion_model", "camera_matrix"} & set(one.entries)),
+        lambda one, name: take_camera_info(one.entries, str(one.path)),
+    ),
 }
 """The formats, by name; the first that accepts a file reads it."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.safe.fields import recorded_distance
 from v2hdm.records import BoolArray, CameraInfo, CentrePrior, FloatArray
@@ -22,12 +23,14 @@ _STEEPEST_RAY = 0.999
 
 def take_ipm(content: object, where: str) -> FloatArray:
     """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm."""
-    ipm = take_array(content, (3, 3), where, DriveError)
-    rows, columns = np.linalg.norm(ipm, axis=1, keepdims=True), np.linalg.norm(ipm, axis=0)
-    if not rows.all() or not columns.all() or 1.0 / np.linalg.cond(_balanced(ipm)) < _SINGULAR:
-        raise DriveError(
-            f"{where}: IPM matrix is not invertible; calibrate it again from at least 4 point pairs"
-        )
+    ipm = balanced = take_array(content, (3, 3), where, DriveError)
+    invertible = ipm.any(axis=0).all() and ipm.any(axis=1).all()
+    # Rows and columns of comparable norms: pixels and metres must not look singular.
+    for axis in (1, 0) * 4 if invertible else ():
+        balanced = balanced / np.linalg.norm(balanced, axis=axis, keepdims=True)
+    if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
+        advice = "calibrate it again from at least 4 point pairs"
+        raise DriveError(f"{where}: IPM matrix is not invertible; {advice}")
     return np.asarray(ipm / np.linalg.norm(ipm))
 
 
@@ -58,15 +61,9 @@ def take_roi(content: object, where: str) -> FloatArray:
     roi = take_array(content, (-1, 2), where, DriveError)
     if len(roi) < 3:
         raise DriveError(f"{where}: a polygon needs at least 3 points, got {len(roi)}; add points")
-    edges = np.roll(roi, -1, axis=0) - roi
-    following = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    winding_rad = np.arctan2(turns, np.sum(edges * following, axis=1)).sum()
-    # Straight corners are fine; a star turns one way at every corner but goes around twice.
-    one_way = (turns >= 0).all() or (turns <= 0).all()
-    if not one_way or not turns.any() or not np.isclose(abs(winding_rad), 2 * np.pi):
+    if not (turning := winding(roi)):
         raise DriveError(f"{where}: polygon is not convex; give its corners in order around the region")
-    return roi if winding_rad > 0 else roi[::-1].copy()
+    return roi if turning > 0 else roi[::-1].copy()
 
 
 def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray, where: str) -> None:
@@ -121,9 +118,8 @@ def take_centre_prior(content: object, where: str) -> CentrePrior:
     sigmas = sigma if isinstance(sigma, list) else [sigma] * 3
     sigma_m = take_array(sigmas, (3,), f"{where}, sigma_m", DriveError)
     if (sigma_m <= 0).any():
-        raise DriveError(
-            f"{where}, sigma_m: must be positive; give the survey's standard deviation in metres"
-        )
+        advice = "give the survey's standard deviation in metres"
+        raise DriveError(f"{where}, sigma_m: must be positive; {advice}")
     return CentrePrior(take_array(entry["xyz"], (3,), f"{where}, xyz", DriveError), sigma_m)
 
 
@@ -135,15 +131,6 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
         raise DriveError(f"{where}: missing key 'initial_ipm'; choose from: {', '.join(ipm)}")
     initial = take_text(name, f"{where}, initial_ipm", DriveError)
     if initial not in ipm:
-        raise DriveError(
-            f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {', '.join(ipm)}"
-        )
+        names = ", ".join(ipm)
+        raise DriveError(f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {names}")
     return initial
-
-
-def _balanced(matrix: FloatArray) -> FloatArray:
-    """Rows and columns brought to comparable norms: pixels and metres must not look singular."""
-    for _ in range(4):
-        matrix = matrix / np.linalg.norm(matrix, axis=1, keepdims=True)
-        matrix = matrix / np.linalg.norm(matrix, axis=0, keepdims=True)
-    return matrix

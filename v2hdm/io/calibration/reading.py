@@ -50,10 +50,10 @@ def read_calibration(path: Path) -> Calibration:
         return take_array(content[key], shape, f"{path}: {key}", MapFileError)
 
     name = take_camera_name(content["camera_name"], f"{path}: camera_name", MapFileError)
-    size = [take_size_px(content[key], f"{path}: {key}", MapFileError) for key in _SIZE]
+    width, height = (take_size_px(content[key], f"{path}: {key}", MapFileError) for key in _SIZE)
     model = take_text(content["distortion_model"], f"{path}: distortion_model", MapFileError)
     distortion = tuple(array("distortion_coefficients", -1).tolist())
-    info = CameraInfo(name, size[0], size[1], array("camera_matrix", 3, 3), model, distortion)
+    info = CameraInfo(name, width, height, array("camera_matrix", 3, 3), model, distortion)
     if len(info.distortion) == DISTORTION_COEFFICIENTS.get(info.distortion_model):
         check_camera(info, str(path), MapFileError)
     covariance = None
@@ -81,9 +81,8 @@ def trusted_calibrations(path: Path) -> dict[str, Calibration]:
     """
     files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
     if not files:
-        raise MapFileError(
-            f"{path}: no calibration_*.yaml in it; give what v2hdm.map or v2hdm.cli.extrinsic wrote"
-        )
+        advice = "give what v2hdm map or v2hdm calibrate ground wrote"
+        raise MapFileError(f"{path}: no calibration_*.yaml in it; {advice}")
     found = {}
     for file in files:
         calibration = read_calibration(file)
@@ -109,22 +108,34 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     """
     check_keys(content, _INFO, _IGNORED, where, DriveError)
     model = take_text(content["distortion_model"], f"{where}: distortion_model", DriveError)
-    if model not in DISTORTION_COEFFICIENTS:
-        raise DriveError(
-            f"{where}: unknown distortion_model '{model}'; "
-            f"convert the calibration to one of: {', '.join(DISTORTION_COEFFICIENTS)}"
-        )
+    expected = _coefficients_of(model, where, "convert the calibration to")
     distortion = take_matrix(content["distortion_coefficients"], f"{where}: distortion_coefficients").ravel()
-    expected = DISTORTION_COEFFICIENTS[model]
     if len(distortion) != expected:
         raise DriveError(
             f"{where}: distortion_coefficients: {model} has {expected} coefficients, got {len(distortion)}; "
             "complete them (zeros where unused) or name the right model"
         )
     name = take_text(content["camera_name"], f"{where}: camera_name", DriveError)
-    size = [take_size_px(content[key], f"{where}: {key}", DriveError) for key in _SIZE]
-    intrinsic = _take_intrinsic(content["camera_matrix"], f"{where}: camera_matrix")
-    info = CameraInfo(name, size[0], size[1], intrinsic, model, tuple(distortion.tolist()))
+    width, height = (take_size_px(content[key], f"{where}: {key}", DriveError) for key in _SIZE)
+    at = f"{where}: camera_matrix"
+    intrinsic = take_matrix(content["camera_matrix"], at)
+    if intrinsic.shape != (3, 3):
+        raise DriveError(f"{at}: expected 3 x 3, got {intrinsic.shape[0]} x {intrinsic.shape[1]}; mend it")
+    zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
+    if intrinsic[0, 0] <= 0 or intrinsic[1, 1] <= 0 or zeros.any() or intrinsic[2, 2] != 1:
+        raise DriveError(f"{at}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it")
+    return _checked(CameraInfo(name, width, height, intrinsic, model, tuple(distortion.tolist())), where)
+
+
+def _coefficients_of(model: str, where: str, advice: str) -> int:
+    """The number of coefficients of a distortion model of ours; else DriveError with ``advice``."""
+    if model not in DISTORTION_COEFFICIENTS:
+        known = ", ".join(DISTORTION_COEFFICIENTS)
+        raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {known}")
+    return DISTORTION_COEFFICIENTS[model]
+
+
+def _checked(info: CameraInfo, where: str) -> CameraInfo:
     check_camera(info, where, DriveError)
     return info
 
@@ -136,20 +147,9 @@ def take_matrix(content: object, where: str) -> FloatArray:
     rows, cols = (take_size_px(entry[key], f"{where}, {key}", DriveError) for key in ("rows", "cols"))
     data = take_array(entry["data"], (-1,), f"{where}, data", DriveError)
     if len(data) != rows * cols:
-        raise DriveError(
-            f"{where}: {rows} x {cols} does not fit its {len(data)} numbers; mend rows, cols or data"
-        )
+        problem = f"{rows} x {cols} does not fit its {len(data)} numbers"
+        raise DriveError(f"{where}: {problem}; mend rows, cols or data")
     return data.reshape(rows, cols)
-
-
-def _take_intrinsic(content: object, where: str) -> FloatArray:
-    intrinsic = take_matrix(content, where)
-    if intrinsic.shape != (3, 3):
-        raise DriveError(f"{where}: expected 3 x 3, got {intrinsic.shape[0]} x {intrinsic.shape[1]}; mend it")
-    zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
-    if intrinsic[0, 0] <= 0 or intrinsic[1, 1] <= 0 or zeros.any() or intrinsic[2, 2] != 1:
-        raise DriveError(f"{where}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it")
-    return intrinsic
 
 
 def info_of(fields: Any, name: str, where: str) -> CameraInfo:
@@ -163,22 +163,13 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
-        raise DriveError(
-            f"{where}: its images are binned or cut to a region; give their camera_info as a file"
-        )
-    if model not in DISTORTION_COEFFICIENTS:
-        raise DriveError(
-            f"{where}: unknown distortion_model '{model}'; give camera_info as a file with one of: "
-            f"{', '.join(DISTORTION_COEFFICIENTS)}"
-        )
-    count = DISTORTION_COEFFICIENTS[model]
+        problem = "its images are binned or cut to a region"
+        raise DriveError(f"{where}: {problem}; give their camera_info as a file")
+    count = _coefficients_of(model, where, "give camera_info as a file with")
     if distortion[count:].any():
-        raise DriveError(
-            f"{where}: {model} has {count} coefficients, got {len(distortion)}; give it as a file"
-        )
+        problem = f"{model} has {count} coefficients, got {len(distortion)}"
+        raise DriveError(f"{where}: {problem}; give it as a file")
     # k3 and those after it are zero where they are not given.
-    padded = np.zeros(count)
-    padded[: len(distortion)] = distortion[:count]
-    info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, tuple(padded.tolist()))
-    check_camera(info, where, DriveError)
-    return info
+    padded = (*distortion[:count].tolist(), *(0.0,) * (count - len(distortion)))
+    info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, padded)
+    return _checked(info, where)

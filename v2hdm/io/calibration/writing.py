@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
+from v2hdm.geometry.rigid import euler_from_rotation, inverse, quaternion_from_rotation
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.store.files import dump_yaml, replace_text
@@ -72,11 +71,6 @@ def write_camera_info(info: CameraInfo, path: Path) -> None:
     replace_text(path, dump_yaml(_camera_info(info)))
 
 
-def camera_info_yaml(calibration: Calibration, about: Provenance) -> str:
-    """ROS' ``camera_info`` as ``camera_calibration_parsers`` reads it: the intrinsics alone."""
-    return _comments(calibration, about) + dump_yaml(_camera_info(calibration.info))
-
-
 def _camera_info(info: CameraInfo) -> dict[str, Any]:
     return {
         "image_width": info.width,
@@ -98,24 +92,24 @@ def static_transform_yaml(calibration: Calibration, about: Provenance) -> str:
     rotation = dict(zip("xyzw", quaternion.tolist(), strict=True))
     transform = {
         "header": {"frame_id": VEHICLE_FRAME},
-        "child_frame_id": _optical_frame(calibration),
+        "child_frame_id": f"{calibration.info.name}_optical_frame",
         "transform": {"translation": translation, "rotation": rotation},
     }
-    return _comments(calibration, about) + dump_yaml({"transforms": [transform]})
+    return _yaml(calibration, about, {"transforms": [transform]})
 
 
 def urdf(calibration: Calibration, about: Provenance) -> str:
     """A URDF robot: the vehicle's link, the camera's, and the fixed joint whose origin is the calibration."""
     vehicle_from_cam = inverse(calibration.cam_from_vehicle)
-    frame = _optical_frame(calibration)
+    frame = f"{calibration.info.name}_optical_frame"
     robot = ET.Element("robot", name="vehicle")
     for link in (VEHICLE_FRAME, frame):
         ET.SubElement(robot, "link", name=link)
     joint = ET.SubElement(robot, "joint", name=f"{frame}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=VEHICLE_FRAME)
     ET.SubElement(joint, "child", link=frame)
-    rpy = _spaced(_fixed_axis_angles(vehicle_from_cam))
-    ET.SubElement(joint, "origin", xyz=_spaced(vehicle_from_cam[:3, 3]), rpy=rpy)
+    xyz, rpy = vehicle_from_cam[:3, 3].tolist(), euler_from_rotation(vehicle_from_cam[:3, :3]).tolist()
+    ET.SubElement(joint, "origin", xyz=" ".join(map(repr, xyz)), rpy=" ".join(map(repr, rpy)))
     ET.indent(robot, "  ")
     comment = _comments(calibration, about).replace("--", "- -")
     return f'<?xml version="1.0"?>\n<!--\n{comment}-->\n{ET.tostring(robot, encoding="unicode")}\n'
@@ -139,7 +133,7 @@ def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
         "resolution": [info.width, info.height],
         "T_cam_vehicle": calibration.cam_from_vehicle.tolist(),
     }
-    return _comments(calibration, about) + dump_yaml({"cam0": camera})
+    return _yaml(calibration, about, {"cam0": camera})
 
 
 def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
@@ -160,22 +154,14 @@ def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
     return f"{head}---\n{_comments(calibration, about)}{body}"
 
 
-@dataclass(frozen=True)
-class CalibrationFormat:
-    """The ending of a file's name, and the function that makes its text."""
-
-    ending: str
-    text: Callable[[Calibration, Provenance], str]
-
-
-CALIBRATION_FORMATS: Mapping[str, CalibrationFormat] = {
-    "camera_info": CalibrationFormat("camera_info.yaml", camera_info_yaml),
-    "static_transform": CalibrationFormat("static_transform.yaml", static_transform_yaml),
-    "urdf": CalibrationFormat("origin.urdf", urdf),
-    "kalibr": CalibrationFormat("kalibr.yaml", kalibr_yaml),
-    "opencv": CalibrationFormat("opencv.yaml", opencv_yaml),
+CALIBRATION_FORMATS: Mapping[str, tuple[str, Callable[[Calibration, Provenance], str]]] = {
+    "camera_info": ("camera_info.yaml", lambda one, about: _yaml(one, about, _camera_info(one.info))),
+    "static_transform": ("static_transform.yaml", static_transform_yaml),
+    "urdf": ("origin.urdf", urdf),
+    "kalibr": ("kalibr.yaml", kalibr_yaml),
+    "opencv": ("opencv.yaml", opencv_yaml),
 }
-"""Formats of a calibration besides our own, by name."""
+"""Formats of a calibration besides our own, by name: the ending of a file's name, and what makes its text."""
 
 
 def write_calibration_as(
@@ -185,10 +171,14 @@ def write_calibration_as(
 
     Raises MapFileError when the format cannot describe this camera.
     """
-    chosen = CALIBRATION_FORMATS[name]
-    path = folder / f"{stem}_{chosen.ending}"
-    replace_text(path, chosen.text(calibration, about))
+    ending, text_of = CALIBRATION_FORMATS[name]
+    path = folder / f"{stem}_{ending}"
+    replace_text(path, text_of(calibration, about))
     return path
+
+
+def _yaml(calibration: Calibration, about: Provenance, content: Mapping[str, Any]) -> str:
+    return _comments(calibration, about) + dump_yaml(content)
 
 
 def _comments(calibration: Calibration, about: Provenance) -> str:
@@ -210,24 +200,5 @@ def _sigmas(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _optical_frame(calibration: Calibration) -> str:
-    return f"{calibration.info.name}_optical_frame"
-
-
 def _matrix(values: FloatArray) -> dict[str, Any]:
     return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
-
-
-def _spaced(values: FloatArray) -> str:
-    return " ".join(repr(value) for value in values.tolist())
-
-
-def _fixed_axis_angles(dst_from_src: FloatArray) -> FloatArray:
-    """Roll, pitch and yaw (3,) in rad about fixed axes, as URDF has them: Rz(yaw) Ry(pitch) Rx(roll)."""
-    rotation = dst_from_src[:3, :3]
-    flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
-    pitch = np.arctan2(-rotation[2, 0], flat)
-    yaw = np.arctan2(rotation[1, 0], rotation[0, 0]) if flat > 0 else 0.0
-    # By its cosines with the other two axes turned, roll stays exact where the pitch is a right angle.
-    across = rotation.T @ [-np.sin(yaw), np.cos(yaw), 0.0]
-    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
@@ -18,17 +17,9 @@ from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.records import Drive, Trajectory
 
 __all__ = [
-    "READERS", "KittiOptions", "ReadOptions", "Reader", "Trajectory", "drive_name", "join_drives",
+    "READERS", "KittiOptions", "ReadOptions", "Trajectory", "drive_name", "join_drives",
     "read_drive", "with_clock_offsets",
 ]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Reader:
-    """One format: ``accepts`` a path by a look at it, ``read`` makes a drive of it."""
-
-    accepts: Callable[[Path], bool]
-    read: Callable[[Path, ReadOptions], Drive]
 
 
 def _read_bag(path: Path, options: ReadOptions) -> Drive:
@@ -36,22 +27,32 @@ def _read_bag(path: Path, options: ReadOptions) -> Drive:
     return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
 
 
-READERS: Mapping[str, Reader] = {
-    "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
-    "kitti": Reader(accepts=is_kitti_drive, read=read_kitti_drive),
-    "nuscenes": Reader(accepts=is_nuscenes_drive, read=read_nuscenes_drive),
-    "bag": Reader(accepts=is_bag, read=_read_bag),
+READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions], Drive]]] = {
+    "folder": (is_folder_drive, read_folder_drive),
+    "kitti": (is_kitti_drive, read_kitti_drive),
+    "nuscenes": (is_nuscenes_drive, read_nuscenes_drive),
+    "bag": (is_bag, _read_bag),
 }
+"""Formats by name: whether a path looks like one, and what makes a drive of it."""
 
 
-def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
-    """Read the drive at ``path`` in whatever format it is.
+def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
+    """Read a drive: a folder with ``drive.yaml``, KITTI raw, nuScenes or a bag.
 
-    Every image gets the vehicle's pose at its time: position linear, rotation slerp, never extrapolated, not
-    across a gap longer than ``options.max_gap_s``; images without a pose are dropped with a logged count. All
+    Every image gets the vehicle's pose at its time, ``map_from_vehicle`` (4, 4): position linear, rotation
+    slerp, never extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are
+    dropped with a logged count. The frame ``map`` is east, north, up, m; a sloping road is laid flat. All
     image files are checked for presence, completeness and size, then ``options.start_s``, ``end_s`` and
-    ``limit`` select some of them. Raises DriveError, with the place and the remedy.
+    ``limit`` select some of them.
+
+    Raises:
+        DriveError: names what is wrong, where, and what to do about it.
+
+    >>> drive = read_drive(port.root)
+    >>> list(drive.cameras), drive.images[0].map_from_vehicle.shape
+    (['front'], (4, 4))
     """
+    path = Path(path)
     options = options or ReadOptions()
     if not path.exists():
         raise DriveError(f"{path}: no such drive folder or bag; check drive.path")
@@ -59,12 +60,16 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
     if options.format not in ("auto", *READERS):
         raise DriveError(f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}")
-    for name, reader in READERS.items():
-        if options.format == name or (options.format == "auto" and reader.accepts(path)):
-            return part_of(reader.read(path, options), options)
-    raise DriveError(
-        f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
-    )
+    for name, (accepts, read) in READERS.items():
+        if options.format == name or (options.format == "auto" and accepts(path)):
+            return part_of(read(path, options), options)
+    known = ", ".join(READERS)
+    raise DriveError(f"{path}: not a drive in any known format ({known}); see docs/drive-format.md")
+
+
+def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> Drive:
+    """The drive itself, or that in a folder, read."""
+    return drive if isinstance(drive, Drive) else read_drive(drive, options)
 
 
 def drive_name(path: Path) -> str:

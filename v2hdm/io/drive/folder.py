@@ -14,15 +14,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.mounting import (
-    IPM_NAMES,
-    check_roi_in_view,
-    choose_initial,
-    ipm_from_guess,
-    take_centre_prior,
-    take_ipm,
-    take_roi,
-)  # fmt: skip
+from v2hdm.io.calibration import mounting
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
@@ -93,18 +85,16 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
-    return assemble_drive(
-        _name(content, path),
-        path,
-        cameras,
-        files,
-        recorded.trajectory,
-        pose_noise,
-        options.max_gap_s,
-        poses_at,
-        origin=recorded.origin,
-        truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
+    truth_dir = None
+    if content.get("truth") is not None:
+        truth_dir = path / take_text(content["truth"], f"{where}: truth", DriveError)
+        if not truth_dir.is_dir():
+            raise DriveError(f"{where}: truth: no such folder {truth_dir}; restore it or drop the key")
+    name = _name(content, path)
+    drive = Drive(
+        name, path, cameras, (), pose_noise, recorded.origin, truth_dir, recorded=recorded.trajectory
     )
+    return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
 def folder_drive_name(path: Path) -> str:
@@ -121,25 +111,29 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         raise DriveError(f"{where}: give either 'ipm' or 'cam_from_vehicle', one of the two")
     if "ipm" in entry:
         matrices = take_mapping(entry["ipm"], f"{where}, ipm", DriveError)
-        check_keys(matrices, (), IPM_NAMES, f"{where}, ipm", DriveError)
-        ipm = {name: take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
+        check_keys(matrices, (), mounting.IPM_NAMES, f"{where}, ipm", DriveError)
+        ipm = {name: mounting.take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
         if not ipm:
-            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(IPM_NAMES)}")
+            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(mounting.IPM_NAMES)}")
     else:
-        ipm = {"estimated": ipm_from_guess(info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle")}
+        ipm = {
+            "estimated": mounting.ipm_from_guess(
+                info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle"
+            )
+        }
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
-    initial_ipm = choose_initial(entry.get("initial_ipm"), ipm, where)
-    roi_vehicle = take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
-    check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
+    initial_ipm = mounting.choose_initial(entry.get("initial_ipm"), ipm, where)
+    roi_vehicle = mounting.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+    mounting.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     return Camera(
         info=info,
         ipm=ipm,
         initial_ipm=initial_ipm,
         roi_vehicle=roi_vehicle,
-        centre_prior=None if prior is None else take_centre_prior(prior, f"{where}, centre_prior"),
+        centre_prior=None if prior is None else mounting.take_centre_prior(prior, f"{where}, centre_prior"),
         linear_response=linear,
         own_vehicle=_read_mask(entry, root, info, where),
     )
@@ -168,21 +162,11 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
         if value < 0:
             raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; mend it")
         if key.endswith("_over_m") and value == 0:
-            raise DriveError(
-                f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
-            )
+            problem = "an error that fades over no distance is no drift"
+            raise DriveError(f"{where}, {key}: {problem}; leave it out")
     stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
     noise = PoseNoise.as_far_as_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise
-
-
-def _find_truth(content: object, root: Path, where: str) -> Path | None:
-    if content is None:
-        return None
-    truth_dir = root / take_text(content, where, DriveError)
-    if not truth_dir.is_dir():
-        raise DriveError(f"{where}: no such folder {truth_dir}; restore it or drop the key")
-    return truth_dir

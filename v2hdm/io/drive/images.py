@@ -14,8 +14,8 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.trajectory import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.safe.pixels import read_header
-from v2hdm.io.trajectory import check_trajectory, why_no_pose
-from v2hdm.records import Camera, Drive, FloatArray, GeodeticOrigin, Image, PoseNoise, Trajectory
+from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
+from v2hdm.records import Camera, Drive, FloatArray, Image, Trajectory
 
 _log = logging.getLogger(__name__)
 
@@ -83,42 +83,25 @@ def select_cameras(available: Sequence[str], wanted: Sequence[str], where: Path)
 
 
 def assemble_drive(
-    name: str,
-    root: Path,
-    cameras: Mapping[str, Camera],
+    drive: Drive,
     files: Sequence[ImageFiles],
-    recorded: Trajectory,
-    pose_noise: PoseNoise,
     max_gap_s: float,
     where: str,
-    *,
-    origin: GeodeticOrigin | None = None,
-    truth_dir: Path | None = None,
     mount_rad: FloatArray | None = None,
 ) -> Drive:
-    """The drive of ``recorded`` poses, with the road laid flat and every image posed and checked.
+    """The drive of its ``recorded`` poses: the road laid flat, every image of ``files`` posed and checked.
 
     ``where`` names the poses in errors; ``mount_rad`` is the sensor's turn where the poses have lost it.
     """
-    check_trajectory(recorded, origin, where)
-    laid = lay_flat(recorded, pose_noise.position_m)
-    log_road(laid if mount_rad is None else replace(laid, mount_rad=mount_rad), root)
-    images = _pose_images(files, laid.trajectory, max_gap_s, root)
-    _check_image_files(images, cameras)
+    assert drive.recorded is not None
+    check_trajectory(drive.recorded, drive.origin, where)
+    laid = lay_flat(drive.recorded, drive.pose_noise.position_m)
+    log_road(laid if mount_rad is None else replace(laid, mount_rad=mount_rad), drive.root)
+    images = _pose_images(files, laid.trajectory, max_gap_s, drive.root)
+    _check_image_files(images, drive.cameras)
     posed = Counter(image.camera for image in images)
-    return Drive(
-        name=name,
-        root=root,
-        cameras=cameras,
-        images=images,
-        pose_noise=pose_noise,
-        origin=origin,
-        truth_dir=truth_dir,
-        unposed={entry.camera: len(entry.paths) - posed[entry.camera] for entry in files},
-        trajectory=laid.trajectory,
-        recorded=recorded,
-        road=laid.road,
-    )
+    unposed = {entry.camera: len(entry.paths) - posed[entry.camera] for entry in files}
+    return replace(drive, images=images, unposed=unposed, trajectory=laid.trajectory, road=laid.road)
 
 
 def _pose_images(
@@ -130,8 +113,8 @@ def _pose_images(
         poses, inside = interpolate(trajectory, entry.stamp_s, max_gap_s)
         if not inside.any():
             raise DriveError(
-                f"{where}: no image of camera '{entry.camera}' ({_span(entry.stamp_s)}) has a pose "
-                f"(poses: {_span(trajectory.stamp_s)}); "
+                f"{where}: no image of camera '{entry.camera}' ({span(entry.stamp_s)}) has a pose "
+                f"(poses: {span(trajectory.stamp_s)}); "
                 f"{why_no_pose(entry.stamp_s, trajectory.stamp_s, max_gap_s)}"
             )
         if not inside.all():
@@ -163,10 +146,6 @@ def _check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -
             )
 
 
-def _span(stamp_s: FloatArray) -> str:
-    return f"{stamp_s[0]:.3f} to {stamp_s[-1]:.3f} s"
-
-
 def part_of(drive: Drive, options: ReadOptions) -> Drive:
     """The images between ``start_s`` and ``end_s`` after the first, at most ``limit`` of each camera."""
     if options.limit is None and options.end_s is None and options.start_s <= 0:
@@ -175,19 +154,15 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
         raise DriveError(f"drive.limit is {options.limit}: give 1 or more images of each camera")
     first_s = min(image.stamp_s for image in drive.images)
     end_s = float("inf") if options.end_s is None else options.end_s
-    counts: Counter[str] = Counter()
-    images = []
-    for image in drive.images:
-        if not options.start_s <= image.stamp_s - first_s <= end_s:
-            continue
-        counts[image.camera] += 1
-        if options.limit is None or counts[image.camera] <= options.limit:
-            images.append(image)
+    images: list[Image] = []
     for name in drive.cameras:
-        if not counts[name]:
+        own = [image for image in drive.images if image.camera == name]
+        own = [image for image in own if options.start_s <= image.stamp_s - first_s <= end_s]
+        images += own[: options.limit]
+        if not own:
             lasts_s = max(image.stamp_s for image in drive.images) - first_s
             raise DriveError(
                 f"{drive.root}: no image of camera '{name}' is left from {options.start_s:g} to {end_s:g} s; "
                 f"the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
             )
-    return replace(drive, images=tuple(images))
+    return replace(drive, images=tuple(sorted(images, key=in_order)))

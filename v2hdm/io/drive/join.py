@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import chain, count
 
 import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
 from v2hdm.geometry.ipm import extrinsic_from_ipm
-from v2hdm.geometry.rigid import camera_centre, log
+from v2hdm.geometry.rigid import camera_centre, log, make_transform
 from v2hdm.geometry.trajectory import in_order
 from v2hdm.records import (
     Camera,
-    CameraInfo,
+    CentrePrior,
     Drive,
     FloatArray,
     GeodeticOrigin,
@@ -29,7 +30,7 @@ from v2hdm.records import (
     Trajectory,
     Visit,
     largest_noise,
-)  # fmt: skip
+)
 
 _log = logging.getLogger(__name__)
 
@@ -40,24 +41,18 @@ _SAME_LENS = 1e-3  # intrinsics that differ by less, px at the image's border, a
 _REACH_M = 40.0  # routes with a marking in common are no further apart: twice a camera's reach
 
 
-@dataclass(frozen=True)
-class _Move:
-    """A rigid motion (4, 4) from one drive's frame into the first's, and its part within the plane."""
+def _moved(one: Trajectory | None, motion: FloatArray) -> Trajectory | None:
+    return None if one is None else replace(one, map_from_vehicle=motion @ one.map_from_vehicle)
 
-    whole: FloatArray
-    planar: FloatArray
 
-    def trajectory(self, one: Trajectory | None, motion: FloatArray) -> Trajectory | None:
-        return None if one is None else replace(one, map_from_vehicle=motion @ one.map_from_vehicle)
-
-    def road(self, road: Road | None) -> Road | None:
-        if road is None:
-            return None
-        points = np.column_stack([road.points_map, road.height_m])
-        moved = points @ self.whole[:3, :3].T + self.whole[:3, 3]
-        # The planes of two places on the earth are tilted by the angle between their verticals.
-        tilt = self.whole[2, :2] @ self.whole[:2, :2].T
-        return Road(moved[:, :2], moved[:, 2], road.slope @ self.whole[:2, :2].T + tilt)
+def _moved_road(road: Road | None, motion: FloatArray) -> Road | None:
+    if road is None:
+        return None
+    points = np.column_stack([road.points_map, road.height_m])
+    moved = points @ motion[:3, :3].T + motion[:3, 3]
+    # The planes of two places on the earth are tilted by the angle between their verticals.
+    tilt = motion[2, :2] @ motion[:2, :2].T
+    return Road(moved[:, :2], moved[:, 2], road.slope @ motion[:2, :2].T + tilt)
 
 
 def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()) -> Drive:
@@ -69,11 +64,12 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
     if len(drives) == 1:
         return drives[0]
     _check(drives)
-    names = _distinct([drive.name for drive in drives])
+    names: list[str] = []
+    for drive in drives:
+        again = (f"{drive.name}-{number}" for number in count(2))
+        names.append(next(name for name in chain([drive.name], again) if name not in names))
     cameras: dict[str, Camera] = {}
-    images: list[Image] = []
-    visits: list[Visit] = []
-    roads: list[Road | None] = []
+    images, visits, roads = [], [], []
     for number, (drive, name) in enumerate(zip(drives, names, strict=True)):
         own = {
             camera: _name_of(camera, one, name, cameras, (number, camera) in apart)
@@ -82,68 +78,53 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
         for camera, joined in own.items():
             one = drive.cameras[camera]
             cameras.setdefault(joined, replace(one, info=replace(one.info, name=joined)))
-        move = _move(drives[0].origin, drive.origin)
+        whole, planar = _move(drives[0].origin, drive.origin)
         for image in drive.images:
-            pose = move.planar @ image.map_from_vehicle
+            pose = planar @ image.map_from_vehicle
             images.append(replace(image, camera=own[image.camera], visit=number, map_from_vehicle=pose))
-        visits.append(
-            Visit(
-                name=name,
-                root=drive.root,
-                pose_noise=drive.pose_noise,
-                truth_dir=drive.truth_dir,
-                trajectory=move.trajectory(drive.trajectory, move.planar),
-                recorded=move.trajectory(drive.recorded, move.whole),
-                cameras=own,
-            )
-        )
-        roads.append(move.road(drive.road))
-    whole = Drive(
-        name="+".join(names),
-        root=drives[0].root,
-        cameras=cameras,
-        images=tuple(sorted(images, key=in_order)),
-        pose_noise=largest_noise([drive.pose_noise for drive in drives]),
-        origin=drives[0].origin,
+        poses = (_moved(drive.trajectory, planar), _moved(drive.recorded, whole))
+        visits.append(Visit(name, drive.root, drive.pose_noise, drive.truth_dir, *poses, own))
+        roads.append(_moved_road(drive.road, whole))
+    _check_overlap(images, visits)
+    return Drive(
+        "+".join(names),
+        drives[0].root,
+        cameras,
+        tuple(sorted(images, key=in_order)),
+        largest_noise([drive.pose_noise for drive in drives]),
+        drives[0].origin,
         road=_one_road(roads, visits),
         joined=tuple(visits),
     )
-    _check_overlap(whole)
-    return whole
 
 
-def same_rig(first: Camera, second: Camera) -> bool:
+def _same_rig(first: Camera, second: Camera) -> bool:
     """Whether two descriptions are of one camera on one mounting: lens exactly, guess by its sigmas."""
-    if not _same_lens(first.info, second.info):
+    one, other = first.info, second.info
+    if (one.width, one.height, one.distortion_model) != (other.width, other.height, other.distortion_model):
         return False
-    guesses = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in (first, second)]
+    same_matrix = np.allclose(one.intrinsic, other.intrinsic, rtol=0, atol=_SAME_LENS)
+    if not (
+        same_matrix and np.allclose(one.distortion, other.distortion, rtol=0, atol=_SAME_LENS / one.width)
+    ):
+        return False
+    guesses = [extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]) for camera in (first, second)]
     turn_rad = float(np.linalg.norm(log(guesses[0] @ np.linalg.inv(guesses[1]))[3:]))
     if turn_rad > _SAME_RIG_SIGMAS * np.sqrt(2) * _GUESS_SIGMA_RAD:
         return False
-    priors = [one.centre_prior for one in (first, second)]
-    sigma = [np.full(3, _GUESS_SIGMA_M) if prior is None else prior.sigma_m for prior in priors]
-    centre = [
-        camera_centre(guess) if prior is None else prior.centre_vehicle
-        for guess, prior in zip(guesses, priors, strict=True)
+    centres = [
+        camera.centre_prior or CentrePrior(camera_centre(guess), np.full(3, _GUESS_SIGMA_M))
+        for camera, guess in zip((first, second), guesses, strict=True)
     ]
-    return bool((np.abs(centre[0] - centre[1]) <= _SAME_RIG_SIGMAS * np.hypot(*sigma)).all())
-
-
-def _same_lens(first: CameraInfo, second: CameraInfo) -> bool:
-    shapes = [(one.width, one.height, one.distortion_model) for one in (first, second)]
-    if shapes[0] != shapes[1]:
-        return False
-    return bool(
-        np.allclose(first.intrinsic, second.intrinsic, rtol=0, atol=_SAME_LENS)
-        and np.allclose(first.distortion, second.distortion, rtol=0, atol=_SAME_LENS / first.width)
-    )
+    apart_m = np.abs(centres[0].centre_vehicle - centres[1].centre_vehicle)
+    return bool((apart_m <= _SAME_RIG_SIGMAS * np.hypot(centres[0].sigma_m, centres[1].sigma_m)).all())
 
 
 def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera], apart: bool) -> str:
     """The joined drive's name for a camera of a session: that of the same rig, if there has been one."""
     if camera not in so_far:
         return camera
-    if not apart and same_rig(so_far[camera], one):
+    if not apart and _same_rig(so_far[camera], one):
         return camera
     why = "its mounting has changed" if apart else "its lens or the guess of its mounting differs"
     _log.warning(
@@ -153,17 +134,6 @@ def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera],
     return f"{camera}@{visit}"
 
 
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, with a number behind those that were there before."""
-    out: list[str] = []
-    for name in names:
-        number, one = 2, name
-        while one in out:
-            number, one = number + 1, f"{name}-{number}"
-        out.append(one)
-    return out
-
-
 def _check(drives: Sequence[Drive]) -> None:
     roots = [drive.root.resolve() for drive in drives]
     again = [root for root in roots if roots.count(root) > 1]
@@ -171,55 +141,45 @@ def _check(drives: Sequence[Drive]) -> None:
         raise DriveError(f"{again[0]}: given twice; name each drive once in drive.path")
     without = [drive.root for drive in drives if drive.origin is None]
     if without and len(without) < len(drives):
-        raise DriveError(
-            f"{without[0]}: has no origin, but other drives have: nobody knows how their frames lie to each "
-            "other; state its origin, or those of none"
-        )
+        problem = "has no origin, but other drives have: nobody knows how their frames lie to each other"
+        raise DriveError(f"{without[0]}: {problem}; state its origin, or those of none")
     if without:
         _log.warning("no drive has an origin: their coordinates are taken to be of one frame")
     datums = {drive.origin.datum: drive.root for drive in drives if drive.origin is not None}
     if len(datums) > 1:
-        raise DriveError(
-            "drives of several datums ("
-            + ", ".join(f"{root}: {datum}" for datum, root in datums.items())
-            + "): transform their poses to one"
-        )
+        stated = ", ".join(f"{root}: {datum}" for datum, root in datums.items())
+        raise DriveError(f"drives of several datums ({stated}): transform their poses to one")
 
 
-def _check_overlap(drive: Drive) -> None:
+def _check_overlap(images: Sequence[Image], visits: Sequence[Visit]) -> None:
     """Refuse a session that comes near to no other: they would have nothing in common."""
-    places = [
-        np.array([image.map_from_vehicle[:2, 3] for image in drive.images if image.visit == number])
-        for number in range(len(drive.joined))
-    ]
-    for number, own in enumerate(places):
-        others = np.concatenate([one for k, one in enumerate(places) if k != number])
-        nearest_m = np.inf
-        for place in own:
-            nearest_m = min(nearest_m, float(np.linalg.norm(others - place, axis=1).min()))
-            if nearest_m <= _REACH_M:
-                break
-        if nearest_m > _REACH_M:
+    places = np.array([image.map_from_vehicle[:2, 3] for image in images])
+    number = np.array([image.visit for image in images])
+    for visit, one in enumerate(visits):
+        own, others = places[number == visit], places[number != visit]
+
+        def away_m(place: FloatArray, others: FloatArray = others) -> float:
+            return float(np.linalg.norm(others - place, axis=1).min())
+
+        if not any(away_m(place) <= _REACH_M for place in own):
             raise DriveError(
-                f"{drive.joined[number].root}: comes no nearer than {nearest_m:.0f} m to the other drives, "
+                f"{one.root}: comes no nearer than {min(map(away_m, own)):.0f} m to the other drives, "
                 "so that they have nothing in common; map it by itself, or check the frame of its poses"
             )
 
 
-def _move(to: GeodeticOrigin | None, origin: GeodeticOrigin | None) -> _Move:
-    """From the frame of one origin into that of another."""
+def _move(to: GeodeticOrigin | None, origin: GeodeticOrigin | None) -> tuple[FloatArray, FloatArray]:
+    """The motion (4, 4) from the frame of one origin into that of another, and its part in the plane."""
     if to is None or origin is None or to == origin:
-        return _Move(np.eye(4), np.eye(4))
+        return np.eye(4), np.eye(4)
     place = np.concatenate([position_of(to), position_of(origin)])
     axes = enu_axes(place)
-    whole = np.eye(4)
-    whole[:3, :3] = axes[0].T @ axes[1]
-    whole[:3, 3] = enu_from_geodetic(to, place[1:])[0]
-    planar = np.eye(4)
+    whole = make_transform(axes[0].T @ axes[1], enu_from_geodetic(to, place[1:])[0])
     yaw = np.arctan2(whole[1, 0], whole[0, 0])
+    planar = np.eye(4)
     planar[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     planar[:2, 3] = whole[:2, 3]
-    return _Move(whole, planar)
+    return whole, planar
 
 
 def _one_road(roads: Sequence[Road | None], visits: Sequence[Visit]) -> Road | None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,10 +18,10 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.io.drive.images import ImageFiles, KittiOptions, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.trajectory import check_geodetic, pose_matrices
+from v2hdm.io.trajectory import check_geodetic
 from v2hdm.records import (
     Camera,
     CameraInfo,
@@ -38,32 +37,20 @@ from v2hdm.store.files import read_text
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class KittiCamera:
-    """One rectified camera: its pinhole intrinsics and where it sits in the IMU's frame."""
-
-    info: CameraInfo
-    cam_from_imu: FloatArray
-
-
-def read_kitti_camera(folder: Path, name: str) -> KittiCamera:
-    """Read the rectified camera ``name`` (``image_00`` to ``image_03``) from the date folder."""
+def _read_camera(folder: Path, name: str) -> tuple[CameraInfo, FloatArray]:
+    """Intrinsics of the rectified camera ``name`` (``image_00`` to ``image_03``), and ``cam_from_imu``."""
     number = name.removeprefix("image_")
     cameras = _Entries(folder / "calib_cam_to_cam.txt")
     projection = cameras.matrix(f"P_rect_{number}", 3, 4)
     width, height = cameras.matrix(f"S_rect_{number}", 1, 2)[0]
     intrinsic = projection[:, :3] / projection[2, 2]
-    rectified0_from_cam0 = np.eye(4)
-    rectified0_from_cam0[:3, :3] = cameras.matrix("R_rect_00", 3, 3)
+    rectified0_from_cam0 = make_transform(cameras.matrix("R_rect_00", 3, 3), np.zeros(3))
     # P = K [I | b]: the rectified cameras share cam 0's axes and differ by the offset b.
-    rectified_from_rectified0 = np.eye(4)
-    rectified_from_rectified0[:3, 3] = np.linalg.solve(intrinsic, projection[:, 3])
+    rectified_from_rectified0 = make_transform(np.eye(3), np.linalg.solve(intrinsic, projection[:, 3]))
     cam0_from_velo = _Entries(folder / "calib_velo_to_cam.txt").rigid()
     velo_from_imu = _Entries(folder / "calib_imu_to_velo.txt").rigid()
-    return KittiCamera(
-        info=CameraInfo(name=name, width=round(width), height=round(height), intrinsic=intrinsic),
-        cam_from_imu=rectified_from_rectified0 @ rectified0_from_cam0 @ cam0_from_velo @ velo_from_imu,
-    )
+    cam_from_imu = rectified_from_rectified0 @ rectified0_from_cam0 @ cam0_from_velo @ velo_from_imu
+    return CameraInfo(name, round(width), round(height), intrinsic), cam_from_imu
 
 
 class _Entries:
@@ -82,13 +69,12 @@ class _Entries:
         except ValueError:
             values = np.empty(0)
         if values.size != rows * columns or not np.isfinite(values).all():
-            raise DriveError(
-                f"{self._path}: {key}: expected {rows * columns} numbers; restore KITTI's own file"
-            )
+            expected = f"expected {rows * columns} numbers"
+            raise DriveError(f"{self._path}: {key}: {expected}; restore KITTI's own file")
         return values.reshape(rows, columns)
 
     def rigid(self) -> FloatArray:
-        return np.vstack([np.hstack([self.matrix("R", 3, 3), self.matrix("T", 3, 1)]), [0.0, 0.0, 0.0, 1.0]])
+        return make_transform(self.matrix("R", 3, 3), self.matrix("T", 1, 3)[0])
 
 
 _CAMERAS = ("image_00", "image_01", "image_02", "image_03")
@@ -105,8 +91,7 @@ _POSE_NOISE = PoseNoise(
 )
 """Most of the data sheet's 0.1 m and 0.1 deg is drift that a stretch of road in view shares. The rest
 wanders: steps of 1.1 m are 6 to 10 mm and 0.014 deg off the integrated velocity and turn rate (drive 0011),
-    as
-3 cm and 0.05 deg that fade over 30 m are."""
+as 3 cm and 0.05 deg that fade over 30 m are."""
 
 
 def is_kitti_drive(path: Path) -> bool:
@@ -122,33 +107,30 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         raise DriveError(f"{path}: no folder image_00 to image_03; give the folder of one drive, ..._sync")
     names = select_cameras(available, options.cameras, path)
     files = [_list_images(path, name) for name in names]
-    calibrations = {name: read_kitti_camera(path.parent, name) for name in names}
+    calibrations = {name: _read_camera(path.parent, name) for name in names}
     stamp_s, oxts = _read_oxts(path, names[0])
 
     check_geodetic(oxts[:, :3], f"{path / 'oxts'}")
     origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
     position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
-    enu_from_imu = pose_matrices(rotation_from_euler(*oxts[:, 3:6].T), position_enu)
+    enu_from_imu = make_transform(rotation_from_euler(*oxts[:, 3:6].T), position_enu)
     by_imu = lay_flat(Trajectory(stamp_s, enu_from_imu), _POSE_NOISE.position_m)
-    vehicle_from_imu = _level_mount(calibrations[names[0]], by_imu.mount_rad, options.kitti.camera_height_m)
+    # The IMU's turn on the vehicle, and its height from that of the camera.
+    roll, pitch = by_imu.mount_rad[:, None]
+    vehicle_from_imu = make_transform(rotation_from_euler(roll, pitch, np.zeros(1))[0], np.zeros(3))
+    camera_imu = np.linalg.inv(calibrations[names[0]][1])[:3, 3]
+    vehicle_from_imu[2, 3] = options.kitti.camera_height_m - (vehicle_from_imu[:3, :3] @ camera_imu)[2]
     enu_from_vehicle = enu_from_imu @ np.linalg.inv(vehicle_from_imu)
     enu_from_vehicle[:, 2, 3] += vehicle_from_imu[2, 3]  # the map's origin is on the road
     cameras = {
-        name: _mount(calibration, vehicle_from_imu, options.kitti)
-        for name, calibration in calibrations.items()
+        name: _mount(info, cam_from_imu @ np.linalg.inv(vehicle_from_imu), options.kitti)
+        for name, (info, cam_from_imu) in calibrations.items()
     }
-    return assemble_drive(
-        path.name,
-        path,
-        cameras,
-        files,
-        Trajectory(stamp_s, enu_from_vehicle),
-        _POSE_NOISE,
-        options.max_gap_s,
-        f"{path / 'oxts'}",
-        origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
-        mount_rad=by_imu.mount_rad,
-    )
+    on_road = geodetic_from_enu(origin_imu, np.array([[0.0, 0.0, -vehicle_from_imu[2, 3]]]))[0]
+    recorded, where = Trajectory(stamp_s, enu_from_vehicle), f"{path / 'oxts'}"
+    origin = GeodeticOrigin(*on_road.tolist())
+    drive = Drive(path.name, path, cameras, (), _POSE_NOISE, origin, recorded=recorded)
+    return assemble_drive(drive, files, options.max_gap_s, where, by_imu.mount_rad)
 
 
 def _list_images(path: Path, camera: str) -> ImageFiles:
@@ -189,9 +171,8 @@ def _stamps_of(paths: Sequence[Path], stamps_path: Path, thing: str) -> FloatArr
     stamps = _read_stamps(stamps_path)
     numbers = [int(path.stem) for path in paths]
     if numbers[-1] >= len(stamps):
-        raise DriveError(
-            f"{stamps_path}: {len(stamps)} lines, but {thing} {numbers[-1]} exists; restore the file"
-        )
+        problem = f"{len(stamps)} lines, but {thing} {numbers[-1]} exists"
+        raise DriveError(f"{stamps_path}: {problem}; restore the file")
     return stamps[numbers]
 
 
@@ -201,9 +182,8 @@ def _read_oxts_row(path: Path) -> FloatArray:
     except ValueError:
         raise DriveError(f"{path}: holds something that is not a number; restore KITTI's own file") from None
     if len(row) != _OXTS_COLUMNS or not np.isfinite(row[:6]).all():
-        raise DriveError(
-            f"{path}: expected {_OXTS_COLUMNS} finite numbers, got {len(row)}; restore KITTI's own file"
-        )
+        problem = f"expected {_OXTS_COLUMNS} finite numbers, got {len(row)}"
+        raise DriveError(f"{path}: {problem}; restore KITTI's own file")
     return row
 
 
@@ -217,37 +197,15 @@ def _read_stamps(path: Path) -> FloatArray:
             seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
             stamps.append(seconds + float(f"0.{fraction or 0}"))
         except ValueError:
-            raise DriveError(
-                f"{path}: line {number}: expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'; mend it"
-            ) from None
+            problem = f"expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'"
+            raise DriveError(f"{path}: line {number}: {problem}; mend it") from None
     return np.array(stamps)
 
 
-def _level_mount(calibration: KittiCamera, mount_rad: FloatArray, camera_height_m: float) -> FloatArray:
-    """``vehicle_from_imu``: the IMU's turn on the vehicle, and its height from that of the camera."""
-    vehicle_from_imu = np.eye(4)
-    roll, pitch = mount_rad[:, None]
-    vehicle_from_imu[:3, :3] = rotation_from_euler(roll, pitch, np.zeros(1))[0]
-    camera_imu = np.linalg.inv(calibration.cam_from_imu)[:3, 3]
-    vehicle_from_imu[2, 3] = camera_height_m - (vehicle_from_imu[:3, :3] @ camera_imu)[2]
-    return vehicle_from_imu
-
-
-def _mount(calibration: KittiCamera, vehicle_from_imu: FloatArray, options: KittiOptions) -> Camera:
-    cam_from_vehicle = calibration.cam_from_imu @ np.linalg.inv(vehicle_from_imu)
-    centre_vehicle = np.linalg.inv(cam_from_vehicle)[:3, 3]
+def _mount(info: CameraInfo, cam_from_vehicle: FloatArray, options: KittiOptions) -> Camera:
+    centre_vehicle = np.asarray(np.linalg.inv(cam_from_vehicle)[:3, 3], dtype=np.float64)
     near, far, half = options.roi_near_m, options.roi_far_m, options.roi_half_width_m
     roi = np.array([[near, -half], [far, -half], [far, half], [near, half]]) + centre_vehicle[:2]
-    return Camera(
-        info=calibration.info,
-        ipm={"estimated": ipm_from_extrinsic(calibration.info, cam_from_vehicle)},
-        initial_ipm="estimated",
-        roi_vehicle=roi,
-        centre_prior=CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m)),
-    )
-
-
-def _lower(origin: GeodeticOrigin, height_m: float) -> GeodeticOrigin:
-    """``origin`` moved down to the road."""
-    latitude, longitude, altitude = geodetic_from_enu(origin, np.array([[0.0, 0.0, -height_m]]))[0]
-    return GeodeticOrigin(float(latitude), float(longitude), float(altitude))
+    prior = CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m))
+    ipm = {"estimated": ipm_from_extrinsic(info, cam_from_vehicle)}
+    return Camera(info, ipm, "estimated", roi, prior)

@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
+from v2hdm.geometry.rigid import inverse, make_transform
 from v2hdm.io.calibration.mounting import ipm_from_guess, roi_ahead
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.safe.fields import check_camera, take_size_px
 from v2hdm.io.safe.texts import read_json, take_camera_name
-from v2hdm.io.trajectory import in_order
+from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, PoseNoise, Trajectory
 from v2hdm.store.files import take_array, take_number, take_text
 
 _TABLES = ("sensor", "calibrated_sensor", "ego_pose", "sample_data")
-_MICROSECONDS = 1e6
-_NORM_TOLERANCE = 1e-3
 
 Row = dict[str, Any]
 
@@ -54,11 +52,17 @@ def read_nuscenes_drive(path: Path, options: ReadOptions) -> Drive:
         stamp_s = np.array([_stamp(row, str(folder)) for row in rows])
         if (np.diff(stamp_s) <= 0).any():
             raise DriveError(f"{folder}: two images of {name} at one time; give one recording, not several")
-        files.append(ImageFiles(name, stamp_s, [path / _file(row, folder) for row in rows]))
-    name, noise, where = path.resolve().name, PoseNoise.as_far_as_stated(), f"{folder}: ego_pose"
-    return assemble_drive(
-        name, path, cameras, files, _trajectory(egos, where), noise, options.max_gap_s, where
-    )
+        at = f"{folder}: sample_data of {name}, filename"
+        names = [take_text(row.get("filename"), at, DriveError) for row in rows]
+        files.append(ImageFiles(name, stamp_s, [path / file for file in names]))
+    where = f"{folder}: ego_pose"
+    rows = sorted(egos.values(), key=lambda row: _stamp(row, where))
+    stamp_s = np.array([_stamp(row, where) for row in rows])
+    order = in_order(stamp_s, where, "row")
+    recorded = Trajectory(stamp_s[order], np.array([_pose(rows[n], where) for n in order.tolist()]))
+    noise = PoseNoise.as_far_as_stated()
+    drive = Drive(path.resolve().name, path, cameras, (), noise, recorded=recorded)
+    return assemble_drive(drive, files, options.max_gap_s, where)
 
 
 def _tables_folder(path: Path) -> Path | None:
@@ -85,20 +89,15 @@ def _of(table: dict[str, Row], row: Row, key: str, folder: Path) -> Row:
 
 
 def _stamp(row: Row, where: str) -> float:
-    return take_number(row.get("timestamp"), f"{where}: timestamp", DriveError) / _MICROSECONDS
-
-
-def _file(row: Row, folder: Path) -> str:
-    return take_text(row.get("filename"), f"{folder}: sample_data {row['token']}, filename", DriveError)
+    return take_number(row.get("timestamp"), f"{where}: timestamp", DriveError) / 1e6
 
 
 def _camera(name: str, rows: list[Row], calibrated: dict[str, Row], folder: Path) -> Camera:
     where = f"{folder}: camera {name}"
     tokens = {str(row["calibrated_sensor_token"]) for row in rows}
     if len(tokens) > 1:
-        raise DriveError(
-            f"{where}: {len(tokens)} calibrations: these are several recordings; give one of them"
-        )
+        problem = f"{len(tokens)} calibrations: these are several recordings"
+        raise DriveError(f"{where}: {problem}; give one of them")
     row = calibrated[tokens.pop()]
     intrinsic = take_array(row.get("camera_intrinsic"), (3, 3), f"{where}, camera_intrinsic", DriveError)
     size = [take_size_px(rows[0].get(key), f"{where}, {key}", DriveError) for key in ("width", "height")]
@@ -109,20 +108,9 @@ def _camera(name: str, rows: list[Row], calibrated: dict[str, Row], folder: Path
     return Camera(info, ipm, "estimated", roi_ahead(vehicle_from_cam))
 
 
-def _trajectory(egos: dict[str, Row], where: str) -> Trajectory:
-    rows = sorted(egos.values(), key=lambda row: _stamp(row, where))
-    stamp_s = np.array([_stamp(row, where) for row in rows])
-    order = in_order(stamp_s, where, "row")
-    return Trajectory(stamp_s[order], np.array([_pose(rows[n], where) for n in order.tolist()]))
-
-
 def _pose(row: Row, where: str) -> FloatArray:
     """The transform (4 x 4) of a row's translation and its rotation, a quaternion w, x, y, z."""
     quaternion = take_array(row.get("rotation"), (4,), f"{where}, rotation", DriveError)
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > _NORM_TOLERANCE:
-        raise DriveError(f"{where}, rotation: quaternion of norm {norm:.6g} instead of 1; mend it")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_quaternion(quaternion[None, [1, 2, 3, 0]] / norm)[0]
-    pose[:3, 3] = take_array(row.get("translation"), (3,), f"{where}, translation", DriveError)
-    return pose
+    rotation = checked_rotations(quaternion[None, [1, 2, 3, 0]], lambda k: f"{where}, rotation", "mend it")
+    place = take_array(row.get("translation"), (3,), f"{where}, translation", DriveError)
+    return make_transform(rotation[0], place)

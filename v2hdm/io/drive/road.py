@@ -31,9 +31,8 @@ _ROAD_M, _HEIGHTS_M = 5.0, 10.0
 
 # Slow sway of a vehicle by acceleration and in bends: 0.17 deg, as on KITTI drives, over a few seconds.
 _SWAY_RAD, _SWAY_M = 0.003, 10.0
-_HEIGHT_SIGMAS = (
-    1.5  # GNSS heights are half again as uncertain as positions: no satellite is below the antenna
-)
+# GNSS heights are half again as uncertain as positions: no satellite is below the antenna.
+_HEIGHT_SIGMAS = 1.5
 _HEIGHT_M = 5.0  # way over which an error of the height is of one piece
 _CROSS_FALL = 0.02  # slope of a road that drains, expected where only heights along a line are known
 
@@ -70,7 +69,8 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
     Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road.
     """
     poses = recorded.map_from_vehicle
-    slope = _slope_of_up_axis(poses)
+    up = poses[:, :3, 2]
+    slope = -up[:, :2] / np.maximum(up[:, 2:], 1e-3)
     if np.median(np.linalg.norm(slope, axis=1)) > _STEEPEST:
         _log.warning("the poses' z axis does not point up: the road beneath them is not laid flat")
         return Laid(recorded, None, np.zeros(2))
@@ -83,18 +83,23 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
         return Laid(recorded, None, np.zeros(2))
     height_sigma_m = _HEIGHT_SIGMAS * position_sigma_m
     if not measured.all():
-        ground = stations.at_poses(_slope_of_heights(stations, height_m, height_sigma_m))
+        # By its heights alone, which hardly say anything of the slope across a straight road.
+        pieces = np.sqrt(2.0 * np.pi) * _HEIGHTS_M / _HEIGHT_M
+        trust_m2 = np.full(len(height_m), (height_sigma_m / _CROSS_FALL) ** 2 / pieces)
+        level = np.zeros((len(height_m), 2, 1))
+        by_heights = local_planes(stations, height_m[:, None], level, _HEIGHTS_M, trust_m2)[1][..., 0]
+        ground = stations.at_poses(by_heights)
         lean[:, ~measured] = _turned(ground, -yaw)[:, ~measured]
     leans = stations.mean(_with_mount(lean, yaw, measured))
-    fit = _fit(stations, height_m, leans, height_sigma_m)
-    relative = lean - _turned(stations.at_poses(fit.slope), -yaw) - fit.mount
+    ground_m, ground_slope, mount = _fit(stations, height_m, leans, height_sigma_m)
+    relative = lean - _turned(stations.at_poses(ground_slope), -yaw) - mount
     relative[:, ~measured] = 0.0
     flat = poses.copy()
     flat[:, 2, 3] = 0.0
     roll, pitch = _roll_pitch(relative).T
     flat[:, :3, :3] = rotation_from_euler(roll, pitch, yaw)
-    road = Road(stations.points_map, fit.height_m, fit.slope)
-    return Laid(Trajectory(recorded.stamp_s, flat), road, _roll_pitch(fit.mount[None])[0])
+    road = Road(stations.points_map, ground_m, ground_slope)
+    return Laid(Trajectory(recorded.stamp_s, flat), road, _roll_pitch(mount[None])[0])
 
 
 def log_road(laid: Laid, where: Path) -> None:
@@ -115,34 +120,30 @@ def log_road(laid: Laid, where: Path) -> None:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Heights (N,) and slopes (N, 2) of the ground; slope of the sensor forward and left (2,)."""
+def _fit(
+    stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Heights (N,) and slopes (N, 2) of the ground, and the mount (2,) forward and left, agreed upon.
 
-    height_m: FloatArray
-    slope: FloatArray
-    mount: FloatArray
-
-
-def _fit(stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float) -> _Fit:
-    """The ground and mount that heights (N,) and up-axes (N, 2, 3) of :func:`_with_mount` agree upon."""
+    By the recorded heights (N,) and the up-axes (N, 2, 3) of :func:`_with_mount`.
+    """
     road = local_lines(stations, leans.reshape(len(leans), 6), _ROAD_M).reshape(leans.shape)
-    drawn = _integrated(stations, road)
+    # Heights along the route over a ground of these slopes, from zero at its start.
+    steps = np.diff(stations.points_map, axis=0)
+    rise = np.einsum("ni,nic->nc", steps, 0.5 * (road[1:] + road[:-1]))
+    drawn = np.vstack([np.zeros((1, 3)), np.cumsum(rise, axis=0)])
     missing = np.column_stack([height_m, np.zeros((len(height_m), 2))]) - drawn
     variance = np.full(len(height_m), height_sigma_m**2)
     for _ in range(2):
-        offset, correction = local_planes(stations, missing, leans - road, _HEIGHTS_M, _trust_m2(variance))
+        # Mean squared leverage at which heights say as much of a slope as the up-axis does.
+        trust_m2 = variance * _HEIGHT_M / (_SWAY_RAD**2 * _SWAY_M)
+        offset, correction = local_planes(stations, missing, leans - road, _HEIGHTS_M, trust_m2)
         mount = _mount(leans - road - correction)
         with_mount = np.append(1.0, mount)
         # Heights that leave the profile of the up-axes, as where a receiver loses its fix, weigh less.
         misfit = local_lines(stations, ((missing - offset) @ with_mount)[:, None] ** 2, _HEIGHTS_M)[:, 0]
         variance = np.maximum(variance, misfit)
-    return _Fit((offset + drawn) @ with_mount, (road + correction) @ with_mount, mount)
-
-
-def _trust_m2(height_variance: FloatArray) -> FloatArray:
-    """Mean squared leverage (N,) at which heights say as much of a slope as the up-axis does."""
-    return np.asarray(height_variance * _HEIGHT_M / (_SWAY_RAD**2 * _SWAY_M))
+    return (offset + drawn) @ with_mount, (road + correction) @ with_mount, mount
 
 
 def _mount(leans: FloatArray) -> FloatArray:
@@ -151,27 +152,6 @@ def _mount(leans: FloatArray) -> FloatArray:
     recorded, by_mount = leans[..., 0], leans[..., 1:]
     normal = weight * np.einsum("nim,nik->mk", by_mount, by_mount) + np.diag(1.0 / np.square(_MOUNT_RAD))
     return np.asarray(np.linalg.solve(normal, -weight * np.einsum("nim,ni->m", by_mount, recorded)))
-
-
-def _integrated(stations: Stations, slope: FloatArray) -> FloatArray:
-    """Heights (N, C) along the route over a ground of these slopes (N, 2, C), from zero at its start."""
-    steps = np.diff(stations.points_map, axis=0)
-    rise = np.einsum("ni,nic->nc", steps, 0.5 * (slope[1:] + slope[:-1]))
-    return np.vstack([np.zeros((1, slope.shape[2])), np.cumsum(rise, axis=0)])
-
-
-def _slope_of_up_axis(poses: FloatArray) -> FloatArray:
-    """Slope (P, 2) by map x and y of the vehicle's floor; huge where its z axis does not point up."""
-    up = poses[:, :3, 2]
-    return np.asarray(-up[:, :2] / np.maximum(up[:, 2:], 1e-3))
-
-
-def _slope_of_heights(stations: Stations, height_m: FloatArray, height_sigma_m: float) -> FloatArray:
-    """Slope (N, 2) of the ground by its heights alone, which hardly say anything across a straight road."""
-    pieces = np.sqrt(2.0 * np.pi) * _HEIGHTS_M / _HEIGHT_M
-    trust_m2 = np.full(len(height_m), (height_sigma_m / _CROSS_FALL) ** 2 / pieces)
-    level = np.zeros((len(height_m), 2, 1))
-    return local_planes(stations, height_m[:, None], level, _HEIGHTS_M, trust_m2)[1][..., 0]
 
 
 def _with_mount(lean: FloatArray, yaw: FloatArray, measured: BoolArray) -> FloatArray:
@@ -304,7 +284,10 @@ def unevenness(road: Road, reach_m: float) -> Unevenness:
     """
     steps_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
     station_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    left = _left(road.points_map)
+    # Unit vectors to the left of the path, zero where it is a point.
+    ahead = np.gradient(road.points_map, axis=0) if len(station_m) > 1 else np.zeros((1, 2))
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    left /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     worst = Unevenness(0.0, reach_m, road.points_map[0], 0.0)
     for k, here_m in enumerate(station_m):
         low, high = np.searchsorted(station_m, [here_m - reach_m, here_m + reach_m])
@@ -322,12 +305,3 @@ def unevenness(road: Road, reach_m: float) -> Unevenness:
         if deviation_m[j] * worst.distance_m > worst.value_m * distance_m[j]:
             worst = Unevenness(float(deviation_m[j]), float(distance_m[j]), road.points_map[k], float(here_m))
     return worst
-
-
-def _left(points_map: FloatArray) -> FloatArray:
-    """Unit vectors (P, 2) to the left of the path, zero where it is a point."""
-    if len(points_map) < 2:
-        return np.zeros_like(points_map)
-    ahead = np.gradient(points_map, axis=0)
-    length = np.linalg.norm(ahead, axis=1, keepdims=True)
-    return np.asarray(np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.maximum(length, 1e-9))

@@ -5,6 +5,7 @@ All that a drive wants of its bag is gathered first and then imported in one pas
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,17 +14,23 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.extras import need
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles
+from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
-from v2hdm.io.importers.video import IMAGE_LIST, import_video
-from v2hdm.io.trajectory import UNITS, read_image_list
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
+from v2hdm.store.folders import entry_folder, is_whole
 
+_log = logging.getLogger(__name__)
+
+_Lister = Callable[[], ImageFiles]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
@@ -57,13 +64,13 @@ class Sources:
         return folder
 
 
-def plan_images(content: object, camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+def plan_images(content: object, camera: str, sources: Sources, where: str) -> _Lister:
     """The function that lists the images of a camera, to be called once all sources are planned."""
     if isinstance(content, str):
         path = sources.root / take_text(content, where, DriveError)
         if path.is_dir():
             return _of_folder({"folder": content}, camera, sources, where)
-        return lambda: _of_list(camera, path, 0.0)
+        return lambda: _of_list(camera, path)
     entry = take_mapping(content, where, DriveError)
     named = [key for key in IMAGE_SOURCES if key in entry]
     if len(named) != 1:
@@ -71,9 +78,9 @@ def plan_images(content: object, camera: str, sources: Sources, where: str) -> C
             f"{where}: name one source, a list file or one of {', '.join(IMAGE_SOURCES)}; "
             f"got {', '.join(named) or 'none'}"
         )
-    source = IMAGE_SOURCES[named[0]]
-    check_keys(entry, (named[0],), source.keys, where, DriveError)
-    return source.plan(entry, camera, sources, where)
+    plan, keys = IMAGE_SOURCES[named[0]]
+    check_keys(entry, (named[0],), keys, where, DriveError)
+    return plan(entry, camera, sources, where)
 
 
 def plan_info(content: object, camera: str, sources: Sources, where: str) -> Callable[[], CameraInfo]:
@@ -98,30 +105,22 @@ def _read_info(path: Path, camera: str | None) -> CameraInfo:
     return read_intrinsics(path, camera, f"camera_info: {{file: {path.name}, camera: NAME}}")
 
 
-def plan_topic_poses(
-    content: object, sources: Sources, where: str
-) -> Callable[[dict[str, Any], str], Readings]:
-    """The function that reads the poses of a topic in ``poses``: messages of poses, or transforms."""
+def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[[], Readings] | None:
+    """The function that reads the poses of a topic in ``poses``, if it names one: of poses, or transforms."""
     if not isinstance(content, dict) or "topic" not in content:
-        return _not_planned
+        return None
     topic = take_text(content["topic"], f"{where}, topic", DriveError)
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
             if key not in content:
-                raise DriveError(
-                    f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle"
-                )
-        frame, vehicle = (
-            take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")
-        )
+                advice = "frame of the map, vehicle of the vehicle"
+                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: {advice}")
+        dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
         transforms = streams.TfStream(True, where)
         tf_folder = sources.want(transforms)
-
-        def of_frames(entry: dict[str, Any], where: str) -> Readings:
-            frames = transforms.frames(tf_folder())
-            return readings_of_poses(frames.moving(frame, vehicle, sources.max_gap_s, where))
-
-        return of_frames
+        return lambda: readings_of_poses(
+            transforms.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where)
+        )
     for key in ("frame", "vehicle"):
         if key in content:
             raise DriveError(f"{where}, {key}: only for {TF_TOPIC}; drop it")
@@ -130,19 +129,25 @@ def plan_topic_poses(
         heading = take_text(heading, f"{where}, heading_topic", DriveError)
     stream = streams.PoseStream(topic, heading, _take_stamps(content, where), where)
     folder = sources.want(stream)
-    return lambda entry, where: stream.readings(folder())
+    return lambda: stream.readings(folder())
 
 
-def _not_planned(entry: dict[str, Any], where: str) -> Readings:
-    raise AssertionError(where)
-
-
-def _of_list(camera: str, path: Path, start_s: float) -> ImageFiles:
+def _of_list(camera: str, path: Path, start_s: float = 0.0) -> ImageFiles:
     stamp_s, names = read_image_list(path)
     return ImageFiles(camera=camera, stamp_s=stamp_s + start_s, paths=[path.parent / name for name in names])
 
 
-def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
+    topic = take_text(entry["topic"], f"{where}, topic", DriveError)
+    folder = sources.want(streams.ImageStream(topic, _take_stamps(entry, where), where))
+    return lambda: _of_list(camera, folder() / streams.IMAGE_LIST)
+
+
+def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
+    return take_choice(entry.get("stamps", streams.STAMPS[0]), streams.STAMPS, f"{where}, stamps", DriveError)
+
+
+def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
     folder = sources.root / take_text(entry["folder"], f"{where}, folder", DriveError)
     unit = take_choice(entry.get("unit", "s"), UNITS, f"{where}, unit", DriveError)
 
@@ -173,7 +178,43 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
     return images
 
 
-def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+def _import_video(path: Path, cache: Path, where: str) -> Path:
+    """The folder of the frames of a video as PNG files, decoded by PyAV now unless they were before.
+
+    Their list has the container's times, s since the first frame.
+    """
+    if not path.is_file():
+        raise DriveError(f"{where}: {path}: no such video; check the path")
+    folder = entry_folder(cache, [path], "video", ["frames"])
+    if is_whole(folder):
+        return folder
+    av = need("av", "video", f"{where}: a video", DriveError)
+    _log.info("%s: decoding its frames into %s, once", path, cache)
+    with new_entry(folder) as partial:
+        stamps: list[float] = []
+        names: list[str] = []
+        try:
+            with av.open(str(path)) as container:
+                for frame in container.decode(video=0):
+                    where = f"{path}: frame {len(stamps) + 1}"
+                    if frame.pts is None:
+                        raise DriveError(f"{where} has no time; give stamps, a time a line")
+                    stamps.append(float(frame.pts * frame.time_base))
+                    if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
+                        raise DriveError(f"{where}: its time does not rise; convert the video")
+                    names.append(f"{len(names):06d}.png")
+                    (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
+        except (av.error.FFmpegError, IndexError) as failure:
+            reason = " ".join(str(failure).split())
+            problem = f"not readable as a video ({reason})"
+            raise DriveError(f"{path}: {problem}; convert or copy it again") from None
+        if not stamps:
+            raise DriveError(f"{path}: holds no frame; convert or copy it again")
+        write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
+    return folder
+
+
+def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
     path = sources.root / take_text(entry["video"], f"{where}, video", DriveError)
     if ("start_s" in entry) == ("stamps" in entry):
         raise DriveError(
@@ -182,40 +223,24 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         )
 
     def images() -> ImageFiles:
-        frames = import_video(path, sources.cache, where) / IMAGE_LIST
+        frames = _import_video(path, sources.cache, where) / streams.IMAGE_LIST
         if "start_s" in entry:
             return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
-        listed = _of_list(camera, frames, 0.0)
+        listed = _of_list(camera, frames)
         stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
         if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
-            raise DriveError(
-                f"{where}: {len(listed.paths)} frames in {path} and {len(stamp_s)} stamps; give one a frame, "
-                "rising"
-            )
+            problem = f"{len(listed.paths)} frames in {path} and {len(stamp_s)} stamps"
+            raise DriveError(f"{where}: {problem}; give one a frame, rising")
         return replace(listed, stamp_s=stamp_s)
 
     return images
 
 
-def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
-    topic = take_text(entry["topic"], f"{where}, topic", DriveError)
-    folder = sources.want(streams.ImageStream(topic, _take_stamps(entry, where), where))
-    return lambda: _of_list(camera, folder() / streams.IMAGE_LIST, 0.0)
-
-
-def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
-    return take_choice(entry.get("stamps", streams.STAMPS[0]), streams.STAMPS, f"{where}, stamps", DriveError)
-
-
-@dataclass(frozen=True)
-class _ImageSource:
-    plan: Callable[[dict[str, Any], str, Sources, str], Callable[[], ImageFiles]]
-    keys: tuple[str, ...]
-
-
-IMAGE_SOURCES: Mapping[str, _ImageSource] = {
-    "folder": _ImageSource(_of_folder, ("stamps", "unit")),
-    "video": _ImageSource(_of_video, ("start_s", "stamps")),
-    "topic": _ImageSource(_of_topic, ("stamps",)),
+IMAGE_SOURCES: Mapping[
+    str, tuple[Callable[[dict[str, Any], str, Sources, str], _Lister], tuple[str, ...]]
+] = {
+    "folder": (_of_folder, ("stamps", "unit")),
+    "video": (_of_video, ("start_s", "stamps")),
+    "topic": (_of_topic, ("stamps",)),
 }
-"""Sources of images other than a list file, by the key that names them."""
+"""Sources of images other than a list file, by the key that names them: how they are planned, other keys."""

@@ -17,13 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.geodetic import (
-    datum_of,
-    enu_from_geodetic,
-    geodetic_from_grid,
-    has_height_datum,
-    is_geographic,
-)  # fmt: skip
+from v2hdm.geometry import geodetic
 from v2hdm.io.importers.tables import read_rows
 from v2hdm.records import FloatArray, GeodeticOrigin
 
@@ -61,7 +55,6 @@ _CALLED: Mapping[str, tuple[str, ...]] = {
 """Columns that are understood, and their other names."""
 
 NAMES: Mapping[str, str] = {name: ours for ours, others in _CALLED.items() for name in (ours, *others)}
-_CONTROL, _CHECK = "control", "check"
 _NEARLY = 0.8  # likeness (:mod:`difflib`) from which an unknown column counts as misspelt
 
 
@@ -110,17 +103,19 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
     one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell does
     not parse.
     """
-    rows = _rows(path)
-    frame = _frame(rows[0].cells, crs, path)
+    header, lines = read_rows(path, ";\t,", "point")
+    names = _columns(header, path)
+    rows, seen = [], dict[str, int]()
+    for line, cells in lines:
+        known = {name: cell for name, cell in zip(names, cells, strict=True) if name is not None}
+        rows.append(_Row(known, where := f"{path}: line {line}"))
+        if not (point := known["id"]):
+            raise DriveError(f"{where}: the point has no id; name it")
+        if point in seen:
+            raise DriveError(f"{where}: the point {point} stands in line {seen[point]} already; keep one")
+        seen[point] = line
+    frame = _frame(names, crs, path)
     first, second = frame.columns
-    seen: dict[str, int] = {}
-    for row in rows:
-        name = row.text("id")
-        if not name:
-            raise DriveError(f"{row.where}: the point has no id; name it")
-        if name in seen:
-            raise DriveError(f"{row.where}: the point {name} stands in line {seen[name]} already; keep one")
-        seen[name] = row.line
     return SurveyTable(
         path,
         frame,
@@ -128,7 +123,7 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
         np.array([row.number("height_m", np.nan) for row in rows]),
         np.array([row.sigmas(sigma_m) for row in rows]),
         tuple(seen),
-        tuple(row.role() == _CHECK for row in rows),
+        tuple(row.is_check() for row in rows),
         tuple(row.text("description") for row in rows),
         crs,
         geoid_m,
@@ -178,11 +173,9 @@ def _other_systems(table: SurveyTable, origin: GeodeticOrigin | None) -> list[st
     if authority.upper() == "EPSG" and code.isdecimal():
         systems = [f"EPSG:{int(code) - 1}", f"EPSG:{int(code) + 1}"]
     if origin is not None and table.frame is not Frame.GEODETIC:
-        zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
-        if origin.datum.upper().startswith("ETRS"):
-            systems.append(f"EPSG:{25800 + zone}")
-        else:
-            systems.append(f"EPSG:{(32600 if origin.latitude_deg >= 0 else 32700) + zone}")
+        utm = 32600 if origin.latitude_deg >= 0 else 32700
+        utm = 25800 if origin.datum.upper().startswith("ETRS") else utm
+        systems.append(f"EPSG:{utm + int((origin.longitude_deg + 180) // 6) % 60 + 1}")
     return [crs for crs in systems if crs != table.crs]
 
 
@@ -196,13 +189,13 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
         )
     height_m = table.height_m
     if crs is not None:
-        datum = datum_of(crs, where, DriveError)
+        datum = geodetic.datum_of(crs, where, DriveError)
         if datum.replace(" ", "") != origin.datum.replace(" ", ""):
             raise DriveError(
                 f"{where}: the points are in {datum} ({crs}), the drive's origin in {origin.datum}, which "
                 "differ by decimetres; give the points in that of the origin"
             )
-        if has_height_datum(crs, where, DriveError) and table.geoid_m is None:
+        if geodetic.has_height_datum(crs, where, DriveError) and table.geoid_m is None:
             unused = "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m"
             _log.warning(unused, where, crs)
             height_m = np.full_like(height_m, np.nan)
@@ -210,18 +203,16 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
     raised_m = np.where(known, height_m + (table.geoid_m or 0.0), origin.altitude_m)
     points = np.column_stack([table.coordinates, raised_m])
     if table.frame is Frame.GEODETIC:
-        wrong = (np.abs(table.coordinates) > [90, 180]).any(axis=1)
-        if wrong.any():
-            k = int(np.argmax(wrong))
-            latitude_deg, longitude_deg = table.coordinates[k]
-            raise DriveError(
-                f"{where}: latitude {latitude_deg:g}, longitude {longitude_deg:g} of {table.ids[k]} is no "
-                "place on the earth; are they swapped?"
-            )
+        for name, (latitude_deg, longitude_deg) in zip(table.ids, table.coordinates, strict=True):
+            if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
+                raise DriveError(
+                    f"{where}: latitude {latitude_deg:g}, longitude {longitude_deg:g} of {name} is no place "
+                    "on the earth; are they swapped?"
+                )
     else:
         assert crs is not None
-        points = geodetic_from_grid(crs, points, where, DriveError)
-    out = enu_from_geodetic(origin, points)
+        points = geodetic.geodetic_from_grid(crs, points, where, DriveError)
+    out = geodetic.enu_from_geodetic(origin, points)
     return out[:, :2], np.where(known, out[:, 2], np.nan)
 
 
@@ -229,7 +220,6 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
 class _Row:
     """One line of the file: its cells by our names of the columns."""
 
-    line: int
     cells: Mapping[str, str]
     where: str
 
@@ -255,21 +245,11 @@ class _Row:
             raise DriveError(f"{self.where}: a sigma of {min(east_m, north_m):g} m; give one above 0")
         return east_m, north_m
 
-    def role(self) -> str:
-        role = self.text("role").lower() or _CONTROL
-        if role not in (_CONTROL, _CHECK):
+    def is_check(self) -> bool:
+        role = self.text("role").lower() or "control"
+        if role not in ("control", "check"):
             raise DriveError(f"{self.where}: role '{role}' is neither control nor check; mend that line")
-        return role
-
-
-def _rows(path: Path) -> list[_Row]:
-    header, lines = read_rows(path, ";\t,", "point")
-    columns = _columns(header, path)
-    rows = []
-    for number, cells in lines:
-        known = {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None}
-        rows.append(_Row(number, known, f"{path}: line {number}"))
-    return rows
+        return role == "check"
 
 
 def _columns(header: Sequence[str], path: Path) -> list[str | None]:
@@ -290,26 +270,25 @@ def _columns(header: Sequence[str], path: Path) -> list[str | None]:
     return ours
 
 
-def _frame(cells: Mapping[str, str], crs: str | None, path: Path) -> Frame:
+def _frame(names: Sequence[str | None], crs: str | None, path: Path) -> Frame:
     """The frame whose columns the file has, checked against ``crs``."""
-    found = [frame for frame in Frame if any(name in cells for name in frame.columns)]
+    found = [frame for frame in Frame if any(name in names for name in frame.columns)]
     if len(found) != 1:
         ways = " or ".join(frame.value for frame in Frame)
         raise DriveError(f"{path}: needs the columns {ways}, one of these pairs")
-    missing = [name for name in found[0].columns if name not in cells]
+    missing = [name for name in found[0].columns if name not in names]
     if missing:
         raise DriveError(f"{path}: has no column {missing[0]}; add it")
-    if found[0] is Frame.GRID and crs is None:
+    (frame,) = found
+    if frame is Frame.GRID and crs is None:
         raise DriveError(
             f"{path}: of which system are east and north? Set mapping.survey.crs, such as EPSG:32632, or "
             "call the columns x_m, y_m if they are in the frame of the poses"
         )
-    if found[0] is Frame.MAP and crs is not None:
-        raise DriveError(
-            f"{path}: x_m, y_m are in the frame of the poses, and mapping.survey.crs is {crs}; call them "
-            "east_m, north_m, or drop crs"
-        )
-    if crs is not None and (found[0] is Frame.GEODETIC) != is_geographic(crs, str(path), DriveError):
-        kind = "latitudes and longitudes" if found[0] is Frame.GEODETIC else "east and north"
+    if frame is Frame.MAP and crs is not None:
+        problem = f"x_m, y_m are in the frame of the poses, and mapping.survey.crs is {crs}"
+        raise DriveError(f"{path}: {problem}; call them east_m, north_m, or drop crs")
+    if crs is not None and (frame is Frame.GEODETIC) != geodetic.is_geographic(crs, str(path), DriveError):
+        kind = "latitudes and longitudes" if frame is Frame.GEODETIC else "east and north"
         raise DriveError(f"{path}: holds {kind}, which {crs} has not; mend mapping.survey.crs")
-    return found[0]
+    return frame

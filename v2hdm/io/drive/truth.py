@@ -31,14 +31,15 @@ def read_truth(drive: Drive) -> Truth:
     folder = drive.truth_dir
     if folder is None:
         raise DriveError(f"{drive.root}: has no ground truth to compare with; drop the comparison")
-    hd_map = read_geojson(folder / "map.geojson")
+    hd_map, noted = read_geojson(folder / "map.geojson"), folder / "disturbances.yaml"
+    named = load_yaml(noted, DriveError)
     return Truth(
         map=hd_map,
         cam_from_vehicle=_read_cameras(folder / "cameras.yaml", drive),
         map_from_vehicle=_read_poses(folder / "poses.tum", drive.images),
         visibility=_read_sightings(folder / "sightings.csv", drive.images, len(hd_map.markings)),
         lane_visible=_read_lane_visible(folder / "lane_visible.csv", hd_map),
-        disturbances=_read_disturbances(folder / "disturbances.yaml"),
+        disturbances={key: take_number(value, f"{noted}: {key}", DriveError) for key, value in named.items()},
     )
 
 
@@ -49,14 +50,10 @@ def has_truth(drive: Drive) -> bool:
     folders = [visit.truth_dir for visit in drive.visits if visit.truth_dir is not None]
     if len(folders) < len(drive.visits):
         return False
-    first, *others = (read_geojson(folder / "map.geojson") for folder in folders)
-    corners = [one.corners_map for one in first.markings]
-    return all(
-        other.origin == first.origin
-        and len(other.markings) == len(corners)
-        and np.array_equal(corners, [one.corners_map for one in other.markings])
-        for other in others
-    )
+    maps = [read_geojson(folder / "map.geojson") for folder in folders]
+    corners = [[one.corners_map for one in hd_map.markings] for hd_map in maps]
+    same_origin = all(one.origin == maps[0].origin for one in maps)
+    return same_origin and all(np.array_equal(corners[0], one) for one in corners)
 
 
 def _joined_truth(drive: Drive) -> Truth:
@@ -71,7 +68,9 @@ def _joined_truth(drive: Drive) -> Truth:
         parts.append(read_truth(Drive(visit.name, visit.root, cameras, images, truth_dir=visit.truth_dir)))
     order = np.argsort(np.concatenate(rows), kind="stable")
     cam_from_vehicle: dict[str, FloatArray] = {}
+    disturbances: dict[str, float] = {}
     for visit, part in zip(drive.joined, parts, strict=True):
+        disturbances |= {f"{visit.name}: {key}": value for key, value in part.disturbances.items()}
         for name, matrix in part.cam_from_vehicle.items():
             cam_from_vehicle.setdefault(visit.cameras[name], matrix)
     lanes = zip(*(part.lane_visible for part in parts), strict=True)
@@ -81,12 +80,12 @@ def _joined_truth(drive: Drive) -> Truth:
         map_from_vehicle=np.concatenate([part.map_from_vehicle for part in parts])[order],
         visibility=np.concatenate([part.visibility for part in parts])[order],
         lane_visible=tuple(np.logical_or.reduce(flags) for flags in lanes),
-        disturbances={
-            f"{visit.name}: {key}": value
-            for visit, part in zip(drive.joined, parts, strict=True)
-            for key, value in part.disturbances.items()
-        },
+        disturbances=disturbances,
     )
+
+
+def _microseconds(stamp_s: float) -> int:
+    return round(stamp_s * 1e6)  # text with fewer decimals must still match
 
 
 def _read_cameras(path: Path, drive: Drive) -> Mapping[str, FloatArray]:
@@ -121,9 +120,8 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
         except ValueError:
             raise DriveError(f"{where}: not '{','.join(SIGHTINGS)}'; mend that line") from None
         if not 0 <= j < markings or not 0.0 <= value <= 1.0:
-            raise DriveError(
-                f"{where}: marking must be below {markings} and visible_fraction within 0 to 1; mend it"
-            )
+            problem = f"marking must be below {markings} and visible_fraction within 0 to 1"
+            raise DriveError(f"{where}: {problem}; mend it")
         if key in row_of:
             visibility[row_of[key], j] = value
     return visibility
@@ -139,11 +137,6 @@ def _read_lane_visible(path: Path, hd_map: HdMap) -> tuple[BoolArray, ...]:
     return visible
 
 
-def _read_disturbances(path: Path) -> Mapping[str, float]:
-    content = load_yaml(path, DriveError)
-    return {key: take_number(value, f"{path}: {key}", DriveError) for key, value in content.items()}
-
-
 def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
     """The rows of a CSV file below its header, each with its place for messages."""
     reader = csv.reader(io.StringIO(read_text(path, DriveError)))
@@ -154,7 +147,3 @@ def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]
         if len(row) != len(columns):
             raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; mend that line")
         yield where, row
-
-
-def _microseconds(stamp_s: float) -> int:
-    return round(stamp_s * 1e6)  # text with fewer decimals must still match

@@ -14,7 +14,7 @@ from v2hdm.io.drive.folder import DRIVE_FILE, POSES_FILE
 from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_image_list, write_tum
-from v2hdm.records import Camera, Drive, Image, Trajectory, Truth
+from v2hdm.records import Drive, Image, Trajectory, Truth
 from v2hdm.store.files import dump_yaml, replace_text
 
 
@@ -31,34 +31,27 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
         mine = [image for image in drive.images if image.camera == name]
         names = [image.path.relative_to(folder / name).as_posix() for image in mine]
         write_image_list(np.array([image.stamp_s for image in mine]), names, folder / name / "images.txt")
-        entries[name] = _describe_camera(name, camera)
+        entry: dict[str, Any] = {
+            "camera_info": f"{name}/camera_info.yaml",
+            "images": f"{name}/images.txt",
+            "linear_response": camera.linear_response,
+            "initial_ipm": camera.initial_ipm,
+            "ipm": {key: matrix.tolist() for key, matrix in camera.ipm.items()},
+            "roi_vehicle": camera.roi_vehicle.tolist(),
+        }
+        if (prior := camera.centre_prior) is not None:
+            surveyed = {"xyz": prior.centre_vehicle.tolist(), "sigma_m": prior.sigma_m.tolist()}
+            entry["centre_prior"] = surveyed
+        entries[name] = entry
     write_tum(trajectory, folder / POSES_FILE)
-    content: dict[str, Any] = {
-        "name": drive.name,
-        "poses": POSES_FILE,
-        "pose_noise": asdict(drive.pose_noise),
-    }
+    noise = asdict(drive.pose_noise)
+    content: dict[str, Any] = {"name": drive.name, "poses": POSES_FILE, "pose_noise": noise}
     if drive.origin is not None:
         content["origin"] = asdict(drive.origin)
     if drive.truth_dir is not None:
         content["truth"] = drive.truth_dir.relative_to(folder).as_posix()
     content["cameras"] = entries
     replace_text(folder / DRIVE_FILE, dump_yaml(content))
-
-
-def _describe_camera(name: str, camera: Camera) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "camera_info": f"{name}/camera_info.yaml",
-        "images": f"{name}/images.txt",
-        "linear_response": camera.linear_response,
-        "initial_ipm": camera.initial_ipm,
-        "ipm": {key: matrix.tolist() for key, matrix in camera.ipm.items()},
-        "roi_vehicle": camera.roi_vehicle.tolist(),
-    }
-    if camera.centre_prior is not None:
-        prior = camera.centre_prior
-        entry["centre_prior"] = {"xyz": prior.centre_vehicle.tolist(), "sigma_m": prior.sigma_m.tolist()}
-    return entry
 
 
 def write_truth(folder: Path, truth: Truth, images: Sequence[Image]) -> None:
@@ -73,11 +66,8 @@ def write_truth(folder: Path, truth: Truth, images: Sequence[Image]) -> None:
         for i, j in np.argwhere(truth.visibility > 0)
     )
     replace_text(folder / "sightings.csv", "\n".join([",".join(SIGHTINGS), *sightings]) + "\n")
-    visible = (
-        f"{lane},{vertex}"
-        for lane, flags in enumerate(truth.lane_visible)
-        for vertex in np.flatnonzero(flags)
-    )
+    lanes = enumerate(map(np.flatnonzero, truth.lane_visible))
+    visible = (f"{lane},{vertex}" for lane, vertices in lanes for vertex in vertices)
     replace_text(folder / "lane_visible.csv", "\n".join([",".join(LANE_VISIBLE), *visible]) + "\n")
     disturbances = {key: float(value) for key, value in truth.disturbances.items()}
     replace_text(folder / "disturbances.yaml", dump_yaml(disturbances))

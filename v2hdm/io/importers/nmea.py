@@ -10,6 +10,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from datetime import UTC, date, datetime
+from functools import reduce
+from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,6 @@ KEYS = ("date",)
 _log = logging.getLogger(__name__)
 
 _DAY_S = 86400.0
-_INVALID_HEADING = "V"  # of THS; A, E, M and S are autonomous, estimated, manual, simulated
 
 
 def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
@@ -96,7 +97,8 @@ class _Log:
         elif kind == "GST":
             stamp = self._time(fields[1])
             self._sigma_m[stamp] = float(np.sqrt((float(fields[6]) ** 2 + float(fields[7]) ** 2) / 2))
-        elif kind == "HDT" or (kind == "THS" and fields[2] != _INVALID_HEADING):
+        # The modes of THS: autonomous, estimated, manual, simulated, and V for invalid.
+        elif kind == "HDT" or (kind == "THS" and fields[2] != "V"):
             if fields[1] and self._time_s is not None:
                 self._attitudes[self._time_s] = (float(fields[1]), 0.0, 0.0, np.nan)
         elif kind == "PASHR" and fields[2] and fields[3] == "T":
@@ -111,10 +113,8 @@ class _Log:
             raise DriveError(f"{self._where}: no GGA sentence with a position; log GGA and HDT, THS or PASHR")
         day = self._first_date or first_day
         if day is None:
-            raise DriveError(
-                f"{self._where}: no RMC or ZDA sentence tells the date: add date, the day of the first "
-                "sentence"
-            )
+            advice = "add date, the day of the first sentence"
+            raise DriveError(f"{self._where}: no RMC or ZDA sentence tells the date: {advice}")
         if self._above_sea:
             _log.warning(
                 "%s: its heights count from the sea, and GGA does not say where that is; add geoid_m if the "
@@ -158,12 +158,8 @@ def _table(rows: dict[float, tuple[float, ...]], begin_s: float, where: str) -> 
 def _fields(sentence: str) -> list[str]:
     """The fields of a sentence; ValueError where its checksum is wrong."""
     body, star, check = sentence[1:].strip().partition("*")
-    if star:
-        value = 0
-        for character in body:
-            value ^= ord(character)
-        if f"{value & 0xFFFF:02X}" != check[:2].upper():
-            raise ValueError(check)
+    if star and f"{reduce(xor, map(ord, body), 0):02X}" != check[:2].upper():
+        raise ValueError(check)
     return body.split(",")
 
 

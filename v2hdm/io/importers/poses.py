@@ -16,21 +16,12 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.geodetic import (
-    convergence_rad,
-    datum_of,
-    enu_axes,
-    enu_from_geodetic,
-    geodetic_from_grid,
-    has_height_datum,
-    is_geographic,
-    position_of,
-)  # fmt: skip
-from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.geometry import geodetic as earth
+from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.importers import nmea, tables
 from v2hdm.io.importers.tables import Readings
-from v2hdm.io.trajectory import check_geodetic, pose_matrices, read_tum, why_no_pose
+from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
 
@@ -41,32 +32,20 @@ COMMON_KEYS = (
     "crs", "heading", "lever_arm_m", "mounting_rpy_deg", "max_sigma_m", "geoid_m", "epoch", "offset_s",
 )  # fmt: skip
 TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
-ReadTopic = Callable[[dict[str, Any], str], Readings]
 
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """The keys of ``poses`` in ``drive.yaml`` that every format has.
+    """The keys of ``poses`` in ``drive.yaml`` that every format has; None is not stated."""
 
-    Attributes:
-        crs: system of the coordinates, such as EPSG:25832; None for the map's own, or WGS84.
-        heading: north that headings count from, ``true`` or ``grid``; None where it is not stated.
-        lever_arm_m: (3,) the point that positions are of, in the vehicle frame; None where it is not stated.
-        vehicle_from_sensor: (3, 3) turn of the attitude's sensor on the vehicle.
-        max_sigma_m: positions stated to be less sure are left out: RTK fixed is 0.02, float about 0.5.
-        geoid_m: height of the geoid above the ellipsoid, for heights above the sea; None if not stated.
-        epoch: of the coordinates, in years; None if not stated.
-        offset_s: added to the recorded times.
-    """
-
-    vehicle_from_sensor: FloatArray
-    crs: str | None = None
-    heading: str | None = None
-    lever_arm_m: FloatArray | None = None
-    max_sigma_m: float = 0.1
-    geoid_m: float | None = None
-    epoch: float | None = None
-    offset_s: float = 0.0
+    vehicle_from_sensor: FloatArray  # (3, 3), turn of the attitude's sensor on the vehicle
+    crs: str | None = None  # of the coordinates, such as EPSG:25832; None for the map's own, or WGS84
+    heading: str | None = None  # north that headings count from, one of HEADINGS
+    lever_arm_m: FloatArray | None = None  # (3,), the point that positions are of, in the vehicle frame
+    max_sigma_m: float = 0.1  # less sure positions are left out: RTK fixed is 0.02, float about 0.5
+    geoid_m: float | None = None  # height of the geoid above the ellipsoid, for heights above the sea
+    epoch: float | None = None  # of the coordinates, in years
+    offset_s: float = 0.0  # added to the recorded times
 
 
 @dataclass(frozen=True)
@@ -82,25 +61,15 @@ class Recorded:
     origin: GeodeticOrigin | None
 
 
-@dataclass(frozen=True)
-class PoseFormat:
-    """One format: ``read(path, entry, root, where)`` and the ``keys`` that it has of its own."""
+_Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
 
-    read: Callable[[Path, dict[str, Any], Path, str], Readings]
-    keys: tuple[str, ...] = ()
-
-
-def _read_tum(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    return tables.readings_of_poses(read_tum(path))
-
-
-POSE_FORMATS: Mapping[str, PoseFormat] = {
-    "tum": PoseFormat(_read_tum),
-    "kitti": PoseFormat(tables.read_kitti_rows, tables.KITTI_KEYS),
-    "csv": PoseFormat(tables.read_table, tables.TABLE_KEYS),
-    "nmea": PoseFormat(nmea.read_nmea, nmea.KEYS),
+POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
+    "tum": (lambda path, entry, root, where: tables.readings_of_poses(read_tum(path)), ()),
+    "kitti": (tables.read_kitti_rows, tables.KITTI_KEYS),
+    "csv": (tables.read_table, tables.TABLE_KEYS),
+    "nmea": (nmea.read_nmea, nmea.KEYS),
 }
-"""Formats of files by the key that names the file; ``topic`` names one of a bag instead."""
+"""Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
 
 
 def read_poses(
@@ -109,13 +78,13 @@ def read_poses(
     origin: GeodeticOrigin | None,
     max_gap_s: float,
     where: str,
-    read_topic: ReadTopic,
+    read_topic: Callable[[], Readings] | None,
 ) -> Recorded:
     """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
 
     File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
     attitudes further apart than ``max_gap_s`` are not interpolated across, ``where`` names the key in errors,
-    and ``read_topic`` reads a topic of the drive's bag.
+    and ``read_topic`` reads the topic of the drive's bag that is named, if one is.
     """
     if isinstance(content, str):
         return Recorded(read_tum(root / content), {}, origin)
@@ -127,24 +96,22 @@ def read_poses(
             f"of the bag; got {', '.join(named) or 'none'}"
         )
     (kind,) = named
-    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys
+    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind][1]
     check_keys(entry, (kind,), (*keys, *COMMON_KEYS), where, DriveError)
     settings = _take_settings(entry, where)
     name = take_text(entry[kind], f"{where}, {kind}", DriveError)
-    if kind == "topic":
-        return assemble(read_topic(entry, where), settings, origin, max_gap_s, f"{where}, topic {name}")
-    readings = POSE_FORMATS[kind].read(root / name, entry, root, where)
+    if read_topic is not None:
+        return assemble(read_topic(), settings, origin, max_gap_s, f"{where}, topic {name}")
+    readings = POSE_FORMATS[kind][0](root / name, entry, root, where)
     return assemble(readings, settings, origin, max_gap_s, str(root / name))
 
 
 def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
     given: dict[str, Any] = {}
-    for key in ("max_sigma_m", "geoid_m", "epoch", "offset_s"):
-        if key in entry:
-            given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
-    for key in ("lever_arm_m", "mounting_rpy_deg"):
-        if key in entry:
-            given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
+    for key in filter(entry.__contains__, ("max_sigma_m", "geoid_m", "epoch", "offset_s")):
+        given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
+    for key in filter(entry.__contains__, ("lever_arm_m", "mounting_rpy_deg")):
+        given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
     if entry.get("heading") is not None:
         given["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
     if given.get("max_sigma_m", 1.0) <= 0:
@@ -192,22 +159,27 @@ def assemble(
         if readings.geodetic:
             check_geodetic(points, where)
         geodetic, north_rad = _on_earth(points, readings.geodetic, settings, where)
-        datum = "WGS84" if settings.crs is None else datum_of(settings.crs, where, DriveError)
+        datum = "WGS84" if settings.crs is None else earth.datum_of(settings.crs, where, DriveError)
         origin = _origin(origin, geodetic[0], datum, settings, where)
         zeros = np.zeros(len(points))
         # A grid whose north lies clockwise of true north turns all that is measured from it clockwise.
         rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
-        rotation = enu_axes(position_of(origin))[0].T @ enu_axes(geodetic) @ rotation
-        points = enu_from_geodetic(origin, geodetic)
-    elif settings.heading is not None or settings.geoid_m is not None:
-        key = "heading" if settings.heading is not None else "geoid_m"
-        raise DriveError(
-            f"{where}, {key}: only for coordinates with a place on the earth; add crs or drop it"
-        )
+        rotation = earth.enu_axes(earth.position_of(origin))[0].T @ earth.enu_axes(geodetic) @ rotation
+        points = earth.enu_from_geodetic(origin, geodetic)
+    else:
+        for key in ("heading", "geoid_m"):
+            if getattr(settings, key) is not None:
+                only = "only for coordinates with a place on the earth; add crs or drop it"
+                raise DriveError(f"{where}, {key}: {only}")
     if settings.lever_arm_m is not None:
         points = points - rotation @ settings.lever_arm_m
-    noise = _noise({"position_m": sigma_m, "heading_rad": heading_sigma_rad})
-    return Recorded(Trajectory(stamp_s, pose_matrices(rotation, points)), noise, origin)
+    # Root mean squares of the sigmas that are stated.
+    noise = {
+        key: float(np.sqrt(np.mean(np.square(stated))))
+        for key, values in (("position_m", sigma_m), ("heading_rad", heading_sigma_rad))
+        if len(stated := values[np.isfinite(values) & (values > 0)])
+    }
+    return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, origin)
 
 
 def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArray:
@@ -233,14 +205,12 @@ def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[Floa
     assert attitudes is not None
     if np.array_equal(attitudes.stamp_s, readings.stamp_s):
         return attitudes.rotation, np.ones(len(readings.stamp_s), dtype=bool)
-    turns = Trajectory(
-        attitudes.stamp_s, pose_matrices(attitudes.rotation, np.zeros((len(attitudes.stamp_s), 3)))
-    )
+    turns = Trajectory(attitudes.stamp_s, make_transform(attitudes.rotation, np.zeros(3)))
     found, known = interpolate(turns, readings.stamp_s, max_gap_s)
     if not known.any():
         raise DriveError(
-            f"{where}: no position ({readings.stamp_s[0]:.3f} to {readings.stamp_s[-1]:.3f} s) has a heading "
-            f"({attitudes.stamp_s[0]:.3f} to {attitudes.stamp_s[-1]:.3f} s) within {max_gap_s:g} s "
+            f"{where}: no position ({span(readings.stamp_s)}) has a heading "
+            f"({span(attitudes.stamp_s)}) within {max_gap_s:g} s "
             "(drive.max_gap_s): "
             f"{why_no_pose(readings.stamp_s, attitudes.stamp_s, max_gap_s, 'positions', 'headings')}"
         )
@@ -255,19 +225,15 @@ def _on_earth(
 ) -> tuple[FloatArray, FloatArray]:
     """Latitude, longitude and height above the ellipsoid (P, 3), and the north that counts (P,), rad."""
     crs = settings.crs
-    if crs is not None and has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
-        raise DriveError(
-            f"{where}: heights of {crs} count from the sea: add geoid_m, the geoid's height above the "
-            "ellipsoid"
-        )
+    if crs is not None and earth.has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
+        advice = "add geoid_m, the geoid's height above the ellipsoid"
+        raise DriveError(f"{where}: heights of {crs} count from the sea: {advice}")
     raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
     if geodetic:
-        if crs is not None and not is_geographic(crs, where, DriveError):
+        if crs is not None and not earth.is_geographic(crs, where, DriveError):
             raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
         if settings.heading == "grid":
-            raise DriveError(
-                f"{where}: heading 'grid' of latitudes and longitudes, which have no grid; mend it"
-            )
+            raise DriveError(f"{where}: heading 'grid' of latitudes, longitudes, which have no grid; mend it")
         return raised, np.zeros(len(points))
     assert crs is not None
     if settings.heading is None:
@@ -277,8 +243,8 @@ def _on_earth(
         )
     north_rad = np.zeros(len(points))
     if settings.heading == "grid":
-        north_rad = convergence_rad(crs, raised, where, DriveError)
-    return geodetic_from_grid(crs, raised, where, DriveError), north_rad
+        north_rad = earth.convergence_rad(crs, raised, where, DriveError)
+    return earth.geodetic_from_grid(crs, raised, where, DriveError), north_rad
 
 
 def _origin(
@@ -293,12 +259,3 @@ def _origin(
             f"give the origin in {datum} (datum: {datum})"
         )
     return given if given.epoch is not None else replace(given, epoch=settings.epoch)
-
-
-def _noise(sigmas: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Root mean squares of the sigmas that are stated."""
-    return {
-        key: float(np.sqrt(np.mean(np.square(stated))))
-        for key, values in sigmas.items()
-        if len(stated := values[np.isfinite(values) & (values > 0)])
-    }

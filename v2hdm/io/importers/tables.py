@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
-from v2hdm.io.trajectory import in_order, pose_matrices
+from v2hdm.geometry.rigid import make_transform, rotation_from_euler
+from v2hdm.io.trajectory import UNITS, checked_rotations, in_order
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
 
@@ -73,7 +73,7 @@ class Readings:
 
 _VEHICLE_FROM_CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _UPRIGHT = 0.5  # least cosine between the poses' z axis and up for poses of a ground vehicle
-_ROTATION_TOLERANCE = _NORM_TOLERANCE = 1e-3
+_ROTATION_TOLERANCE = 1e-3
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
@@ -104,11 +104,10 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
         turn = _VEHICLE_FROM_CAMERA_AXES
         rotation, points = turn @ rotation @ turn.T, points @ turn.T
     elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
-        raise DriveError(
-            f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
-        )
+        advice = "say axes: camera if they are KITTI's own"
+        raise DriveError(f"{path}: the poses' z axis does not point up; {advice}")
     rows = in_order(stamp_s, str(path))
-    return readings_of_poses(Trajectory(stamp_s[rows], pose_matrices(rotation[rows], points[rows])))
+    return readings_of_poses(Trajectory(stamp_s[rows], make_transform(rotation[rows], points[rows])))
 
 
 def read_stamps(path: Path) -> FloatArray:
@@ -126,16 +125,15 @@ def _numbers(path: Path, columns: int) -> FloatArray:
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise DriveError(
-                f"{path}: line {number}: expected {columns} finite numbers, got '{line[:60]}'; mend it"
-            )
+            problem = f"expected {columns} finite numbers, got '{line[:60]}'"
+            raise DriveError(f"{path}: line {number}: {problem}; mend it")
         rows.append(row)
     if not rows:
         raise DriveError(f"{path}: holds no numbers; expected {columns} a line")
     return np.array(rows)
 
 
-_STAMPS: Mapping[str, float] = {"stamp_s": 1.0, "stamp_ms": 1e3, "stamp_us": 1e6, "stamp_ns": 1e9}
+_STAMPS: Mapping[str, float] = {f"stamp_{unit}": scale for unit, scale in UNITS.items()}
 _MAP = ("x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -151,19 +149,21 @@ up."""
 
 def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
     """Read the CSV file at ``path``, separated by commas, semicolons, tabs or blanks."""
-    columns = _columns(path, _take_names(entry.get("columns"), f"{where}, columns"))
+    names = take_mapping(entry.get("columns", {}), f"{where}, columns", DriveError)
+    check_keys(names, (), NAMES, f"{where}, columns", DriveError)
+    texts = {ours: take_text(name, f"{where}, columns, {ours}", DriveError) for ours, name in names.items()}
+    columns = _columns(path, texts)
     stamp_s = _stamps(columns, path)
     rows = in_order(stamp_s, str(path), "pose")
     columns = {name: values[rows] for name, values in columns.items()}
     geodetic = _GEODETIC[0] in columns
-    names = _GEODETIC if geodetic else _MAP
+    coordinates = _GEODETIC if geodetic else _MAP
     if geodetic == (_MAP[0] in columns):
-        raise DriveError(
-            f"{path}: needs positions, as columns {', '.join(_MAP)} or {', '.join(_GEODETIC)}, one of the two"
-        )
-    _need(columns, names[:2], path)
+        either = f"{', '.join(_MAP)} or {', '.join(_GEODETIC)}"
+        raise DriveError(f"{path}: needs positions, as columns {either}, one of the two")
+    _check_there(columns, coordinates[:2], path)
     count = len(rows)
-    points = np.column_stack([columns.get(name, np.zeros(count)) for name in names])
+    points = np.column_stack([columns.get(name, np.zeros(count)) for name in coordinates])
     sigma_m = columns.get("sigma_m", np.full(count, np.nan))
     if "quality" in columns:
         stated = np.array([SIGMA_OF_QUALITY_M.get(value, np.inf) for value in columns["quality"]])
@@ -174,22 +174,13 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, antenna=geodetic)
 
 
-def _take_names(content: object, where: str) -> dict[str, str]:
-    if content is None:
-        return {}
-    entry = take_mapping(content, where, DriveError)
-    check_keys(entry, (), NAMES, where, DriveError)
-    return {ours: take_text(theirs, f"{where}, {ours}", DriveError) for ours, theirs in entry.items()}
-
-
 def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     """The columns of our ``NAMES`` that the file has, each (N,)."""
     header, rows = read_rows(path, ",;\t", "pose")
     for ours, theirs in names.items():
         if header.count(theirs) != 1:
-            raise DriveError(
-                f"{path}: has no column '{theirs}' for {ours}, or two; it has: {', '.join(header)}"
-            )
+            problem = f"has no column '{theirs}' for {ours}, or two"
+            raise DriveError(f"{path}: {problem}; it has: {', '.join(header)}")
     found = {ours: header.index(theirs) for ours, theirs in names.items()}
     for place, name in enumerate(header):
         if name in NAMES and place not in found.values() and name not in found:
@@ -224,9 +215,8 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
     rows = [(number, split(line)) for number, line in lines[1:]]
     for number, cells in rows:
         if len(cells) != len(header):
-            raise DriveError(
-                f"{path}: line {number}: {len(cells)} cells under {len(header)} columns; mend that line"
-            )
+            problem = f"{len(cells)} cells under {len(header)} columns"
+            raise DriveError(f"{path}: line {number}: {problem}; mend that line")
     return header, rows
 
 
@@ -247,26 +237,26 @@ def _parse(name: str, cell: str, where: str) -> float:
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     named = [name for name in (*_STAMPS, "utc") if name in columns]
     if len(named) != 1:
-        has = ", ".join(named) or "none"
-        raise DriveError(
-            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; see columns"
-        )
+        wanted, has = ", ".join(_STAMPS), ", ".join(named) or "none"
+        raise DriveError(f"{path}: needs one column of times, {wanted} or utc, has {has}; see columns")
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
+
+
+def _check_there(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
+    for name in names:
+        if name not in columns:
+            raise DriveError(f"{path}: has no column '{name}'; say under columns what the file calls it")
 
 
 def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
     angles = [name for name in _ANGLES if name in columns]
     yaws = [name for name in angles if name.startswith(("heading", "yaw"))]
     if "qw" in columns:
-        _need(columns, _QUATERNION, path)
+        _check_there(columns, _QUATERNION, path)
         if angles:
             raise DriveError(f"{path}: has a quaternion and {angles[0]}: say one of them under columns")
         quaternion = np.column_stack([columns[name] for name in _QUATERNION])
-        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
-            k = int(np.argmax(np.abs(norm - 1) > _NORM_TOLERANCE))
-            raise DriveError(f"{path}: pose {k + 1}: quaternion of norm {norm[k, 0]:.6g} instead of 1")
-        return rotation_from_quaternion(quaternion / norm)
+        return checked_rotations(quaternion, lambda k: f"{path}: pose {k + 1}")
     if not yaws:
         return None
     for kind in (("heading_deg", "yaw_deg", "yaw_rad"), ("roll_deg", "roll_rad"),
@@ -277,16 +267,9 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
     zeros = np.zeros(len(columns[yaws[0]]))
 
     def radians(kind: str) -> FloatArray:
-        if f"{kind}_rad" in columns:
-            return columns[f"{kind}_rad"]
-        return np.radians(columns.get(f"{kind}_deg", zeros))
+        degrees = columns.get(f"{kind}_deg", zeros)
+        return columns[f"{kind}_rad"] if f"{kind}_rad" in columns else np.radians(degrees)
 
     yaw = np.pi / 2 - radians("heading") if "heading_deg" in columns else radians("yaw")
     pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")
     return rotation_from_euler(radians("roll"), pitch, yaw)
-
-
-def _need(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise DriveError(f"{path}: has no column '{missing[0]}'; say under columns what the file calls it")

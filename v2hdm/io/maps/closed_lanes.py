@@ -50,8 +50,7 @@ class _Cuts:
     """Vertices at which a line is cut, at least the width of a narrow lane apart along it."""
 
     def __init__(self, line: FloatArray) -> None:
-        steps_m = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        self._along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self._along_m = np.insert(np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)), 0, 0.0)
         self.vertices: list[int] = []
 
     def at(self, vertex: int) -> int:
@@ -95,10 +94,8 @@ class _Run:
             if start == stop:
                 continue
             turn = 1 if start < stop else -1
-            bounds = (
-                (self.line, np.arange(begin, end + 1)),
-                (self.other, np.arange(start, stop + turn, turn)),
-            )
+            own_bound = (self.line, np.arange(begin, end + 1))
+            bounds = (own_bound, (self.other, np.arange(start, stop + turn, turn)))
             lanes.append(ClosedLane(*(bounds if self.side < 0 else bounds[::-1])))
         return lanes
 
@@ -134,15 +131,13 @@ class _Segments:
 
     @classmethod
     def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
-        none = np.empty((0, 2))
-        return cls(
-            start=np.concatenate([none, *(line[:-1] for line in lines_map)]),
-            end=np.concatenate([none, *(line[1:] for line in lines_map)]),
-            line=np.repeat(np.arange(len(lines_map)), [max(len(line) - 1, 0) for line in lines_map]),
-            index=np.concatenate(
-                [np.arange(0), *(np.arange(len(line) - 1) for line in lines_map if len(line))]
-            ),
+        none, counts = np.empty((0, 2)), [max(len(line) - 1, 0) for line in lines_map]
+        start, end = (
+            np.concatenate([none, *(line[part] for line in lines_map)])
+            for part in (slice(None, -1), slice(1, None))
         )
+        index = np.concatenate([np.arange(0), *map(np.arange, counts)])
+        return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
 
     def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
         """For each vertex (N,) of a line, the line met first on its left (1) or right (-1), -1 for none.

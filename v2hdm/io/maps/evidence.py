@@ -14,15 +14,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.io.maps.features import ground_height_m
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Road
-from v2hdm.store.files import (
-    load_json,
-    read_text,
-    replace_text,
-    take_array,
-    take_mapping,
-    take_number,
-    take_text,
-)
+from v2hdm.store import files
 
 FILE = "residuals.csv"  # in a result folder
 
@@ -38,30 +30,18 @@ projected minus observed, ``distance_sigma`` the same in standard deviations."""
 
 @dataclass(frozen=True)
 class Residuals:
-    """K corner observations that an optimisation accepted.
+    """K corner observations in I images that an optimisation accepted."""
 
-    Attributes:
-        image: paths of the images, below the drive's folder; ``row_image`` (K,) are indices into them.
-        camera: name of the camera of each image.
-        taken_s: (I,) times of the images, on the clock of the poses.
-        marking: (K,) the id of the marking, 0 where its candidate was left out of the map.
-        corner: (K,) 0 to 3, in the order of its corners.
-        is_point: (K,) whether the observation says where the corner is, not only on which line.
-        observed_px: (K, 2) pinhole pixels.
-        residual_px: (K, 2) projected minus observed.
-        distance_sigma: (K,) its length in standard deviations.
-    """
-
-    image: tuple[str, ...]
-    camera: tuple[str, ...]
-    taken_s: FloatArray
-    row_image: IntArray
-    marking: IntArray
-    corner: IntArray
-    is_point: BoolArray
-    observed_px: FloatArray
-    residual_px: FloatArray
-    distance_sigma: FloatArray
+    image: tuple[str, ...]  # I paths below the drive's folder
+    camera: tuple[str, ...]  # the name of each image's camera
+    taken_s: FloatArray  # (I,) times of the images, on the clock of the poses
+    row_image: IntArray  # (K,) indices into the images
+    marking: IntArray  # (K,) the id of the marking, 0 where its candidate was left out of the map
+    corner: IntArray  # (K,) 0 to 3, in the order of its corners
+    is_point: BoolArray  # (K,) whether the observation says where the corner is, not only on which line
+    observed_px: FloatArray  # (K, 2) pinhole pixels
+    residual_px: FloatArray  # (K, 2) projected minus observed
+    distance_sigma: FloatArray  # (K,) its length in standard deviations
 
     def __len__(self) -> int:
         return len(self.row_image)
@@ -90,12 +70,12 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
             residuals.marking[k] or "", residuals.corner[k] + 1, int(residuals.is_point[k]),
             f"{u:.3f}", f"{v:.3f}", f"{du:.4f}", f"{dv:.4f}", f"{residuals.distance_sigma[k]:.3f}",
         ])  # fmt: skip
-    replace_text(path, text.getvalue())
+    files.replace_text(path, text.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
     """Read the file of :func:`write_residuals`; raises MapFileError where it is missing or damaged."""
-    rows = list(csv.reader(io.StringIO(read_text(path, MapFileError))))
+    rows = list(csv.reader(io.StringIO(files.read_text(path, MapFileError))))
     if not rows or tuple(rows[0]) != COLUMNS:
         raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
     images: dict[str, tuple[int, str, float]] = {}
@@ -111,18 +91,11 @@ def read_residuals(path: Path) -> Residuals:
             raise MapFileError(f"{path}: line {line}: not {len(COLUMNS)} fields as named above") from None
         row_image.append(number)
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
-    return Residuals(
-        image=tuple(images),
-        camera=tuple(camera for _, camera, _ in images.values()),
-        taken_s=np.array([taken_s for _, _, taken_s in images.values()]),
-        row_image=np.array(row_image, dtype=np.int64),
-        marking=table[:, 0].astype(np.int64),
-        corner=table[:, 1].astype(np.int64) - 1,
-        is_point=table[:, 2] > 0,
-        observed_px=table[:, 3:5],
-        residual_px=table[:, 5:7],
-        distance_sigma=table[:, 7],
-    )
+    cameras = tuple(camera for _, camera, _ in images.values())
+    stamps = np.array([stamp for _, _, stamp in images.values()])
+    ids, corners = table[:, :2].astype(np.int64).T
+    known = (np.array(row_image, dtype=np.int64), ids, corners - 1, table[:, 2] > 0)
+    return Residuals(tuple(images), cameras, stamps, *known, table[:, 3:5], table[:, 5:7], table[:, 7])
 
 
 @dataclass(frozen=True)
@@ -144,14 +117,8 @@ def write_exclusions(
     for number, one in enumerate(excluded):
         place = one.position_map.reshape(1, 2)
         heights = None if road is None else ground_height_m(road, place)
-        properties = {
-            "id": number,
-            "class": one.kind,
-            "reason": one.reason,
-            "sightings": one.sightings,
-            "cameras": one.cameras,
-            "position_map": one.position_map.tolist(),
-        }
+        properties = {"id": number, "class": one.kind, "reason": one.reason, "sightings": one.sightings}
+        properties |= {"cameras": one.cameras, "position_map": one.position_map.tolist()}
         (position,) = geojson_positions(place, heights, origin)
         features.append(geojson_feature(f"excluded/{number}", "Point", position, properties))
     write_features(path, features, origin, {})
@@ -159,19 +126,19 @@ def write_exclusions(
 
 def read_exclusions(path: Path) -> list[ExcludedMarking]:
     """Read the file of :func:`write_exclusions`; raises MapFileError where it is missing or damaged."""
-    features = load_json(path, MapFileError).get("features")
+    features = files.load_json(path, MapFileError).get("features")
     if not isinstance(features, list):
         raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
     excluded = []
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
-        feature = take_mapping(feature, where, MapFileError)
-        entry = take_mapping(feature.get("properties"), where, MapFileError)
+        feature = files.take_mapping(feature, where, MapFileError)
+        entry = files.take_mapping(feature.get("properties"), where, MapFileError)
         kind, reason, cameras = (
-            take_text(entry.get(key), f"{where}: {key}", MapFileError)
+            files.take_text(entry.get(key), f"{where}: {key}", MapFileError)
             for key in ("class", "reason", "cameras")
         )
-        at = take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
-        sightings = take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
+        at = files.take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
+        sightings = files.take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
         excluded.append(ExcludedMarking(kind, at, int(sightings), reason, cameras))
     return excluded

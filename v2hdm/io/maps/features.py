@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,11 +52,6 @@ class Feature:
         return order[::-1] if self.closed and signed_area(self.points_map) < 0 else order
 
     @property
-    def ordered_heights_m(self) -> FloatArray | None:
-        """The heights (N,) in the order of :attr:`ring`."""
-        return None if self.heights_m is None else self.heights_m[self.ring]
-
-    @property
     def ring_covariance_m2(self) -> FloatArray | None:
         """The covariance (2N, 2N) in the order of :attr:`ring`."""
         order = [2 * k + axis for k in self.ring for axis in (0, 1)]
@@ -88,44 +83,35 @@ class Feature:
 
 def features_of(hd_map: HdMap) -> list[Feature]:
     """Markings, lanes, then symbols, each with its own id: that which it has, else the next free one."""
-    features = [
-        Feature(
-            m.id or 0,
-            m.kind,
-            m.corners_map,
-            m.sightings,
-            True,
-            m.heights_m,
-            m.covariance_m2,
-            m.relative_sigma_m,
-        )
-        for m in hd_map.markings
-    ]
-    features += [
-        Feature(lane.id or 0, lane.kind, lane.points_map, lane.sightings, False, lane.heights_m)
-        for lane in hd_map.lanes
-    ]
-    for one in hd_map.symbols:
-        outline = Feature(one.id or 0, one.kind, one.outline_map, one.sightings, True, one.heights_m)
-        features.append(replace(outline, symbol=True, place_sigma_m=one.sigma_m))
-    ids = unique_ids([feature.id for feature in features], hd_map.largest_id)
-    return [with_id(feature, number) for feature, number in zip(features, ids, strict=True)]
+    everything: list[Any] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
+    ids = unique_ids([one.id or 0 for one in everything], hd_map.largest_id)
+    features = []
+    for one, number in zip(everything, ids, strict=True):
+        if isinstance(one, Symbol):
+            points, more = one.outline_map, dict[str, Any](symbol=True, place_sigma_m=one.sigma_m)
+        elif isinstance(one, Lane):
+            points, more = one.points_map, {}
+        else:
+            sigma_m, points = one.relative_sigma_m, one.corners_map
+            more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m}
+        closed = not isinstance(one, Lane)
+        features.append(Feature(number, one.kind, points, one.sightings, closed, one.heights_m, **more))
+    return features
 
 
-def map_of(features: Iterable[Feature], origin: GeodeticOrigin | None) -> HdMap:
-    """The map whose features these are, in their order."""
+def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrigin | None) -> HdMap:
+    """The map whose features these are, in their order, with other ids."""
     markings: list[Marking] = []
     lanes: list[Lane] = []
     symbols: list[Symbol] = []
-    for one in features:
+    for one, number in zip(features, ids, strict=True):
+        own = (one.kind, one.points_map, one.sightings)
         if one.symbol:
-            known = (one.place_sigma_m, one.heights_m, one.id)
-            symbols.append(Symbol(one.kind, one.points_map, one.sightings, *known))
+            symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number))
         elif one.closed:
-            more = (one.covariance_m2, one.relative_sigma_m, one.heights_m, one.id)
-            markings.append(Marking(one.kind, one.points_map, one.sightings, *more))
+            markings.append(Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number))
         else:
-            lanes.append(Lane(one.kind, one.points_map, one.sightings, one.heights_m, one.id))
+            lanes.append(Lane(*own, one.heights_m, number))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
@@ -141,27 +127,22 @@ def unique_ids(ids: Sequence[int], largest: int = 0) -> list[int]:
 
 
 def properties_of(feature: Feature) -> dict[str, Any]:
-    """The properties of a feature in files, besides its geometry."""
-    properties: dict[str, Any] = {
+    """The properties of a feature in files, besides its geometry; arrays are lists."""
+    known = {
         "id": feature.id,
         "class": feature.kind,
         "sightings": feature.sightings,
-        feature.key: feature.points_map.tolist(),
+        feature.key: feature.points_map,
+        "heights_m": feature.heights_m,
+        "sigma_m": feature.sigma_m,
+        "covariance_m2": feature.covariance_m2,
+        "relative_sigma_m": feature.relative_sigma_m,
     }
-    if feature.heights_m is not None:
-        properties["heights_m"] = feature.heights_m.tolist()
-    if feature.sigma_m is not None:
-        properties["sigma_m"] = feature.sigma_m
-    if feature.covariance_m2 is not None:
-        properties["covariance_m2"] = feature.covariance_m2.tolist()
-    if feature.relative_sigma_m is not None:
-        properties["relative_sigma_m"] = feature.relative_sigma_m
-    return properties
-
-
-def with_id(feature: Feature, number: int) -> Feature:
-    """``feature`` with another id."""
-    return feature if feature.id == number else replace(feature, id=number)
+    return {
+        key: value.tolist() if isinstance(value, np.ndarray) else value
+        for key, value in known.items()
+        if value is not None
+    }
 
 
 def with_heights(hd_map: HdMap, road: Road | None) -> HdMap:
@@ -183,15 +164,11 @@ def with_heights(hd_map: HdMap, road: Road | None) -> HdMap:
 
 def ground_height_m(road: Road, points_map: FloatArray) -> FloatArray:
     """Recorded height (N,) of the ground at ``points_map`` (N, 2), by the road's planes nearest to them."""
-    pieces = [
-        _height_m(road, points_map[start : start + _AT_ONCE]) for start in range(0, len(points_map), _AT_ONCE)
-    ]
-    return np.concatenate(pieces) if pieces else np.empty(0)
-
-
-def _height_m(road: Road, points_map: FloatArray) -> FloatArray:
-    offset = points_map[:, None] - road.points_map
-    squared = np.einsum("nsi,nsi->ns", offset, offset)
-    weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / _ALONG_M**2)
-    plane = road.height_m + np.einsum("nsi,si->ns", offset, road.slope)
-    return np.asarray((weight * plane).sum(axis=1) / weight.sum(axis=1))
+    pieces = [np.empty(0)]
+    for start in range(0, len(points_map), _AT_ONCE):
+        offset = points_map[start : start + _AT_ONCE, None] - road.points_map
+        squared = np.einsum("nsi,nsi->ns", offset, offset)
+        weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / _ALONG_M**2)
+        plane = road.height_m + np.einsum("nsi,si->ns", offset, road.slope)
+        pieces.append((weight * plane).sum(axis=1) / weight.sum(axis=1))
+    return np.concatenate(pieces)

@@ -53,28 +53,22 @@ def write_dxf(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
             document.layers.add(layer, color=1 + len(document.layers) % _COLOURS)
         points = feature.xyz_map[feature.ring].tolist()
         line = space.add_polyline3d(points, close=feature.closed, dxfattribs={"layer": layer})
-        line.set_xdata(APPLICATION, _extended(feature))
+        data: list[tuple[int, Any]] = [(_TEXT, "id"), (_WHOLE, feature.id)]
+        data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
+        if feature.relative_sigma_m is not None:
+            data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
+        if (covariance := feature.ring_covariance_m2) is not None:
+            data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
+        line.set_xdata(APPLICATION, data)
     with whole_file(path) as partial:
         document.saveas(partial)
 
-
-def _extended(feature: Feature) -> list[tuple[int, Any]]:
-    data: list[tuple[int, Any]] = [(_TEXT, "id"), (_WHOLE, feature.id)]
-    data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
-    if feature.relative_sigma_m is not None:
-        data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
-    if (covariance := feature.ring_covariance_m2) is not None:
-        data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
-    return data
-
-
-_CORNERS = 4
 
 COLUMNS: tuple[str, ...] = (
     *("id", "class", "point", "x_map_m", "y_map_m", "height_m"),
     *("longitude_deg", "latitude_deg", "ellipsoidal_height_m"),
     *("sigma_x_m", "sigma_y_m", "sightings", "relative_sigma_m"),
-    *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, _CORNERS + 1) for other in "xy"),
+    *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, 5) for other in "xy"),
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
 of point 3 of the same feature. Empty where it is not known."""
@@ -86,10 +80,8 @@ def write_csv(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
     A CSV has no place for the ``verdict``.
     """
     text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
-    for feature in features_of(hd_map):
-        table.writerows(_rows(feature, hd_map.origin))
+    rows = (row for feature in features_of(hd_map) for row in _rows(feature, hd_map.origin))
+    csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
     replace_text(path, text.getvalue())
 
 
@@ -100,16 +92,16 @@ def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:
         positions = np.empty((count, 3))
         positions[feature.ring] = feature.positions(origin)
         geodetic = positions.tolist()
+    relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
         height = "" if feature.heights_m is None else float(feature.heights_m[k])
         sigmas: list[Any] = ["", ""]
-        covariances: list[Any] = [""] * (4 * _CORNERS)
+        covariances: list[Any] = [""] * 16
         if feature.covariance_m2 is not None:
             own = feature.covariance_m2[2 * k : 2 * k + 2]
             sigmas = np.sqrt(np.diag(own[:, 2 * k : 2 * k + 2])).tolist()
             covariances = own.ravel().tolist()
-        relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
         row = [feature.id, feature.kind, k + 1, x, y, height, *geodetic[k], *sigmas]
         rows.append([*row, feature.sightings, relative, *covariances])
     return rows
@@ -117,19 +109,19 @@ def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:
 
 @dataclass(frozen=True)
 class Format:
-    """One format: its file by the map's name, the function that writes it, the packages that it needs."""
+    """One format: its file by the map's name, the function that writes it, the package that it needs."""
 
     file: str
     write: Callable[[HdMap, Path, Verdict], None]
-    needs: tuple[str, ...] = ()
+    needs: str | None = None
 
 
 FORMATS: Mapping[str, Format] = {
     "geojson": Format("{name}.geojson", write_geojson),
     "csv": Format("{name}.csv", write_csv),
-    "gpkg": Format("{name}.gpkg", write_geopackage, ("pyogrio",)),
+    "gpkg": Format("{name}.gpkg", write_geopackage, "pyogrio"),
     "lanelet2": Format("{name}_lanelet2/lanelet2_map.osm", write_lanelet2),
-    "dxf": Format("{name}.dxf", write_dxf, ("ezdxf",)),
+    "dxf": Format("{name}.dxf", write_dxf, "ezdxf"),
 }
 
 
@@ -138,7 +130,7 @@ def check_formats(names: Sequence[str], key: str) -> None:
     for name in names:
         if name not in FORMATS:
             raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(FORMATS)}")
-        for package in FORMATS[name].needs:
+        if (package := FORMATS[name].needs) is not None:
             need(package, "gis", f"the format {name}", ConfigError)
 
 

@@ -3,9 +3,8 @@
 With a geodetic origin the geometry is WGS84 longitude and latitude, as the RFC demands, and any GIS shows the
 map in its place. Without one it is local metres, as the foreign member ``v2hdm`` states under
 ``coordinates``. The properties ``corners_map`` and ``points_map`` hold the local coordinates at full
-precision, ``heights_m``
-the ground's heights in the map frame. With heights or an origin, positions have a third coordinate, in m:
-above the ellipsoid, or above the local z = 0.
+precision, ``heights_m`` the ground's heights in the map frame. With heights or an origin, positions have a
+third coordinate, in m: above the ellipsoid, or above the local z = 0.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.geometry.geodetic import geodetic_from_enu
 from v2hdm.io.maps.features import Feature, features_of, properties_of
 from v2hdm.io.maps.reading import RESOLUTION
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
@@ -35,7 +33,14 @@ def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None =
     Markings become Polygons (closed, counter-clockwise), lanes LineStrings. The ``verdict`` on the run that
     made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
-    features = [_feature(one, hd_map.origin) for one in features_of(hd_map)]
+    features = []
+    for one in features_of(hd_map):
+        positions = _rounded(one.positions(hd_map.origin), hd_map.origin)
+        shape, coordinates = (
+            ("Polygon", [[*positions, positions[0]]]) if one.closed else ("LineString", positions)
+        )
+        features.append(geojson_feature(one.id, shape, coordinates, properties_of(one)))
+
     about: dict[str, Any] = {"largest_id": max([hd_map.largest_id, *(one["id"] for one in features)])}
     if hd_map.drift_over_m is not None:
         about["drift_over_m"] = hd_map.drift_over_m
@@ -60,14 +65,6 @@ def write_features(
     replace_text(path, f'{head[:-1]}, "features": [\n{lines}\n]}}\n')
 
 
-def _feature(feature: Feature, origin: GeodeticOrigin | None) -> dict[str, Any]:
-    positions = geojson_positions(feature.points_map[feature.ring], feature.ordered_heights_m, origin)
-    properties = properties_of(feature)
-    if feature.closed:
-        return geojson_feature(feature.id, "Polygon", [[*positions, positions[0]]], properties)
-    return geojson_feature(feature.id, "LineString", positions, properties)
-
-
 def geojson_feature(
     identity: int | str, geometry: str, coordinates: list[Any], properties: dict[str, Any]
 ) -> dict[str, Any]:
@@ -84,12 +81,12 @@ def geojson_positions(
     points_map: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None
 ) -> list[list[float]]:
     """Positions of ground points (N, 2): longitude, latitude and height, or local metres."""
-    if origin is None:
-        local = points_map if heights_m is None else np.column_stack([points_map, heights_m])
-        metres: list[list[float]] = local.tolist()
-        return metres
-    ground = np.column_stack([points_map, np.zeros(len(points_map)) if heights_m is None else heights_m])
-    latitude, longitude, height_m = geodetic_from_enu(origin, ground).T
-    degrees = np.round(np.column_stack([longitude, latitude]), _DEGREE_DECIMALS)
-    positions: list[list[float]] = np.column_stack([degrees, np.round(height_m, _HEIGHT_DECIMALS)]).tolist()
-    return positions
+    return _rounded(Feature(0, "", points_map, 0, False, heights_m).positions(origin), origin)
+
+
+def _rounded(positions: FloatArray, origin: GeodeticOrigin | None) -> list[list[float]]:
+    if origin is not None:
+        heights_m = np.round(positions[:, 2], _HEIGHT_DECIMALS)
+        positions = np.column_stack([np.round(positions[:, :2], _DEGREE_DECIMALS), heights_m])
+    rounded: list[list[float]] = positions.tolist()
+    return rounded

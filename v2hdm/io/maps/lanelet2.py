@@ -15,7 +15,6 @@ import json
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +24,15 @@ import numpy as np
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
-from v2hdm.io.maps.closed_lanes import ClosedLane, closed_lanes
+from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
 from v2hdm.store.files import dump_yaml, replace_text
 
-PROJECTOR_FILE = "map_projector_info.yaml"
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
 
-_FORMAT_VERSION = _MAP_VERSION = "1"
 _DEGREE_DECIMALS, _HEIGHT_DECIMALS = 12, 6  # 1e-7 m; JOSM writes 11
-_SQUARE_M = 100_000.0
 
 # Ids of each feature's parts, above all ids of features and exact in every language; vertices take the lower
 # half.
@@ -60,17 +56,15 @@ def write_lanelet2(
     if projector not in PROJECTORS:
         raise ConfigError(f"unknown projector '{projector}'; choose from: {', '.join(PROJECTORS)}")
     if hd_map.origin is None and projector != LOCAL:
-        raise ConfigError(
-            f"the map has no origin on the earth, which the projector {projector} needs: choose {LOCAL}"
-        )
+        problem = f"the map has no origin on the earth, which the projector {projector} needs"
+        raise ConfigError(f"{problem}: choose {LOCAL}")
     features = features_of(hd_map)
     for feature in features:
         if len(feature.points_map) >= _MOST_VERTICES:
             raise MapFileError(f"feature {feature.id}: more than {_MOST_VERTICES} vertices; split it")
     document = _Document(hd_map.origin, projector)
     lines = [feature for feature in features if not feature.closed]
-    vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
-    lanes = _Lanes(document, lines, closed_lanes([line.points_map for line in lines]), vertices)
+    lanes = _Lanes(document, lines)
     for feature in features:
         if feature.symbol:
             outline = document.nodes(feature, feature.xyz_map[feature.ring])
@@ -79,11 +73,18 @@ def write_lanelet2(
         elif feature.closed:
             _write_marking(document, feature, lanes)
         else:
-            document.way(feature.id, vertices[feature.id], _line_tags(feature) | _more_tags(feature))
+            document.way(feature.id, lanes.vertices[feature.id], _line_tags(feature) | _more_tags(feature))
     lanes.write()
     square = document.place_nodes()
     replace_text(path, document.text())
-    replace_text(path.with_name(PROJECTOR_FILE), dump_yaml(_projector_info(projector, hd_map.origin, square)))
+    info: dict[str, Any] = {"projector_type": projector}
+    if projector != LOCAL and hd_map.origin is not None:
+        place = zip(
+            ("latitude", "longitude", "altitude"), position_of(hd_map.origin)[0].tolist(), strict=True
+        )
+        where = {"map_origin": dict(place)} if square is None else {"mgrs_grid": square}
+        info |= {"vertical_datum": "WGS84"} | where
+    replace_text(path.with_name("map_projector_info.yaml"), dump_yaml(info))
 
 
 def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None:
@@ -123,24 +124,17 @@ def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[Floa
 class _Lanes:
     """The lanelets of a map, and the stop lines' rules that they refer to."""
 
-    def __init__(
-        self,
-        document: _Document,
-        lines: Sequence[Feature],
-        lanes: Sequence[ClosedLane],
-        vertices: Mapping[int, Sequence[int]],
-    ) -> None:
-        self._document = document
-        self._lines = lines
-        self._lanes = lanes
-        self._vertices = vertices
+    def __init__(self, document: _Document, lines: Sequence[Feature]) -> None:
+        self._document, self._lines = document, lines
+        self._lanes = closed_lanes([line.points_map for line in lines])
+        self.vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
+        self.rules: list[list[int]] = [[] for _ in self._lanes]
         self._bounds: dict[tuple[int, int, int], int] = {}
-        self.rules: list[list[int]] = [[] for _ in lanes]
 
     def of(self, place_map: FloatArray) -> int | None:
         """The lane in which a place (2,) of the map lies."""
         for number, lane in enumerate(self._lanes):
-            left, right = (self._points(*bound) for bound in (lane.left, lane.right))
+            left, right = (self._lines[n].points_map[order] for n, order in (lane.left, lane.right))
             outline = np.concatenate([left, right[::-1]]) - place_map
             if cv2.pointPolygonTest(outline.astype(np.float32), (0.0, 0.0), False) >= 0:
                 return number
@@ -148,7 +142,8 @@ class _Lanes:
 
     def direction(self, lane: int, place_map: FloatArray) -> FloatArray:
         """The direction (2,) in which a lane passes a place (2,) of the map."""
-        left = self._points(*self._lanes[lane].left)
+        line, order = self._lanes[lane].left
+        left = self._lines[line].points_map[order]
         nearest = int(np.argmin(((left - place_map) ** 2).sum(axis=1)))
         return np.asarray(np.gradient(left, axis=0)[nearest])
 
@@ -164,9 +159,6 @@ class _Lanes:
             tags = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
             self._document.relation(lanelet_id, members, tags | {"participant:vehicle": "yes"})
 
-    def _points(self, line: int, order: IntArray) -> FloatArray:
-        return self._lines[line].points_map[order]
-
     def _bound(self, line: int, order: IntArray) -> int:
         """The line string of a bound: the line itself where that is all of it, else a piece of its nodes."""
         owner = self._lines[line]
@@ -177,24 +169,16 @@ class _Lanes:
         if key not in self._bounds:
             pieces = sum(1 for other, _, _ in self._bounds if other == line)
             self._bounds[key] = _part(owner, _MOST_VERTICES + 1 + pieces)
-            nodes = self._vertices[owner.id][first : last + 1]
+            nodes = self.vertices[owner.id][first : last + 1]
             self._document.way(self._bounds[key], nodes, _line_tags(owner) | {"part_of": str(owner.id)})
         return self._bounds[key]
 
 
-@dataclass(frozen=True)
-class GridPlaces:
-    """Points of one grid square, as ``54SUE``: ``local`` (N, 2) m east and north of its south-west corner."""
+def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> tuple[str, FloatArray]:
+    """Points (N,) in the Military Grid Reference System: UTM within one square of 100 km, as ``54SUE``.
 
-    square: str
-    local: FloatArray
-
-
-def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> GridPlaces:
-    """Positions of points (N,) in the Military Grid Reference System: UTM within a square of 100 km.
-
-    Raises ConfigError when they lie in several squares or beyond the grid, or ``mgrs`` or ``pyproj`` is
-    missing.
+    Returns the square, and the points (N, 2), m east and north of its south-west corner. Raises ConfigError
+    when they lie in several squares or beyond the grid, or ``mgrs`` or ``pyproj`` is missing.
     """
     pyproj, mgrs = (
         need(one, "gis", "the format lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs")
@@ -211,20 +195,18 @@ def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> GridPlac
         )
     (square,) = squares
     utm = pyproj.Proj(proj="utm", zone=int(square[:-3]), ellps="WGS84")
-    return GridPlaces(square, np.column_stack(utm(longitude_deg, latitude_deg)) % _SQUARE_M)
+    return square, np.column_stack(utm(longitude_deg, latitude_deg)) % 100_000.0
 
 
 class _Document:
     """The OSM document; nodes are placed last, all at once."""
 
     def __init__(self, origin: GeodeticOrigin | None, projector: str) -> None:
-        self._origin = origin
-        self._projector = projector
+        self._origin, self._projector = origin, projector
         self._root = ET.Element("osm", version="0.6", generator="v2hdm")
-        ET.SubElement(self._root, "MetaInfo", format_version=_FORMAT_VERSION, map_version=_MAP_VERSION)
+        ET.SubElement(self._root, "MetaInfo", format_version="1", map_version="1")
         self._nodes: dict[int, FloatArray] = {}
-        self._ways: list[ET.Element] = []
-        self._relations: list[ET.Element] = []
+        self._elements: list[ET.Element] = []
 
     def nodes(self, owner: Feature, xyz_map: FloatArray, first: int = 0) -> list[int]:
         """Ids of new nodes at places (N, 3) of the map, from part ``first`` of their owner on."""
@@ -233,50 +215,43 @@ class _Document:
         return list(made)
 
     def way(self, number: int, nodes: Sequence[int], tags: Mapping[str, str]) -> None:
-        way = ET.Element("way", id=str(number))
+        self._elements.append(way := ET.Element("way", id=str(number)))
         for node in nodes:
             ET.SubElement(way, "nd", ref=str(node))
         _add_tags(way, tags)
-        self._ways.append(way)
 
     def relation(self, number: int, members: Sequence[tuple[str, int, str]], tags: Mapping[str, str]) -> None:
-        relation = ET.Element("relation", id=str(number))
+        self._elements.append(relation := ET.Element("relation", id=str(number)))
         for kind, ref, role in members:
             ET.SubElement(relation, "member", type=kind, ref=str(ref), role=role)
         _add_tags(relation, tags)
-        self._relations.append(relation)
 
     def place_nodes(self) -> str | None:
         """Write the nodes; returns the grid square where the projector has one."""
         xyz_map = np.array(list(self._nodes.values())).reshape(-1, 3)
         degrees = geodetic_from_enu(self._origin or _NOWHERE, xyz_map)
-        local, grid = xyz_map[:, :2], None
+        local, square = xyz_map[:, :2], None
         if self._projector == MGRS:
             if self._origin is not None and not len(xyz_map):
                 here = position_of(self._origin)
-                return grid_places(here[:, 1], here[:, 0]).square
-            grid = grid_places(degrees[:, 1], degrees[:, 0])
-            local = grid.local
+                return grid_places(here[:, 1], here[:, 0])[0]
+            square, local = grid_places(degrees[:, 1], degrees[:, 0])
         heights_m = xyz_map[:, 2] if self._projector == LOCAL else degrees[:, 2]
         for node, (latitude, longitude, _), (x, y), height in zip(
             self._nodes, degrees.tolist(), local.tolist(), heights_m.tolist(), strict=True
         ):
             lat, lon = (f"{degrees:.{_DEGREE_DECIMALS}f}" for degrees in (latitude, longitude))
             element = ET.SubElement(self._root, "node", id=str(node), lat=lat, lon=lon)
-            tags = {} if grid is None else {"mgrs_code": _mgrs_code(grid, x, y)}
+            # To the metre, which the grid rounds down.
+            tags = {} if square is None else {"mgrs_code": f"{square}{int(x):05d}{int(y):05d}"}
             tags |= {"local_x": repr(x), "local_y": repr(y), "ele": f"{height:.{_HEIGHT_DECIMALS}f}"}
             _add_tags(element, tags)
-        return None if grid is None else grid.square
+        return square
 
     def text(self) -> str:
-        self._root.extend([*self._ways, *self._relations])
+        self._root.extend(sorted(self._elements, key=lambda one: one.tag != "way"))
         ET.indent(self._root, " ")
         return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(self._root, encoding="unicode")}\n'
-
-
-def _mgrs_code(grid: GridPlaces, x: float, y: float) -> str:
-    """A place to the metre, which the grid rounds down."""
-    return f"{grid.square}{int(x):05d}{int(y):05d}"
 
 
 def _part(owner: Feature, number: int) -> int:
@@ -285,8 +260,7 @@ def _part(owner: Feature, number: int) -> int:
 
 
 def _line_tags(feature: Feature) -> dict[str, str]:
-    dashed = feature.kind == LANE_DASH
-    subtype, lane_change = ("dashed", "yes") if dashed else ("solid", "no")
+    subtype, lane_change = ("dashed", "yes") if feature.kind == LANE_DASH else ("solid", "no")
     return {"type": "line_thin", "subtype": subtype, "lane_change": lane_change}
 
 
@@ -304,13 +278,3 @@ def _more_tags(feature: Feature) -> dict[str, str]:
 def _add_tags(element: ET.Element, tags: Mapping[str, str]) -> None:
     for key, value in tags.items():
         ET.SubElement(element, "tag", k=key, v=value)
-
-
-def _projector_info(projector: str, origin: GeodeticOrigin | None, square: str | None) -> dict[str, Any]:
-    if projector == LOCAL or origin is None:
-        return {"projector_type": LOCAL}
-    info: dict[str, Any] = {"projector_type": projector, "vertical_datum": "WGS84"}
-    if square is not None:
-        return info | {"mgrs_grid": square}
-    place = zip(("latitude", "longitude", "altitude"), position_of(origin)[0].tolist(), strict=True)
-    return info | {"map_origin": dict(place)}

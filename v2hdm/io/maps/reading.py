@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import re
-import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,27 +20,17 @@ from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
-from v2hdm.io.maps.features import (
-    CORNERS,
-    OUTLINE,
-    POINTS,
-    Feature,
-    map_of,
-    unique_ids,
-    with_id,
-)  # fmt: skip
+from v2hdm.io.maps.features import CORNERS, OUTLINE, POINTS, Feature, map_of, unique_ids
 from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.io.safe.texts import parse_json, take_name
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
 from v2hdm.store.files import load_json, take_array, take_mapping, take_number
 
 _log = logging.getLogger(__name__)
 
 Verdict = Mapping[str, Any] | None
 
-_LARGEST_ID = 1_000_000_000  # every format and GIS holds it as a whole number of 32 bits
-_MOST_SIGHTINGS = 1_000_000_000
-_LEAST_OF_A_RING = 3  # corners of a polygon, the repeated first one aside (RFC 7946, section 3.1.6)
+_LARGEST_ID = _MOST_SIGHTINGS = 1_000_000_000  # every format and GIS holds it as a whole number of 32 bits
 _NAMED = 9  # edited features that the log names
 
 # Degrees and m by which positions may be off without an edit. Of GeoJSON, GDAL takes a last digit after
@@ -58,8 +48,6 @@ LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 """Layers of a GeoPackage by the property that holds the coordinates of their features."""
 
 _SQL = re.compile(r"sqlite3_\w+\(.*\) failed: |Failed to prepare SQL .*: ")
-_WKB_KINDS = {2: False, 3: True, 5: False, 6: True}
-"""Whether WKB types (line, polygon, and the Multi... of one of them) are closed (OGC 06-103r4, table 7)."""
 
 
 def read_map(path: Path) -> tuple[HdMap, Verdict]:
@@ -70,9 +58,8 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise MapFileError(
-            f"{path}: no map that can be read; give a file that ends in {' or '.join(_READERS)}"
-        )
+        endings = " or ".join(_READERS)
+        raise MapFileError(f"{path}: no map that can be read; give a file that ends in {endings}")
     return reader[0](path), reader[1](path)
 
 
@@ -100,12 +87,11 @@ def read_geojson(path: Path) -> HdMap:
         entry = take_mapping(feature, where, MapFileError)
         properties = take_mapping(entry.get("properties"), where, MapFileError)
         reader.add(properties, _of_geojson(entry.get("geometry"), where), where)
-    hd_map, largest, over_m = reader.map(), about.get("largest_id"), about.get("drift_over_m")
-    if largest is not None:
-        largest = take_whole(largest, 0, _LARGEST_ID, f"{path}: largest_id", MapFileError)
+    hd_map, over_m = reader.map(), about.get("drift_over_m")
+    largest = take_whole(about.get("largest_id") or 0, 0, _LARGEST_ID, f"{path}: largest_id", MapFileError)
     if over_m is not None:
         over_m = take_number(over_m, f"{path}: drift_over_m", MapFileError)
-    return replace(hd_map, largest_id=largest or 0, drift_over_m=over_m)
+    return replace(hd_map, largest_id=largest, drift_over_m=over_m)
 
 
 def read_verdict(path: Path) -> Verdict:
@@ -164,7 +150,7 @@ class _Reader:
             raise MapFileError(
                 f"{where}: has neither a geometry nor '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it"
             )
-        if geometry is not None and geometry.closed and len(geometry.positions) < _LEAST_OF_A_RING:
+        if geometry is not None and geometry.closed and len(geometry.positions) < 3:
             raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
         geodetic = geometry is not None and self._origin is not None
         if geometry is not None and geodetic and (np.abs(geometry.positions[:, 1]) > 90).any():
@@ -187,14 +173,12 @@ class _Reader:
         if self._edited:
             named = ", ".join(str(ids[index]) for index in self._edited[:_NAMED])
             more = ", ..." if len(self._edited) > _NAMED else ""
-            _log.info(
-                "%s: %d features were edited and are taken as drawn: %s",
-                self._path, len(self._edited), named + more,
-            )  # fmt: skip
+            edited = f"{len(self._edited)} features were edited and are taken as drawn"
+            _log.info("%s: %s: %s", self._path, edited, named + more)
         new = sum(a != b for a, b in zip(before, ids, strict=True))
         if new:
             _log.info("%s: %d features had no id of their own and were given one", self._path, new)
-        return map_of(map(with_id, self._features, ids), self._origin)
+        return map_of(self._features, ids, self._origin)
 
 
 def _believed(
@@ -218,7 +202,11 @@ def _believed(
     drawn = stored.positions(origin)
     expected = np.zeros((len(positions), 3))
     expected[stored.ring, : drawn.shape[1]] = drawn
-    positions = positions[_aligned(expected[:, :2], positions, geometry.closed)]
+    if geometry.closed:
+        order = np.arange(len(positions))
+        orders = [np.roll(one, -start) for one in (order, order[::-1]) for start in range(len(order))]
+        away = [float(((positions[one, :2] - expected[:, :2]) ** 2).sum()) for one in orders]
+        positions = positions[orders[int(np.argmin(away))]]
     agree = np.abs(positions - expected[:, :size]) <= rounding[:size]
     if agree.all():
         return stored
@@ -237,15 +225,6 @@ def _in_map(positions: FloatArray, heights_m: FloatArray | None, origin: Geodeti
         return np.column_stack([positions, known])[:, :3]
     above_m = np.column_stack([positions, origin.altitude_m + known])[:, 2]
     return enu_from_geodetic(origin, np.column_stack([positions[:, 1], positions[:, 0], above_m]))
-
-
-def _aligned(expected: FloatArray, positions: FloatArray, closed: bool) -> IntArray:
-    """The order of ``positions`` that comes nearest to ``expected``: as they are unless they form a ring."""
-    order = np.arange(len(positions))
-    if not closed:
-        return order
-    orders = [np.roll(one, -start) for one in (order, order[::-1]) for start in range(len(order))]
-    return min(orders, key=lambda one: float(((positions[one, :2] - expected) ** 2).sum()))
 
 
 def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
@@ -284,9 +263,8 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     kind, parts = entry.get("type"), entry.get("coordinates")
     closed = kind in ("Polygon", "MultiPolygon")
     if not closed and kind not in ("LineString", "MultiLineString"):
-        raise MapFileError(
-            f"{where}: its geometry is a {kind}; draw markings as Polygons, lanes as LineStrings"
-        )
+        advice = "draw markings as Polygons, lanes as LineStrings"
+        raise MapFileError(f"{where}: its geometry is a {kind}; {advice}")
     for _ in range({"Polygon": 1, "MultiPolygon": 2, "MultiLineString": 1}.get(str(kind), 0)):
         if not isinstance(parts, list) or len(parts) != 1:
             raise MapFileError(f"{where}: its {kind} has holes or several parts; split it")
@@ -300,35 +278,30 @@ def _of_wkb(wkb: bytes | None, where: str) -> Geometry | None:
     """A polygon of one ring, a line, or a Multi... of one of them, from well-known binary."""
     if wkb is None:
         return None
-    at = 0
-    for _ in range(2):
-        order = "<" if wkb[at] == 1 else ">"
-        code, parts = struct.unpack_from(f"{order}II", wkb, at + 1)
-        # A thousand (ISO) or the highest bit (as GDAL did before ISO) stands for heights.
-        plain = code & 0xFFFF
-        kind, dimensions = plain % 1000, 3 if code & 0x80000000 or plain // 1000 == 1 else 2
-        at += 9
-        if kind < 4:
-            break
-        if parts != 1:
-            raise MapFileError(f"{where}: its geometry has several parts; split it")
-    closed = _WKB_KINDS.get(kind)
-    if closed is None:
+    shapely = need("shapely", "gis", "the format gpkg", ConfigError)
+    parts = shapely.get_parts(shapely.from_wkb(wkb))
+    if len(parts) != 1:
+        raise MapFileError(f"{where}: its geometry has several parts; split it")
+    shape = parts[0]
+    if shape.geom_type not in ("LineString", "Polygon"):
         raise MapFileError(f"{where}: its geometry is none that a map has; draw a polygon or a line")
-    count = parts
-    if closed:
-        if parts != 1:
-            raise MapFileError(f"{where}: its polygon has holes; fill them")
-        (count,) = struct.unpack_from(f"{order}I", wkb, at)
-        at += 4
-    positions = np.frombuffer(wkb, f"{order}f8", count * dimensions, at).reshape(count, dimensions)
-    positions = take_array(positions.tolist(), (-1, dimensions), f"{where}, geometry", MapFileError)
+    closed, dimensions = shape.geom_type == "Polygon", 3 if shape.has_z else 2
+    if closed and len(shape.interiors):
+        raise MapFileError(f"{where}: its polygon has holes; fill them")
+    positions = shapely.get_coordinates(shape, include_z=shape.has_z).tolist()
+    positions = take_array(positions, (-1, dimensions), f"{where}, geometry", MapFileError)
     return Geometry(positions[:-1] if closed else positions, closed)
 
 
-def short_gdal_error(failure: Exception) -> str:
-    """The first line of an error of GDAL, without its SQL."""
-    return _SQL.sub("", str(failure).splitlines()[0])
+@contextmanager
+def gdal_errors(path: Path, problem: str, advice: str) -> Iterator[None]:
+    """Turn an error of GDAL into one line: the first of its own, without the SQL."""
+    errors = need("pyogrio.errors", "gis", "the format gpkg", ConfigError)
+    try:
+        yield
+    except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
+        first = _SQL.sub("", str(failure).splitlines()[0])
+        raise MapFileError(f"{path}: {problem} ({first}); {advice}") from None
 
 
 def _about(path: Path, key: str) -> object:
@@ -339,16 +312,11 @@ def _about(path: Path, key: str) -> object:
 
 def _layer(path: Path, layer: str) -> list[tuple[bytes | None, dict[str, Any]]]:
     """Geometry and properties of each row of a GeoPackage's layer; missing numbers are None."""
-    raw, errors = (
-        need(f"pyogrio.{part}", "gis", "the format gpkg", ConfigError) for part in ("raw", "errors")
-    )
+    raw = need("pyogrio.raw", "gis", "the format gpkg", ConfigError)
     if not path.is_file():
         raise MapFileError(f"{path}: no such file; check the path or restore it")
-    try:
+    with gdal_errors(path, "not a map written by v2hdm", "give one that is"):
         meta, _, geometry, columns = raw.read(str(path), layer=layer)
-    except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-        problem = short_gdal_error(failure)
-        raise MapFileError(f"{path}: not a map written by v2hdm ({problem}); give one that is") from None
     rows = [
         {name: None if value != value else value for name, value in zip(meta["fields"], row, strict=True)}
         for row in zip(*(column.tolist() for column in columns), strict=True)

@@ -57,7 +57,13 @@ def take_origin(content: object, where: str, error: type[V2hdmError]) -> Geodeti
 def take_covariance(content: object, size: int, where: str, error: type[V2hdmError]) -> FloatArray:
     """``content`` as a covariance (size, size), perhaps written with fewer digits than it has."""
     matrix = take_array(content, (size, size), where, error)
-    if not _is_covariance(matrix):
+    variance = np.diag(matrix)
+    with np.errstate(all="ignore"):  # absurd numbers fail the tests that follow
+        sigma = np.sqrt(variance)
+        scale = np.outer(sigma, sigma)
+        correlation = matrix / np.where(scale > 0, scale, 1.0)
+        symmetric = np.abs(correlation - correlation.T).max() <= _ROUNDING
+    if (variance < 0).any() or not symmetric or np.linalg.eigvalsh(correlation).min() <= -_ROUNDING:
         raise error(f"{where}: not symmetric or negative somewhere; mend it or leave it out")
     return matrix
 
@@ -70,37 +76,32 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     """
     (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
     if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:
-        raise error(
-            f"{where}: camera_matrix: not of the form fx s cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it"
-        )
+        problem = "not of the form fx s cx, 0 fy cy, 0 0 1 with positive fx, fy"
+        raise error(f"{where}: camera_matrix: {problem}; mend it")
     if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
         raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; mend it")
-    _check_tangential(info, where, error)
-    reach, sides = lens_reach(info), _sides(info)
-    if reach >= np.hypot(*sides):
-        return
-    scale_px = (fx + fy) / 2
-    problem = (
-        f"{where}: distortion_coefficients: this lens folds over itself {scale_px * reach:.0f} px from its "
-        f"centre, and the image reaches {scale_px * np.hypot(*sides):.0f} px from there"
-    )
-    if reach < max(sides):
-        raise error(f"{problem}; calibrate it again with points up to the image's corners")
-    _log.warning("%s: do not trust what lies in its corners; calibrate with points up to there", problem)
-
-
-def _check_tangential(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
-    """Refuse a lens so far off its axis that the image's middle is turned over or torn."""
+    # The image's reach from the axis to a side, and up or down, in focal lengths.
+    across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
+    down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
+    at, k = f"{where}: distortion_coefficients", info.distortion
     # The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
     # where 6 p r reaches 1; every real lens is below a tenth of that.
-    if info.distortion_model == "equidistant" or len(info.distortion) < 4:
-        return
-    tangential = float(np.hypot(info.distortion[2], info.distortion[3]))
-    if 6 * tangential * min(max(_sides(info)), _MIDDLE) >= 1:
+    tangential = np.hypot(k[2], k[3]) if info.distortion_model != "equidistant" and len(k) > 3 else 0.0
+    if 6 * tangential * min(max(across, down), _MIDDLE) >= 1:
         raise error(
-            f"{where}: distortion_coefficients: p1 and p2 of {info.distortion[2]:g} and "
-            f"{info.distortion[3]:g} turn the image over; their order is k1 k2 p1 p2 k3, mend them"
+            f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} turn the image over; their order is k1 k2 p1 p2 k3, "
+            "mend them"
         )
+    reach, scale_px = lens_reach(info), (fx + fy) / 2
+    if reach >= np.hypot(across, down):
+        return
+    problem = (
+        f"{at}: this lens folds over itself {scale_px * reach:.0f} px from its centre, and the image reaches "
+        f"{scale_px * np.hypot(across, down):.0f} px from there"
+    )
+    if reach < max(across, down):
+        raise error(f"{problem}; calibrate it again with points up to the image's corners")
+    _log.warning("%s: do not trust what lies in its corners; calibrate with points up to there", problem)
 
 
 def lens_reach(info: CameraInfo) -> float:
@@ -124,24 +125,3 @@ def recorded_distance(info: CameraInfo, angles: FloatArray) -> FloatArray:
     if len(k) > 5:
         recorded /= 1 + square * (k[5] + square * (k[6] + square * k[7]))
     return recorded
-
-
-def _sides(info: CameraInfo) -> tuple[float, float]:
-    """The image's reach from the axis to a side, and up or down, in focal lengths."""
-    (fx, _, cx), (_, fy, cy), _ = info.intrinsic
-    across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
-    down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
-    return float(across), float(down)
-
-
-def _is_covariance(matrix: FloatArray) -> bool:
-    variance = np.diag(matrix)
-    if (variance < 0).any():
-        return False
-    with np.errstate(all="ignore"):  # absurd numbers fail the tests that follow
-        sigma = np.sqrt(variance)
-        scale = np.outer(sigma, sigma)
-        correlation = matrix / np.where(scale > 0, scale, 1.0)
-        if not np.abs(correlation - correlation.T).max() <= _ROUNDING:
-            return False
-    return bool(np.linalg.eigvalsh(correlation).min() > -_ROUNDING)

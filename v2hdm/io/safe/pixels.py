@@ -15,9 +15,10 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import takewhile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -70,7 +71,11 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     with _opened(path) as stored:
         data = stored[:]
     header = _checked(data, path)
-    _check_sums(data, path)
+    # Decoders only warn of a chunk of a PNG that does not have its checksum.
+    chunks = _png_chunks(data) if data.startswith(_PNG) else ()
+    sums = [(data[at - 4 : at + length], _unpack(">I", data, at + length)[0]) for _, at, length in chunks]
+    if any(zlib.crc32(chunk) != expected for chunk, expected in sums):
+        raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
         _warn_turned(path.parent, header.orientation)
     with _complaints() as lines:
@@ -146,7 +151,8 @@ def _checked(data: _Data, path: Path) -> Header:
         header = _header(data)
     except (struct.error, LookupError, ValueError):
         header = None
-    if header is None or not _is_whole(data):
+    end = {_JPEG: b"\xff\xd9", _PNG[:2]: b"IEND"}.get(begin[:2], b"")
+    if header is None or end not in data[-_TAIL_BYTES:]:
         raise DriveError(f"{path}: image is truncated or damaged; restore it or drop it from the list")
     size = f"{path}: image is {header.width} x {header.height} px"
     if min(header.width, header.height) < LEAST_SIDE_PX:
@@ -156,17 +162,13 @@ def _checked(data: _Data, path: Path) -> Header:
     return header
 
 
-def _is_whole(data: _Data) -> bool:
-    """Whether a file has its end."""
-    end = {_JPEG: b"\xff\xd9", _PNG[:2]: b"IEND"}.get(data[:2], b"")
-    return end in data[-_TAIL_BYTES:]
-
-
 def _header(data: _Data) -> Header | None:
     begin = data[:8]
     if begin == _PNG:
         width, height = _unpack(">II", data, 16)
-        return Header(width, height, _png_orientation(data))
+        before = takewhile(lambda chunk: chunk[0] != b"IDAT", _png_chunks(data))
+        exif = next((data[at : at + length] for kind, at, length in before if kind == b"eXIf"), b"")
+        return Header(width, height, _orientation(exif))
     if begin.startswith(_JPEG):
         return _jpeg_header(data)
     if begin.startswith(_TIFF):
@@ -204,15 +206,6 @@ def _jpeg_header(data: _Data) -> Header | None:
     return None
 
 
-def _png_orientation(data: _Data) -> int:
-    for kind, at, length in _png_chunks(data):
-        if kind == b"eXIf":
-            return _orientation(data[at : at + length])
-        if kind == b"IDAT":
-            break
-    return _UPRIGHT
-
-
 def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
     """Kind, begin and length of the body of each whole chunk (PNG, third edition, section 5.3)."""
     at = len(_PNG)
@@ -222,15 +215,6 @@ def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
             break
         yield data[at + 4 : at + 8], at + 8, length
         at += 12 + length
-
-
-def _check_sums(data: bytes, path: Path) -> None:
-    """Compare every chunk of a PNG with its checksum, of which decoders only warn."""
-    if not data.startswith(_PNG):
-        return
-    for kind, at, length in _png_chunks(data):
-        if zlib.crc32(data[at : at + length], zlib.crc32(kind)) != _unpack(">I", data, at + length)[0]:
-            raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
 
 
 def _webp_header(data: bytes) -> Header:
@@ -247,11 +231,10 @@ def _webp_header(data: bytes) -> Header:
 
 def _orientation(exif: bytes) -> int:
     """The orientation in an EXIF block, upright where that is damaged."""
-    try:
-        tag = _tiff_tags(exif).get(_ORIENTATION_TAG, _UPRIGHT) if exif.startswith(_TIFF) else _UPRIGHT
-    except struct.error:
-        return _UPRIGHT
-    return tag if 1 <= tag <= 8 else _UPRIGHT
+    with suppress(struct.error):
+        tag = _tiff_tags(exif).get(_ORIENTATION_TAG, 0) if exif.startswith(_TIFF) else 0
+        return tag if 1 <= tag <= 8 else _UPRIGHT
+    return _UPRIGHT
 
 
 def _tiff_tags(data: _Data) -> dict[int, int]:

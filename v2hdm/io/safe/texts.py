@@ -43,9 +43,8 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
             kind = "a folder" if stat.S_ISDIR(about.st_mode) else "a pipe or a device"
             raise error(f"{path}: is {kind}, not a file; check the path")
         if about.st_size > most:
-            raise error(
-                f"{path}: has {about.st_size / 1e6:.0f} MB, {most / 1e6:.0f} MB at most; check the path"
-            )
+            size, largest = f"{about.st_size / 1e6:.0f} MB", f"{most / 1e6:.0f} MB"
+            raise error(f"{path}: has {size}, {largest} at most; check the path")
         note_input(path)
         data = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -103,7 +102,9 @@ def read_json(path: Path, error: type[V2hdmError]) -> Any:
 
 def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
     """The content of a JSON text from ``where``."""
-    if json_depth(text) > MOST_DEPTH:
+    letters = np.frombuffer(_QUOTED.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
+    steps = np.isin(letters, _OPENING).astype(np.int32) - np.isin(letters, _CLOSING)
+    if np.cumsum(steps).max(initial=0) > MOST_DEPTH:
         raise error(f"{where}: JSON nested deeper than {MOST_DEPTH} levels; mend it")
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -123,16 +124,8 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
     except RecursionError:
         raise error(f"{where}: JSON nested too deep; mend it") from None
     except json.JSONDecodeError as failure:
-        raise error(
-            f"{where}: line {failure.lineno} JSON syntax error: {failure.msg}; mend that line"
-        ) from None
-
-
-def json_depth(text: str) -> int:
-    """The depth of nested lists and objects in a JSON text."""
-    letters = np.frombuffer(_QUOTED.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
-    steps = np.isin(letters, _OPENING).astype(np.int32) - np.isin(letters, _CLOSING)
-    return int(np.cumsum(steps).max(initial=0))
+        at = f"{where}: line {failure.lineno}"
+        raise error(f"{at} JSON syntax error: {failure.msg}; mend that line") from None
 
 
 def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
@@ -163,9 +156,8 @@ def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> st
     """``content`` as the name of a camera, which none of :data:`ALL_CAMERAS` is."""
     name = take_name(content, where, error)
     if name.lower() in ALL_CAMERAS:
-        raise error(
-            f"{where}: a camera is called {shown(name)}, as results of all of them are; choose another"
-        )
+        problem = f"a camera is called {shown(name)}, as results of all of them are"
+        raise error(f"{where}: {problem}; choose another")
     return name
 
 

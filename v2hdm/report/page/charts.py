@@ -15,8 +15,9 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from v2hdm.records import FloatArray, HdMap
-from v2hdm.report.page.facts import GroundResiduals, Route
-from v2hdm.report.style import OKABE_ITO, set_image_axes
+from v2hdm.report.page.facts import Facts, GroundResiduals, Route
+from v2hdm.report.page.layers import SIGMAS_95
+from v2hdm.report.style import OKABE_ITO, RC, draw_arrows, set_image_axes
 
 INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
 """Colours of text, axes, grid and background: those that ``page.css`` replaces by its theme's."""
@@ -31,19 +32,16 @@ CELLS = (9, 16)
 _LEAST_IN_CELL = 10
 """Observations of a cell from which its mean is drawn: its error is a third of one observation's."""
 
-_RC: dict[Any, Any] = {
+_RC: dict[Any, Any] = RC | {
+    "axes.titleweight": "normal",
     "svg.fonttype": "none",
-    "font.family": "sans-serif",
     "font.size": 9.5,
     "text.color": INK,
     "axes.labelcolor": INK,
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
     "axes.linewidth": 0.8,
     "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
     "axes.titlecolor": INK,
     "xtick.color": MUTED,
     "ytick.color": MUTED,
@@ -51,7 +49,6 @@ _RC: dict[Any, Any] = {
     "ytick.labelcolor": INK,
     "grid.color": GRID,
     "grid.linewidth": 0.8,
-    "legend.frameon": False,
     "legend.labelcolor": INK,
     "lines.linewidth": 1.6,
     "patch.linewidth": 1.2,
@@ -81,21 +78,18 @@ def _look(number: int) -> dict[str, Any]:
 
 def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
     """The whole map from above, for paper: markings, lane lines, the route, what was left out (N, 2)."""
-    points = [m.corners_map for m in hd_map.markings] + [one.points_map for one in hd_map.lanes]
-    if route is not None:
-        points.append(route.map_from_vehicle[:, :2, 3])
-    spread = np.ptp(np.concatenate(points), axis=0) + 10.0
+    way = np.empty((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
+    shapes, lanes = [m.corners_map for m in hd_map.markings], [one.points_map for one in hd_map.lanes]
+    spread = np.ptp(np.concatenate([*shapes, *lanes, way]), axis=0) + 10.0
     height_in = float(np.clip(6.4 * spread[1] / spread[0] + 0.8, 2.4, 6.2))
     with _chart("site", 7.2, height_in) as (figure, out):
         axes = figure.subplots()
-        if route is not None:
-            way = route.map_from_vehicle[:, :2, 3]
+        if len(way):
             axes.plot(*way.T, color=MUTED, lw=1.0, ls=(0, (4, 2)), label="route of the vehicle")
             axes.plot(*way[0], "o", color=MUTED, ms=4)
-        lanes = [one.points_map for one in hd_map.lanes]
         lines = LineCollection(lanes, colors=OKABE_ITO["sky"], linewidths=0.9, label="lane lines")
         axes.add_collection(lines)
-        shapes = [m.corners_map for m in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
+        shapes += [one.outline_map for one in hd_map.symbols]
         paint: dict[str, Any] = {"facecolors": OKABE_ITO["blue"], "edgecolors": OKABE_ITO["blue"]}
         axes.add_collection(PolyCollection(shapes, linewidths=0.8, label="markings", **paint))
         if len(excluded):
@@ -108,18 +102,29 @@ def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
     return out[0]
 
 
-def histogram_chart(residuals: GroundResiduals) -> str:
+def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
+    """Residuals as a histogram, over the image, over range and along the route."""
+    infos = {name: one.calibration.info for name, one in facts.cameras.items()}
+    assert facts.route is not None
+    return {
+        "histogram": _histogram_chart(residuals),
+        "field": _field_chart(residuals, {name: (one.width, one.height) for name, one in infos.items()}),
+        "range": _range_chart(residuals),
+        "route": _route_chart(facts.route, residuals),
+    }
+
+
+def _histogram_chart(residuals: GroundResiduals) -> str:
     """Residuals in px, and in standard deviations beside what they would be if the noise model were right."""
     with _chart("histogram", 7.2, 2.5) as (figure, out):
         left, right = figure.subplots(1, 2)
-        size_px = np.linalg.norm(residuals.residual_px[residuals.is_point], axis=1)
+        size_px = residuals.size_px[residuals.is_point]
         edges_px = np.linspace(0, max(float(np.percentile(size_px, 99)) if len(size_px) else 1.0, 0.1), 41)
         edges_sigma = np.linspace(0, 5, 41)
         for number, name in enumerate(residuals.cameras):
             own = residuals.camera == number
-            point = own & residuals.is_point
-            lengths = np.linalg.norm(residuals.residual_px[point], axis=1)
-            _steps(left, lengths, edges_px, f"{name} ({np.count_nonzero(point)})", number)
+            lengths = residuals.size_px[own & residuals.is_point]
+            _steps(left, lengths, edges_px, f"{name} ({len(lengths)})", number)
             _steps(right, residuals.distance_sigma[own], edges_sigma, name, number)
         ideal = edges_sigma * np.exp(-0.5 * edges_sigma**2)
         right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="as the noise model says")
@@ -134,13 +139,12 @@ def histogram_chart(residuals: GroundResiduals) -> str:
 
 
 def _steps(axes: Axes, values: FloatArray, edges: FloatArray, label: str, number: int) -> None:
-    if not len(values):
-        return
-    counts, _ = np.histogram(values, edges)
-    axes.stairs(counts / (len(values) * np.diff(edges)), edges, label=label, baseline=None, **_look(number))
+    if len(values):
+        share = np.histogram(values, edges)[0] / (len(values) * np.diff(edges))
+        axes.stairs(share, edges, label=label, baseline=None, **_look(number))
 
 
-def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]) -> str:
+def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]) -> str:
     """The mean residual over each camera's image, by ``sizes`` (width, height) in px."""
     names = list(residuals.cameras)
     width_px, height_px = sizes[names[0]]
@@ -152,23 +156,12 @@ def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]
         for axes in panels[len(names) :]:
             axes.set_axis_off()
         fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
-        lengths = [float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)]
-        longest = max(lengths, default=0.1)
-        key_px = _round_down(max(longest, 1e-3))
+        longest = max([float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)] or [0.1])
         for number, (axes, name) in enumerate(zip(panels, names, strict=False)):
             width_px, height_px = sizes[name]
-            places, mean = fields[number]
-            if len(places):  # matplotlib cannot draw the key of no arrows
-                # The longest arrow spans one and a half cells.
-                scale = longest / (1.5 * width_px / CELLS[1])
-                arrows = axes.quiver(
-                    *places.T, *mean.T, angles="xy", scale_units="xy", scale=scale,
-                    color=OKABE_ITO[_ORDER[number % len(_ORDER)]], width=0.005, headwidth=3.6,
-                )  # fmt: skip
-                axes.quiverkey(
-                    arrows, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", coordinates="axes",
-                    labelcolor=INK, color=INK, fontproperties={"size": 8.5},
-                )  # fmt: skip
+            # The longest arrow spans one and a half cells.
+            span, colour = 1.5 * width_px / CELLS[1], OKABE_ITO[_ORDER[number % len(_ORDER)]]
+            draw_arrows(axes, *fields[number], longest, span, color=colour, width=0.005, headwidth=3.6)
             set_image_axes(axes, 0, width_px, height_px, 0)
             axes.set(aspect="equal", title=name)
             for side in ("top", "right"):
@@ -188,30 +181,21 @@ def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tu
     enough = np.flatnonzero(count >= _LEAST_IN_CELL)
     mean = np.column_stack([np.bincount(cell, off[inside, a], rows * columns) for a in (0, 1)])
     u, v = (enough % columns + 0.5) * size[0] / columns, (enough // columns + 0.5) * size[1] / rows
-    centres = np.column_stack([u, v])
-    return centres, mean[enough] / count[enough][:, None]
+    return np.column_stack([u, v]), mean[enough] / count[enough][:, None]
 
 
-def _round_down(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten up to ``value``."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)) * power)
-
-
-def range_chart(residuals: GroundResiduals) -> str:
+def _range_chart(residuals: GroundResiduals) -> str:
     """Residuals against the distance from the camera: in the image and on the ground."""
     with _chart("range", 7.2, 2.5) as (figure, out):
         left, right = figure.subplots(1, 2)
         farthest = float(np.ceil(residuals.range_m.max(initial=1.0)))
         edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
-        ground = np.linalg.norm(residuals.ground_m, axis=1)
-        size_px = np.linalg.norm(residuals.residual_px, axis=1)
+        ground_cm = 100 * np.linalg.norm(residuals.ground_m, axis=1)
         for number, name in enumerate(residuals.cameras):
-            own = (residuals.camera == number) & residuals.is_point & np.isfinite(ground)
+            own = (residuals.camera == number) & residuals.is_point & np.isfinite(ground_cm)
             look = {**_look(number), "marker": _MARKERS[number % len(_MARKERS)], "ms": 3.5}
-            for axes, values in ((left, size_px), (right, 100 * ground)):
-                middle, rms = _rms_by(residuals.range_m[own], values[own], edges)
-                axes.plot(middle, rms, label=name, **look)
+            for axes, values in ((left, residuals.size_px), (right, ground_cm)):
+                axes.plot(*_rms_by(residuals.range_m[own], values[own], edges), label=name, **look)
         left.set_ylabel("RMS distance (px)")
         right.set_ylabel("RMS distance on the ground (cm)")
         for axes in (left, right):
@@ -232,45 +216,38 @@ def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[F
     return middle[enough], np.sqrt(squared[enough] / count[enough])
 
 
-def route_chart(route: Route, residuals: GroundResiduals | None) -> str:
+def _route_chart(route: Route, residuals: GroundResiduals) -> str:
     """Along the way: the residuals, and what was taken off the recorded poses."""
-    panels = [name for name, there in (("fit", residuals), ("pose", route.recorded)) if there is not None]
-    with _chart("route", 7.2, 1.9 * len(panels) + 0.3) as (figure, out):
-        rows = dict(zip(panels, np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)), strict=True))
-        way_m = route.way_m
-        if residuals is not None:
-            _fit_along(rows["fit"], residuals, route)
+    rows = 1 if route.recorded is None else 2
+    with _chart("route", 7.2, 1.9 * rows + 0.3) as (figure, out):
+        panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+        way_m, fit = route.way_m, panels[0]
+        total = max(float(way_m[-1]), 1.0)
+        edges = np.linspace(0, total, int(np.clip(total / 5, 4, 80)) + 1)
+        taken_m = np.interp(residuals.taken_s, route.stamp_s, way_m)
+        for number, name in enumerate(residuals.cameras):
+            own = (residuals.camera == number) & residuals.is_point
+            binned = _rms_by(taken_m[own], residuals.size_px[own], edges)
+            fit.plot(*binned, label=name, lw=1.1, **_look(number))
+        fit.set_ylabel("RMS residual (px)")
+        fit.set_ylim(bottom=0)
+        fit.legend(loc="upper right", ncols=len(residuals.cameras), fontsize=8.5)
         if route.recorded is not None:
-            moved = np.linalg.inv(route.recorded) @ route.map_from_vehicle
-            for number, (name, axis) in enumerate((("forward", 0), ("left", 1))):
-                axes, shift = rows["pose"], 100 * moved[:, axis, 3]
-                look = _look(number)
-                sigma = 100 * route.sigma[:, axis]
-                axes.fill_between(
-                    way_m, shift - 2.448 * sigma, shift + 2.448 * sigma, color=look["color"], alpha=0.15, lw=0
+            moved_cm = 100 * (np.linalg.inv(route.recorded) @ route.map_from_vehicle)[:, :2, 3]
+            for axis, name in enumerate(("forward", "left")):
+                shift, band, look = moved_cm[:, axis], SIGMAS_95 * 100 * route.sigma[:, axis], _look(axis)
+                panels[1].fill_between(
+                    way_m, shift - band, shift + band, color=look["color"], alpha=0.15, lw=0
                 )
-                axes.plot(way_m, shift, label=name, lw=1.1, **look)
-            rows["pose"].axhline(0, color=MUTED, lw=0.6)
-            rows["pose"].set_ylabel("correction (cm)")
-            rows["pose"].legend(loc="upper right", ncols=2, fontsize=8.5)
-        for axes in rows.values():
+                panels[1].plot(way_m, shift, label=name, lw=1.1, **look)
+            panels[1].axhline(0, color=MUTED, lw=0.6)
+            panels[1].set_ylabel("correction (cm)")
+            panels[1].legend(loc="upper right", ncols=2, fontsize=8.5)
+        for axes in panels:
             axes.grid(axis="y")
-            axes.set_xlim(0, max(float(way_m[-1]), 1.0))
-        list(rows.values())[-1].set_xlabel("way driven (m)")
+            axes.set_xlim(0, total)
+        panels[-1].set_xlabel("way driven (m)")
     return out[0]
-
-
-def _fit_along(axes: Axes, residuals: GroundResiduals, route: Route) -> None:
-    total = max(float(route.way_m[-1]), 1.0)
-    edges = np.linspace(0, total, int(np.clip(total / 5, 4, 80)) + 1)
-    way = np.interp(residuals.taken_s, route.stamp_s, route.way_m)
-    for number, name in enumerate(residuals.cameras):
-        own = (residuals.camera == number) & residuals.is_point
-        middle, rms = _rms_by(way[own], np.linalg.norm(residuals.residual_px[own], axis=1), edges)
-        axes.plot(middle, rms, label=name, lw=1.1, **_look(number))
-    axes.set_ylabel("RMS residual (px)")
-    axes.set_ylim(bottom=0)
-    axes.legend(loc="upper right", ncols=max(1, len(residuals.cameras)), fontsize=8.5)
 
 
 def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
@@ -293,7 +270,9 @@ def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
 
 
 def bar_chart(name: str, counts: Sequence[tuple[str, int]]) -> str:
-    """Counts by name, the largest first, as horizontal bars with their numbers."""
+    """Counts by name, the largest first, as horizontal bars with their numbers; empty for none."""
+    if not counts:
+        return ""
     with _chart(name, 7.2, 0.45 + 0.27 * len(counts)) as (figure, out):
         axes = figure.subplots()
         labels, values = [one for one, _ in counts], [count for _, count in counts]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,11 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
-from v2hdm.io.maps.features import features_of
+from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
 from v2hdm.report.metrics import way_along
-from v2hdm.store.files import load_json, load_yaml, read_text
+from v2hdm.store.files import load_json, load_yaml, read_text, take_number
 
 BEST = "Opt"
 """The method whose map is the run's result, as ``metrics.json`` names it."""
@@ -87,11 +87,6 @@ class Facts:
         """The figures of the result."""
         return dict(self.results.get(BEST, {}))
 
-    @property
-    def ids(self) -> list[int]:
-        """The ids of the map's markings, then lanes, then symbols."""
-        return [one.id for one in features_of(self.hd_map)] if self.hd_map else []
-
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read the result folder of a run; ``drive`` is the one that it mapped, if it is at hand.
@@ -104,18 +99,18 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
     metrics = load_json(folder / "metrics.json", MapFileError)
     sets = list(metrics.get("results") or {})
-    has_map = (folder / "map.geojson").is_file()
+    hd_map = read_geojson(folder / "map.geojson") if (folder / "map.geojson").is_file() else None
     excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
-    residuals = folder / RESIDUALS
-    config = folder / "config.yaml"
+    features = features_of(hd_map) if hd_map else []
+    residuals, config = folder / RESIDUALS, folder / "config.yaml"
     heading, *checked = _table(folder / "check_points.csv") or ((),)
     return Facts(
         folder=folder,
         metrics=metrics,
-        config=read_text(config, MapFileError) if config.is_file() else "",
-        hd_map=_with_ids(read_geojson(folder / "map.geojson")) if has_map else None,
+        config=read_text(config, MapFileError).strip() if config.is_file() else "",
+        hd_map=map_of(features, [one.id for one in features], hd_map.origin) if hd_map else None,
         excluded=tuple(one for one in excluded if not sets or one.cameras == sets[-1]),
-        cameras=_cameras(folder),
+        cameras=read_cameras(folder),
         route=_route(folder, drive),
         residuals=read_residuals(residuals) if residuals.is_file() else None,
         check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked),
@@ -124,23 +119,20 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
     )
 
 
-def _with_ids(hd_map: HdMap) -> HdMap:
-    ids = iter([one.id for one in features_of(hd_map)])
-    markings = tuple(replace(one, id=next(ids)) for one in hd_map.markings)
-    lanes = tuple(replace(one, id=next(ids)) for one in hd_map.lanes)
-    symbols = tuple(replace(one, id=next(ids)) for one in hd_map.symbols)
-    return replace(hd_map, markings=markings, lanes=lanes, symbols=symbols)
+def read_cameras(folder: Path) -> dict[str, CameraFacts]:
+    """The calibrations of a result folder by camera.
 
-
-def _cameras(folder: Path) -> dict[str, CameraFacts]:
+    Raises:
+        MapFileError: a file is damaged.
+    """
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
-        content = load_yaml(path, MapFileError)
-        calibration = read_calibration(path)
-        clock_s = (content.get("clock_offset_s"), content.get("clock_sigma_s"))
-        found[calibration.info.name] = CameraFacts(
-            calibration, *(float(one) if isinstance(one, int | float) else None for one in clock_s)
+        content, calibration = load_yaml(path, MapFileError), read_calibration(path)
+        clock_s = (
+            take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
+            for key in ("clock_offset_s", "clock_sigma_s")
         )
+        found[calibration.info.name] = CameraFacts(calibration, *clock_s)
     return found
 
 
@@ -149,9 +141,8 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
         return None
     adjusted = read_tum(folder / "trajectory.tum")
     path = folder / "trajectory_sigma.csv"
-    rows = _table(path)[1:]
     try:
-        table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
+        table = np.array(_table(path)[1:], dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
         raise MapFileError(f"{path}: not a line of 8 numbers for each pose of trajectory.tum") from None
     stamp_s, poses = adjusted.stamp_s, adjusted.map_from_vehicle
@@ -192,6 +183,11 @@ class GroundResiduals:
     distance_sigma: FloatArray
     range_m: FloatArray
     ground_m: FloatArray
+
+    @property
+    def size_px(self) -> FloatArray:
+        """Lengths (K,) of the residuals."""
+        return np.asarray(np.linalg.norm(self.residual_px, axis=1))
 
 
 def ground_residuals(facts: Facts) -> GroundResiduals | None:
@@ -234,18 +230,9 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
 
 def cams_from_map(residuals: Residuals, route: Route, calibrations: Mapping[str, Calibration]) -> FloatArray:
     """Where each image (I, 4, 4) was taken from, by the adjusted poses; nan for cameras not calibrated."""
-    frame = nearest_pose(route, residuals.taken_s)
+    nearest = np.searchsorted((route.stamp_s[1:] + route.stamp_s[:-1]) / 2, residuals.taken_s)
     out = np.full((len(residuals.image), 4, 4), np.nan)
     for i, name in enumerate(residuals.camera):
         if name in calibrations:
-            out[i] = calibrations[name].cam_from_vehicle @ inverse(route.flat[frame[i]])
+            out[i] = calibrations[name].cam_from_vehicle @ inverse(route.flat[nearest[i]])
     return out
-
-
-def nearest_pose(route: Route, taken_s: FloatArray) -> IntArray:
-    """The index (N,) of the pose nearest in time."""
-    after = np.clip(np.searchsorted(route.stamp_s, taken_s), 1, max(len(route.stamp_s) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(route.stamp_s) - 1)
-    later = np.abs(route.stamp_s[after] - taken_s) < np.abs(route.stamp_s[before] - taken_s)
-    return np.asarray(np.where(later, after, before))

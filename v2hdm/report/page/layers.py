@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +19,7 @@ from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 def jpeg(pixels: np.ndarray, quality: int) -> str:
     """An image (H, W, 3) BGR as JPEG in base64."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    return as_base64(cv2.imencode(".jpg", pixels, options)[1].tobytes())
+    return _coded(".jpg", pixels, *options)
 
 
 def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
@@ -30,9 +28,8 @@ def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
-def as_base64(content: bytes) -> str:
-    """Bytes as text."""
-    return base64.b64encode(content).decode("ascii")
+def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
+    return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
 
 EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
@@ -44,8 +41,7 @@ _QUALITY = 72
 _COMPARISON_WIDTH_PX = 1400
 
 
-@dataclass(frozen=True)
-class GroundPage:
+class GroundPage(NamedTuple):
     """The same ground before and after the optimisation (JPEG in base64), and what to see in it."""
 
     picture: str
@@ -64,24 +60,14 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     bounds = take_array(content.get("bounds_m"), (4,), f"{where}: bounds_m", MapFileError)
     path = folder / Path(take_text(content.get("image"), f"{where}: image", MapFileError)).name
     coded = path.read_bytes() if path.is_file() else b""
-    if path.suffix == ".webp" and 0 < len(as_base64(coded)) <= LARGEST_BYTES:
-        text = as_base64(coded)
-    else:
+    text = base64.b64encode(coded).decode("ascii") if path.suffix == ".webp" else ""
+    if not 0 < len(text) <= LARGEST_BYTES:
         pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_UNCHANGED) if coded else None
         if pixels is None:
             raise MapFileError(f"{path}: no picture that can be read; make the mosaic again")
-        text = _small_enough(pixels)
+        while len(text := _coded(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, _QUALITY)) > LARGEST_BYTES:
+            pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
     return {"src": text, "type": "image/webp", "bounds": bounds.tolist()}
-
-
-def _small_enough(pixels: np.ndarray) -> str:
-    """A picture in base64, as large as its budget allows."""
-    while True:
-        coded = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1].tobytes()
-        text = as_base64(coded)
-        if len(text) <= LARGEST_BYTES:
-            return text
-        pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
 
 
 def ground_page(folder: Path) -> GroundPage | None:
@@ -91,11 +77,10 @@ def ground_page(folder: Path) -> GroundPage | None:
     if pixels is None:
         return None
     shown = shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1]))
-    sharpness: Mapping[str, Any] = {}
-    if (folder / EXTENT).is_file():
-        content = load_json(folder / EXTENT, MapFileError)
-        sharpness = take_mapping(content.get("sharpness", {}), f"{folder / EXTENT}: sharpness", MapFileError)
     caption = "All images laid on the ground, by the initial and by the optimised calibration and poses."
+    extent = folder / EXTENT
+    content = load_json(extent, MapFileError) if extent.is_file() else {}
+    sharpness = take_mapping(content.get("sharpness", {}), f"{extent}: sharpness", MapFileError)
     if sharpness.get("edges"):
         before, after = (100 * float(sharpness[f"edge_width_{one}_m"]) for one in ("before", "after"))
         caption += (
@@ -161,7 +146,11 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             for one in facts.excluded
         ],
         "checks": _checks(facts),
-        "truth": _truth(facts),
+        "truth": facts.truth
+        and {
+            "markings": [_metres(one.corners_map) for one in facts.truth.map.markings],
+            "lanes": [_metres(one.points_map) for one in facts.truth.map.lanes],
+        },
         "route": {
             "adjusted": [] if route is None else _metres(route.map_from_vehicle[:, :2, 3]),
             "recorded": [] if route is None or route.recorded is None else _metres(route.recorded[:, :2, 3]),
@@ -186,11 +175,8 @@ def _errors(facts: Facts) -> dict[int, float]:
     if facts.truth is None or facts.hd_map is None:
         return {}
     mapped, true = facts.hd_map.markings, facts.truth.map.markings
-    rows, columns = match_markings(mapped, true)
-    found = {}
-    for row, column in zip(rows, columns, strict=True):
-        found[row] = rms(corner_errors([mapped[row]], [true[column]]))
-    return found
+    pairs = zip(*match_markings(mapped, true), strict=True)
+    return {row: rms(corner_errors([mapped[row]], [true[column]])) for row, column in pairs}
 
 
 def _checks(facts: Facts) -> list[dict[str, Any]]:
@@ -210,15 +196,6 @@ def _number(text: str | None) -> float | None:
         return float(text or "")
     except ValueError:
         return None
-
-
-def _truth(facts: Facts) -> dict[str, Any] | None:
-    if facts.truth is None:
-        return None
-    return {
-        "markings": [_metres(one.corners_map) for one in facts.truth.map.markings],
-        "lanes": [_metres(one.points_map) for one in facts.truth.map.lanes],
-    }
 
 
 def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:

@@ -12,7 +12,7 @@ import numpy as np
 from v2hdm.detection.batch import read_image
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.records import Drive, FloatArray, Image
+from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, shrunk
 
@@ -57,50 +57,39 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     """
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
-    images = {_name(image, facts.drive): image for image in facts.drive.images}
+    root = facts.drive.root
+    images = {  # by their names in residuals.csv
+        image.path.relative_to(root).as_posix() if image.path.is_relative_to(root) else str(image.path): image
+        for image in facts.drive.images
+    }
     calibrations = {name: one.calibration for name, one in facts.cameras.items()}
     cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
-    cuts = [cut for cut in _cuts(facts, cam_from_map) if cut.image in images]
-    cuts = sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]
-    made: list[tuple[int, str, dict[str, Any]]] = []
+    cuts = [*_of_markings(facts)]
+    for symbol in facts.hd_map.symbols:
+        cuts += _of_place(facts, cam_from_map, f"s{symbol.id}", symbol.outline_map)
+    for number, one in enumerate(facts.excluded):
+        cuts += _of_place(facts, cam_from_map, f"x{number}", one.position_map[None])
+    cuts = [cut for cut in cuts if cut.image in images]
     by_image: dict[str, list[_Cut]] = {}
-    for cut in cuts:
+    for cut in sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]:
         by_image.setdefault(cut.image, []).append(cut)
+    made: list[tuple[_Cut, dict[str, Any]]] = []
     for name, wanted in by_image.items():
         image = images[name]
         pixels = read_image(image, facts.drive.cameras[image.camera])
         for cut in wanted:
             picture = _cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
             if picture is not None:
-                made.append((cut.rank, cut.key, {**picture, "image": name}))
-    return _within_budget(made)
-
-
-def _within_budget(made: list[tuple[int, str, dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
-    """The best picture of everything first, then the second best, until the budget is spent."""
+                made.append((cut, {**picture, "image": name}))
+    # The best picture of everything first, then the second best, until the budget is spent.
     out: dict[str, list[dict[str, Any]]] = {}
     spent = 0
-    for _, key, picture in sorted(made, key=lambda one: one[0]):
+    for cut, picture in sorted(made, key=lambda one: one[0].rank):
         spent += len(picture["src"])
         if spent > BUDGET_BYTES:
             break
-        out.setdefault(key, []).append(picture)
+        out.setdefault(cut.key, []).append(picture)
     return out
-
-
-def _name(image: Image, drive: Drive) -> str:
-    """The image's name in ``residuals.csv``."""
-    path = image.path
-    return path.relative_to(drive.root).as_posix() if path.is_relative_to(drive.root) else str(path)
-
-
-def _cuts(facts: Facts, cam_from_map: FloatArray) -> Iterable[_Cut]:
-    assert facts.hd_map is not None
-    yield from _of_markings(facts)
-    for symbol in facts.hd_map.symbols:
-        yield from _of_place(facts, cam_from_map, f"s{symbol.id}", symbol.outline_map)
-    for number, one in enumerate(facts.excluded):
-        yield from _of_place(facts, cam_from_map, f"x{number}", one.position_map[None])
 
 
 def _of_markings(facts: Facts) -> Iterable[_Cut]:

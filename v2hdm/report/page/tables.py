@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,18 +17,15 @@ from v2hdm.report.page.layers import SIGMAS_95, ellipses
 from v2hdm.report.terminal import METHODS
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Rows of texts under their headings; ``numeric`` columns are set to the right."""
 
-    caption: str
-    headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    numeric: tuple[bool, ...]
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    numeric: Sequence[bool]
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """One number that a reader asks for: what, how much with its unit, and what it means."""
 
     name: str
@@ -38,18 +34,17 @@ class Figure:
     note: str
 
 
-def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> Table:
+def table(headings: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> Table:
     """A table whose first ``words`` columns are words and whose others are numbers."""
-    return Table(
-        caption, tuple(headings), tuple(tuple(row) for row in rows),
-        tuple(n >= words for n in range(len(headings))),
-    )  # fmt: skip
+    return Table(headings, rows, [n >= words for n in range(len(headings))])
 
 
-def number(value: object, digits: int, factor: float = 1.0) -> str:
-    """A number as text, a dash where there is none."""
+def number(value: object, digits: int | None = None, factor: float = 1.0) -> str:
+    """A number as text, with three significant digits unless told; a dash where there is none."""
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         return "–"
+    if digits is None:
+        digits = min(max(0, 2 - math.floor(math.log10(abs(value)))), 6) if value else 0
     return f"{factor * value:.{digits}f}".replace("-", "−")
 
 
@@ -63,26 +58,16 @@ def in_words(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def significant(value: object) -> str:
-    """A number with three digits that count."""
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    digits = max(0, 2 - math.floor(math.log10(abs(value))))
-    return number(value, min(digits, 6))
-
-
-def pair_table(caption: str, content: Mapping[str, Any]) -> Table | None:
+def pair_table(content: Mapping[str, Any]) -> Table | None:
     """Names and values as they stand in ``metrics.json``."""
     rows = [[name_of(str(key)), _plain(value)] for key, value in content.items()]
-    return Table(caption, ("", ""), tuple(tuple(row) for row in rows), (False, False)) if rows else None
+    return table(("", ""), rows, words=2) if rows else None
 
 
 def _plain(value: object) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(_plain(one) for one in value)
-    return significant(value) if isinstance(value, float) else str(value)
+    return number(value) if isinstance(value, float) else str(value)
 
 
 _LEAST_FOR_SHARE = 20  # corners from which a share of them is stated
@@ -110,11 +95,10 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         return ()
     markings, best = facts.hd_map.markings, facts.best
     lanes = best.get("lanes", {})
-    symbols = f"{in_words(len(facts.hd_map.symbols), 'symbol')} besides"
-    length = f"{number(lanes.get('length_m'), 0)} m together"
+    symbols, length = in_words(len(facts.hd_map.symbols), "symbol"), number(lanes.get("length_m"), 0)
     figures = [
-        Figure("Markings", str(len(markings)), "", symbols),
-        Figure("Lane lines", str(len(facts.hd_map.lanes)), "", length),
+        Figure("Markings", str(len(markings)), "", f"{symbols} besides"),
+        Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m together"),
     ]
     for name, values, note in (
         ("Between neighbours", relative_m(markings), "95 % of a corner’s error, relative"),
@@ -138,24 +122,16 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
 
 def accuracy_table(facts: Facts) -> Table | None:
     """By class how well the corners are known: half of them within, 95 % of them within."""
-    if facts.hd_map is None:
+    if facts.hd_map is None or not len(half_axes_m(facts.hd_map.markings)):
         return None
     by_kind = _by_kind(facts.hd_map.markings)
-    if not len(half_axes_m(facts.hd_map.markings)):
-        return None
     rows = []
     for name, own in [*by_kind.items(), *([("all", facts.hd_map.markings)] if len(by_kind) > 1 else [])]:
         sizes_m = (relative_m(own), half_axes_m(own))
-        shares = [_percentile(values, at) for values in sizes_m for at in (50, 95)]
+        shares = [np.percentile(one, at) if len(one) else None for one in sizes_m for at in (50, 95)]
         rows.append([name_of(name), str(len(own)), *(number(one, 1, 100) for one in shares)])
-    return table(
-        "95 % error of a corner as the adjustment states it (cm). Relative: what a marking adds to the "
-        "error of a distance to others about 10 m away (radius). Absolute: in the map’s frame, with the "
-        "drift of the poses (larger half axis). Each for the median corner and for the corner that 95 % are "
-        "better than.",
-        ("class", "markings", "relative, median", "relative, 95th", "absolute, median", "absolute, 95th"),
-        rows,
-    )
+    kinds = ("relative, median", "relative, 95th", "absolute, median", "absolute, 95th")
+    return table(("class", "markings", *kinds), rows)
 
 
 def truth_table(facts: Facts) -> Table | None:
@@ -170,13 +146,8 @@ def truth_table(facts: Facts) -> Table | None:
         errors = [number(found.get(key), 2, 100) for key in ("corner_rmse_m", "corner_bias_m")]
         false, inside = number(found.get("false_markings"), 0), number(_inside(own, facts), 0, 100)
         rows.append([name_of(name), str(len(own)), false, number(recall, 1, 100), *errors, inside])
-    return table(
-        "The drive was rendered, so the truth is known; the mapper never sees it. Recall counts markings "
-        "that were driven past in full view. The last column tests the stated accuracy: 95 is exact, more "
-        "is cautious, less is too bold.",
-        ("class", "markings", "false", "recall (%)", "RMSE (cm)", "bias (cm)", "in their 95 % ellipse (%)"),
-        rows,
-    )
+    errors_of = ("false", "recall (%)", "RMSE (cm)", "bias (cm)", "in their 95 % ellipse (%)")
+    return table(("class", "markings", *errors_of), rows)
 
 
 def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
@@ -186,11 +157,10 @@ def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
     squared: list[float] = []
     for row, column in zip(rows, columns, strict=True):
         covariance = markings[row].covariance_m2
-        if covariance is None:
-            continue
-        off = corner_errors([markings[row]], [facts.truth.map.markings[column]])
-        blocks = covariance.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
-        squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(blocks), off).tolist()
+        if covariance is not None:
+            off = corner_errors([markings[row]], [facts.truth.map.markings[column]])
+            blocks = covariance.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
+            squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(blocks), off).tolist()
     return None if len(squared) < _LEAST_FOR_SHARE else float(np.mean(np.array(squared) <= SIGMAS_95**2))
 
 
@@ -214,19 +184,15 @@ _CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
 def check_point_table(facts: Facts) -> Table | None:
     """Surveyed points that no estimate has seen, beside the map: what ``check_points.csv`` says of them."""
     rows = facts.check_points
-    shown = [name for name in _CHECK_COLUMNS if any(row.get(name) for row in rows)]
+    shown = {name: one for name, one in _CHECK_COLUMNS.items() if any(row.get(name) for row in rows)}
     if not shown:
         return None
-    return Table(
-        "Surveyed corners withheld from the adjustment: the map minus the survey.",
-        tuple(_CHECK_COLUMNS[name][0] for name in shown),
-        tuple(tuple(_check_cell(name, row.get(name, "")) for name in shown) for row in rows),
-        tuple(_CHECK_COLUMNS[name][1] is not None for name in shown),
-    )
+    cells = [[_check_cell(row.get(name, ""), *one[1:]) for name, one in shown.items()] for row in rows]
+    headings, factors, _ = zip(*shown.values(), strict=True)
+    return Table(headings, cells, [factor is not None for factor in factors])
 
 
-def _check_cell(name: str, text: str) -> str:
-    _, factor, digits = _CHECK_COLUMNS[name]
+def _check_cell(text: str, factor: float | None, digits: int) -> str:
     if factor is None:
         return text
     try:
@@ -249,12 +215,7 @@ def content_table(facts: Facts) -> Table | None:
             length = number(sum(length_m(one.points_map) for one in lanes) if lanes else None, 1)
             sightings = number(float(np.median([one.sightings for one in own])), 0)
             rows.append([name_of(name), form, str(len(own)), length, sightings])
-    return table(
-        "What the map holds. Sightings: images that show one of them, the median.",
-        ("class", "as", "count", "length (m)", "sightings"),
-        rows,
-        words=2,
-    )
+    return table(("class", "as", "count", "length (m)", "sightings"), rows, words=2)
 
 
 _AGAINST_TRUTH = {
@@ -275,19 +236,12 @@ def method_table(facts: Facts) -> Table | None:
         return None
     has_truth = any("recall" in row for row in facts.results.values())
     columns = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
-    rows = []
-    for name in METHODS:
-        row = facts.results.get(name)
-        if row is None:
-            continue
-        shown = [number(row.get(key), digits, factor) for key, digits, factor in columns.values()]
-        rows.append([name, METHODS[name], str(row.get("markings", "–")), *shown])
-    return table(
-        "The same drive by each method, all cameras together. Opt is the result of this report.",
-        ("", "method", "markings", *columns),
-        rows,
-        words=2,
-    )
+    rows = [
+        [name, METHODS[name], str(row.get("markings", "–"))]
+        + [number(row.get(key), digits, factor) for key, digits, factor in columns.values()]
+        for name, row in ((name, facts.results[name]) for name in METHODS if name in facts.results)
+    ]
+    return table(("", "method", "markings", *columns), rows, words=2)
 
 
 def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:
@@ -295,7 +249,7 @@ def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...
     rows = []
     for one in verdict.get(which) or []:
         unit = f" {one['unit']}" if one.get("unit") else ""
-        value, limit = (significant(one.get(key)) for key in ("value", "limit"))
+        value, limit = (number(one.get(key)) for key in ("value", "limit"))
         outcome = "untold" if which == "untold" else str(one["status"])
         measured = [text if text == "–" else f"{text}{unit}" for text in (value, limit)]
         rows.append((outcome, str(one["check"]), str(one["about"]), *measured, str(one["says"])))
@@ -307,9 +261,8 @@ def timing_table(facts: Facts) -> Table | None:
     seconds = facts.metrics.get("seconds") or {}
     if not seconds:
         return None
-    total = sum(float(one) for one in seconds.values())
-    rows = [[name, number(float(value), 1)] for name, value in seconds.items()]
-    return table("Time of each step of the run (s).", ("step", "s"), [*rows, ["together", number(total, 1)]])
+    steps = seconds | {"together": sum(float(one) for one in seconds.values())}
+    return table(("step", "s"), [[name, number(float(value), 1)] for name, value in steps.items()])
 
 
 def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
@@ -320,19 +273,14 @@ def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
     return dict(sorted(found.items(), key=lambda pair: -len(pair[1])))
 
 
-def _percentile(values: FloatArray, share: float) -> float:
-    return float(np.percentile(values, share)) if len(values) else math.nan
-
-
-@dataclass(frozen=True)
-class CameraPage:
+class CameraPage(NamedTuple):
     """One camera in the report: its words, its table, its picture (JPEG in base64)."""
 
     name: str
     words: str
     lens: str
     mounting: Table
-    picture: str | None = None
+    picture: str | None
 
 
 def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage, ...]:
@@ -358,26 +306,21 @@ def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
     unknown = np.full(3, np.nan)
     centre_sigma = unknown if covariance is None else centre_sigmas(matrix, covariance)
     angle_sigma = unknown if covariance is None else np.rad2deg(angle_sigmas(matrix, covariance))
-    rows = [
-        [f"centre {axis}", f"{number(centre[n], 3)} m", f"{number(centre_sigma[n], 1, 1e3)} mm",
-         _change(found.get(f"{key}_change_m"), 1e3, 0, "mm")]
-        for n, (axis, key) in enumerate((("forward", "x"), ("left", "y"), ("up", "z")))
-    ]  # fmt: skip
-    rows += [
-        [axis, f"{number(angles[n], 3)}°", f"{number(angle_sigma[n], 3)}°",
-         _change(found.get(f"{key}_change_deg"), 1.0, 2, "°")]
-        for n, (axis, key) in enumerate((("roll", "roll"), ("pitch, down", "pitch"), ("yaw, left", "yaw")))
-    ]  # fmt: skip
+    rows = []
+    for n, (axis, key) in enumerate((("forward", "x"), ("left", "y"), ("up", "z"))):
+        changed = _change(found.get(f"{key}_change_m"), 1e3, 0, " mm")
+        value, sigma = number(centre[n], 3), number(centre_sigma[n], 1, 1e3)
+        rows.append([f"centre {axis}", f"{value} m", f"{sigma} mm", changed])
+    for n, (axis, key) in enumerate((("roll", "roll"), ("pitch, down", "pitch"), ("yaw, left", "yaw"))):
+        changed = _change(found.get(f"{key}_change_deg"), 1.0, 2, "°")
+        rows.append([axis, f"{number(angles[n], 3)}°", f"{number(angle_sigma[n], 3)}°", changed])
     if one.clock_offset_s is not None:
-        rows.append([
-            "clock, images later", f"{number(one.clock_offset_s, 1, 1e3)} ms",
-            f"{number(one.clock_sigma_s, 1, 1e3)} ms", "–",
-        ])  # fmt: skip
-    return table("", ("", "value", "± 1 σ", "changed by"), rows)
+        offset, sigma = number(one.clock_offset_s, 1, 1e3), number(one.clock_sigma_s, 1, 1e3)
+        rows.append(["clock, images later", f"{offset} ms", f"{sigma} ms", "–"])
+    return table(("", "value", "± 1 σ", "changed by"), rows)
 
 
 def _change(value: object, factor: float, digits: int, unit: str) -> str:
     if not isinstance(value, int | float):
         return "–"
-    sign = "+" if value > 0 else ""
-    return f"{sign}{number(value, digits, factor)}{unit if unit == '°' else f' {unit}'}"
+    return f"{'+' if value > 0 else ''}{number(value, digits, factor)}{unit}"

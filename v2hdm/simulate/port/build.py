@@ -13,7 +13,8 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.rigid import camera_centre, rotation_from_euler
+from v2hdm.geometry.planar import winding
+from v2hdm.geometry.rigid import camera_centre, make_transform, rotation_from_euler
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
 from v2hdm.simulate.port.paint import Alteration, alter, build_layout
@@ -39,11 +40,8 @@ def camera_info(name: str, config: CameraConfig) -> CameraInfo:
 def cam_from_vehicle(mount: MountConfig) -> FloatArray:
     """The extrinsic (4 x 4) of a mount: the camera looks along x, then turns by yaw, pitch and roll."""
     angles = (np.deg2rad([a]) for a in (mount.roll_deg, mount.pitch_deg, mount.yaw_deg))
-    vehicle_from_cam = rotation_from_euler(*angles)[0] @ _FORWARD_LEFT_UP_FROM_OPTICAL
-    out = np.eye(4)
-    out[:3, :3] = vehicle_from_cam.T
-    out[:3, 3] = -vehicle_from_cam.T @ (mount.x_m, mount.y_m, mount.z_m)
-    return out
+    turned = (rotation_from_euler(*angles)[0] @ _FORWARD_LEFT_UP_FROM_OPTICAL).T
+    return make_transform(turned, -turned @ (mount.x_m, mount.y_m, mount.z_m))
 
 
 @dataclass(frozen=True)
@@ -61,17 +59,12 @@ def calibrate(
 ) -> ManualCalibration:
     """Calibrate a camera by hand: survey points on the ground, click them in the image, solve.
 
-    Raises:
-        ConfigError: when a point lies outside the image, or the points do not determine a homography.
+    Raises ConfigError when a point lies outside the image, or the points do not determine a homography.
     """
     yaw = np.deg2rad(mount.yaw_deg)
     ahead, left = np.array(config.points_ahead_m, dtype=np.float64).T
-    points = np.column_stack(
-        [
-            mount.x_m + ahead * np.cos(yaw) - left * np.sin(yaw),
-            mount.y_m + ahead * np.sin(yaw) + left * np.cos(yaw),
-        ]
-    )
+    x = mount.x_m + ahead * np.cos(yaw) - left * np.sin(yaw)
+    points = np.column_stack([x, mount.y_m + ahead * np.sin(yaw) + left * np.cos(yaw)])
     pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle(mount), points)
     clicked_px = distort_points(info, pinhole_px)
     clicked_px = clicked_px + rng.normal(0.0, config.click_sigma_px, points.shape)
@@ -79,10 +72,8 @@ def calibrate(
     outside = (clicked_px < 0).any(axis=1) | (clicked_px > (info.width - 1, info.height - 1)).any(axis=1)
     if outside.any():
         first_ahead, first_left = config.points_ahead_m[int(np.argmax(outside))]
-        raise ConfigError(
-            f"calibration.points_ahead_m: [{first_ahead:g}, {first_left:g}] is outside camera "
-            f"'{info.name}'; move it or the mount"
-        )
+        problem = f"[{first_ahead:g}, {first_left:g}] is outside camera '{info.name}'"
+        raise ConfigError(f"calibration.points_ahead_m: {problem}; move it or the mount")
     # Solved towards pixels, where the larger and equal errors are.
     pinhole_from_vehicle, _ = cv2.findHomography(surveyed, undistort_points(info, clicked_px), 0)
     if pinhole_from_vehicle is None:
@@ -90,29 +81,6 @@ def calibrate(
     ipm = np.linalg.inv(pinhole_from_vehicle)
     unit_ipm = np.asarray(ipm / np.linalg.norm(ipm))
     return ManualCalibration(surveyed, clicked_px, unit_ipm, convex_hull(surveyed))
-
-
-def survey_camera(
-    name: str,
-    config: CameraConfig,
-    calibration: CalibrationConfig,
-    initial_ipm: str,
-    rng: np.random.Generator,
-) -> tuple[Camera, ManualCalibration]:
-    """A camera as the mapper knows it (two IPMs, a region, a surveyed centre), and its manual calibration."""
-    info = camera_info(name, config)
-    own = calibrate(info, config.mount, calibration, rng)
-    borrowed = calibrate(info, config.borrowed_mount, calibration, rng)
-    centre = np.array([config.mount.x_m, config.mount.y_m, config.mount.z_m])
-    sigma = np.full(3, calibration.centre_sigma_m)
-    camera = Camera(
-        info=info,
-        ipm={"calibrated": own.ipm, "estimated": borrowed.ipm},
-        initial_ipm=initial_ipm,
-        roi_vehicle=own.roi_vehicle if initial_ipm == "calibrated" else borrowed.roi_vehicle,
-        centre_prior=CentrePrior(centre + rng.normal(0.0, sigma), sigma),
-    )
-    return camera, own
 
 
 _IPMS = ("calibrated", "estimated")
@@ -157,10 +125,9 @@ class Port:
             full_well_electrons=exposure.full_well_electrons,
             read_noise=exposure.read_noise,
         )
-        info, pose, motion = (
-            self.cameras[camera].info, self.cam_from_map(camera, frame), self._motion(camera, frame)
-        )  # fmt: skip
-        return self.renderer.render(info, pose, rng, optics, motion, self.moving_boxes(frame))
+        info, pose = self.cameras[camera].info, self.cam_from_map(camera, frame)
+        boxes = self.moving_boxes(frame)
+        return self.renderer.render(info, pose, rng, optics, self._motion(camera, frame), boxes)
 
     def jpeg(self, image_bgr: NDArray[np.uint8]) -> bytes:
         """The file that the vehicle would have recorded of a picture (H, W, 3)."""
@@ -174,14 +141,12 @@ class Port:
 
     def _motion(self, camera: str, frame: int) -> Motion:
         """The camera's motion on its way along the route, in its own frame."""
-        stamp = self.driven.stamp_s[frame : frame + 1]
-        speed = float(self.route.speed_at(stamp)[0])
-        station = self.route.station_at(stamp)
+        stamp, extrinsic = self.driven.stamp_s[frame : frame + 1], self.cam_from_vehicle[camera]
+        speed, station = float(self.route.speed_at(stamp)[0]), self.route.station_at(stamp)
         yaw_rate = speed * float(np.interp(station[0], self.route.station_m, self.route.curvature))
-        extrinsic = self.cam_from_vehicle[camera]
-        centre = camera_centre(extrinsic)
         turning = np.array([0.0, 0.0, yaw_rate])
-        velocity = extrinsic[:3, :3] @ (np.array([speed, 0.0, 0.0]) + np.cross(turning, centre))
+        moving = np.array([speed, 0.0, 0.0]) + np.cross(turning, camera_centre(extrinsic))
+        velocity = extrinsic[:3, :3] @ moving
         (vx, vy, vz), (wx, wy, wz) = velocity.tolist(), (extrinsic[:3, :3] @ turning).tolist()
         exposure_s = self.config.exposure.exposure_s
         return Motion(velocity_cam=(vx, vy, vz), angular_velocity_cam=(wx, wy, wz), exposure_s=exposure_s)
@@ -198,32 +163,34 @@ def _visit_seed(config: PortConfig, part: int) -> list[int]:
 def surveyed_cameras(config: PortConfig) -> dict[str, tuple[Camera, ManualCalibration]]:
     """The cameras of a port as the mapper gets to know them, and the manual calibration of each.
 
-    Raises:
-        ConfigError: the points of the calibration cannot be used.
+    Of a camera it knows two IPMs, a region and a surveyed centre. Raises ConfigError when the points of the
+    calibration cannot be used.
     """
     rng = np.random.default_rng([config.seed, _CALIBRATION])
-    return {
-        name: survey_camera(name, config.cameras[name], config.calibration, config.initial_ipm, rng)
-        for name in sorted(config.cameras)
-    }
+    sigma, surveyed = np.full(3, config.calibration.centre_sigma_m), {}
+    for name, camera in sorted(config.cameras.items()):
+        info, mount = camera_info(name, camera), camera.mount
+        own = calibrate(info, mount, config.calibration, rng)
+        borrowed = calibrate(info, camera.borrowed_mount, config.calibration, rng)
+        prior = CentrePrior(np.array([mount.x_m, mount.y_m, mount.z_m]) + rng.normal(0.0, sigma), sigma)
+        roi_vehicle = (own if config.initial_ipm == "calibrated" else borrowed).roi_vehicle
+        ipm = {"calibrated": own.ipm, "estimated": borrowed.ipm}
+        surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior), own
+    return surveyed
 
 
 def build_port(config: PortConfig) -> Port:
     """Build a port; equal configurations give equal ports.
 
-    Raises:
-        ConfigError: when values are out of range or contradict each other.
+    Raises ConfigError when values are out of range or contradict each other.
     """
     _check(config)
-
     streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD, _ALTERED)}
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
-        raise ConfigError(
-            f"port '{config.name}', route.pieces: {route.length_m:g} m in all; "
-            f"give {_SHORTEST_ROUTE_M:g} m or more"
-        )
+        problem = f"{route.length_m:g} m in all; give {_SHORTEST_ROUTE_M:g} m or more"
+        raise ConfigError(f"port '{config.name}', route.pieces: {problem}")
     layout = build_layout(config.paint, route, streams[_LAYOUT])
     layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
@@ -278,12 +245,5 @@ def _check(config: PortConfig) -> None:
 
 
 def _is_convex(shape: list[list[float]]) -> bool:
-    """Whether points make up a convex polygon that turns one way and once around."""
-    if len(shape) < 3 or any(len(point) != 2 for point in shape) or not np.isfinite(shape).all():
-        return False
-    side = np.roll(shape, -1, axis=0) - np.array(shape)
-    following = np.roll(side, -1, axis=0)
-    cross = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
-    turn = np.arctan2(cross, (side * following).sum(axis=1))
-    one_way = (turn > 0).all() or (turn < 0).all()
-    return bool(one_way and np.isclose(abs(turn.sum()), 2 * np.pi))
+    points = len(shape) >= 3 and all(len(point) == 2 for point in shape) and np.isfinite(shape).all()
+    return bool(points and winding(np.array(shape)))

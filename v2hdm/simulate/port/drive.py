@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -35,17 +36,8 @@ from v2hdm.store.files import whole_file
 from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
 
-_SAMPLES = 5
 _FARTHEST_M = 40.0
 _NEAR_M = 0.3
-
-
-def quad_samples(corners: FloatArray) -> FloatArray:
-    """A grid of points (J, 25, 2), each standing for an equal share of quadrilaterals (J, 4, 2)."""
-    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    s, t = (g.ravel()[None, :, None] for g in np.meshgrid(steps, steps))
-    a, b, c, d = (corners[:, k, None, :] for k in range(4))
-    return np.asarray((1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d)
 
 
 def points_seen(
@@ -55,17 +47,16 @@ def points_seen(
     centre = camera_centre(cam_from_map)
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
     seen[seen] = inside_image(info, cam_from_map, points_map[seen])
-    near = [b for b in boxes if _may_hide(b, cam_from_map, float(centre[2]))]
+    near = []
+    for box in boxes:
+        # Before the camera, near enough, and not above all its sight lines to the ground.
+        reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
+        depth = float(cam_from_map[2, :2] @ np.array(box.centre_map) + cam_from_map[2, 3])
+        if box.base_m < centre[2] and -reach < depth < _FARTHEST_M + reach:
+            near.append(box)
     if seen.any() and near:
         seen[seen] = ~hidden_by(near, centre, points_map[seen])
     return np.asarray(seen)
-
-
-def _may_hide(box: Box, cam_from_map: FloatArray, height_m: float) -> bool:
-    """Whether a box lies before the camera, near enough, and not above all its sight lines to the ground."""
-    reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
-    depth = float(cam_from_map[2, :2] @ np.array(box.centre_map) + cam_from_map[2, 3])
-    return box.base_m < height_m and -reach < depth < _FARTHEST_M + reach
 
 
 def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> BoolArray:
@@ -90,10 +81,8 @@ def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArr
         cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
         turn = np.array([[cos, -sin], [sin, cos]])
         eye = np.append((centre_map[:2] - box.centre_map) @ turn, centre_map[2] - box.base_m)
-        ground = np.column_stack(
-            [(points_map - box.centre_map) @ turn, np.full(len(points_map), -box.base_m)]
-        )
-        ray = ground - eye
+        ground = (points_map - box.centre_map) @ turn
+        ray = np.column_stack([ground, np.full(len(ground), -box.base_m)]) - eye
         half = np.array([box.size_m[0] / 2, box.size_m[1] / 2])
         low, high = np.append(-half, 0.0), np.append(half, box.size_m[2])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,18 +100,11 @@ _worker_port: Port | None = None
 
 
 def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Steps) -> Path:
-    """The folder of a port's drive in a cache, rendered now unless it was rendered before.
+    """The folder of a port's drive in a ``cache`` of such, rendered now unless it was rendered before.
 
-    Args:
-        config: the port.
-        cache: folder of all rendered drives.
-        workers: processes to render with; 1 renders in this one.
-        progress: called with the number of finished images and of all.
-
-    Raises:
-        ConfigError: when the configuration makes no port.
-        DriveError: when the cache cannot be written.
-        WorkerError: when a process died; what it had rendered is kept.
+    ``workers`` processes render, 1 in this one; ``progress`` is called with the number of finished images and
+    of all. Raises ConfigError when the configuration makes no port, DriveError when the cache cannot be
+    written, WorkerError when a process died; what it had rendered is kept.
     """
     folder = folder_of_port(config, cache)
     if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
@@ -162,36 +144,24 @@ def _drop_damaged(folder: Path) -> bool:
 def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps) -> None:
     """Render a port's drive into ``folder`` with its truth; see :func:`rendered_drive`."""
     port = build_port(config)
-    images = _images(port, folder)
+    images = [
+        Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
+        for frame, (stamp, pose) in enumerate(
+            zip(port.driven.stamp_s, port.driven.map_from_vehicle, strict=True)
+        )
+        for name in port.cameras
+    ]
     try:
         for name in port.cameras:
             (folder / name / "images").mkdir(parents=True, exist_ok=True)
         _render_all(port, images, workers, progress)
-        drive = Drive(
-            name=config.name,
-            root=folder,
-            cameras=port.cameras,
-            images=images,
-            pose_noise=pose_noise(config.disturbance, config.route.speed_mps),
-            origin=port.hd_map.origin,
-            truth_dir=folder / TRUTH_FOLDER,
-        )
-        write_truth(folder / TRUTH_FOLDER, _truth(port, images), images)
+        noise, truth_dir = pose_noise(config.disturbance, config.route.speed_mps), folder / TRUTH_FOLDER
+        drive = Drive(config.name, folder, port.cameras, images, noise, port.hd_map.origin, truth_dir)
+        write_truth(truth_dir, _truth(port, images), images)
         write_drive(folder, drive, port.driven.recorded)
     except OSError as failure:
-        raise DriveError(
-            f"{folder}: cannot write the rendered drive ({failure.strerror}); "
-            "free space or choose another cache"
-        ) from None
-
-
-def _images(port: Port, folder: Path) -> list[Image]:
-    driven = port.driven
-    return [
-        Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
-        for frame, (stamp, pose) in enumerate(zip(driven.stamp_s, driven.map_from_vehicle, strict=True))
-        for name in port.cameras
-    ]
+        problem = f"cannot write the rendered drive ({failure.strerror})"
+        raise DriveError(f"{folder}: {problem}; free space or choose another cache") from None
 
 
 def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) -> None:
@@ -200,20 +170,18 @@ def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) 
         for k, image in enumerate(images)
         if not image.path.is_file()
     ]
-    done = len(images) - len(jobs)
-    progress(done, len(images))
+    done = count(len(images) - len(jobs))
 
-    def count(_: object = None) -> None:
-        nonlocal done
-        done += 1
-        progress(done, len(images))
+    def report(_: object = None) -> None:
+        progress(next(done), len(images))
 
+    report()
     if workers <= 1 or len(jobs) < 2 * workers:
         for job in jobs:
             _write_picture(port, job)
-            count()
+            report()
     else:
-        share_out(_work, jobs, workers, _start_worker, (port.config,), count)
+        share_out(_work, jobs, workers, _start_worker, (port.config,), report)
 
 
 def _start_worker(config: PortConfig) -> None:
@@ -240,7 +208,11 @@ def _truth(port: Port, images: list[Image]) -> Truth:
     A lane vertex counts as seen when two images show it within their camera's region of interest.
     """
     corners = np.array([m.corners_map for m in port.hd_map.markings]).reshape(-1, 4, 2)
-    samples = quad_samples(corners)
+    # A grid of points (J, 25, 2), each standing for an equal share of its quadrilateral.
+    steps = (np.arange(5) + 0.5) / 5
+    s, t = (axis.ravel()[None, :, None] for axis in np.meshgrid(steps, steps))
+    a, b, c, d = (corners[:, k, None, :] for k in range(4))
+    samples = (1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d
     per_marking = samples.shape[1]
     vertices = [lane.points_map for lane in port.hd_map.lanes]
     points = np.vstack([samples.reshape(-1, 2), *vertices])

@@ -40,14 +40,15 @@ _ARROW_M = [
     np.array([[0.5, -0.35], [1.5, 0.0], [0.5, 0.35]]),
 ]
 _STOP_LINE_M = [np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])]
-# The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator.
+# The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator: two upright, three level.
 _LETTER_BARS_M = (
-    (-0.6, 0.6, 0.0, 0.1),
-    (-0.6, 0.6, 0.3, 0.4),
-    (-0.6, -0.5, 0.1, 0.3),
-    (-0.05, 0.05, 0.1, 0.3),
-    (0.5, 0.6, 0.1, 0.3),
+    *((-0.6, 0.6, 0.0, 0.1), (-0.6, 0.6, 0.3, 0.4)),
+    *((-0.6, -0.5, 0.1, 0.3), (-0.05, 0.05, 0.1, 0.3), (0.5, 0.6, 0.1, 0.3)),
 )
+
+
+_Place = tuple[FloatArray | tuple[float, float], float]  # centre and yaw in rad
+_Worn = tuple[float, float]  # wear and dirt
 
 
 @dataclass
@@ -69,10 +70,10 @@ class Layout:
 
     def is_free(self, centre: FloatArray, lines: FloatArray) -> bool:
         """Whether a marking at ``centre`` (2,) keeps clear of ``lines`` (N, 2) and of all other paint."""
-        for points, gap_m in ((lines, _LINE_GAP_M), (np.array(self.occupied_map), _LEAST_GAP_M)):
-            if len(points) and float(((points - centre) ** 2).sum(axis=1).min()) < gap_m**2:
-                return False
-        return True
+        gaps_m = ((lines, _LINE_GAP_M), (np.array(self.occupied_map), _LEAST_GAP_M))
+        return not any(
+            len(points) and ((points - centre) ** 2).sum(axis=1).min() < gap_m**2 for points, gap_m in gaps_m
+        )
 
 
 def build_layout(config: PaintConfig, route: Route, rng: np.random.Generator) -> Layout:
@@ -83,10 +84,9 @@ def build_layout(config: PaintConfig, route: Route, rng: np.random.Generator) ->
     for offset in config.dashed_offsets_m:
         painter.dashed_line(offset)
     painter.other_paint()
-    for offset in config.diamond_offsets_m:
-        painter.diamond_row(offset, False)
-    for offset in config.field_offsets_m:
-        painter.diamond_row(offset, True)
+    for is_field, offsets in ((False, config.diamond_offsets_m), (True, config.field_offsets_m)):
+        for offset in offsets:
+            painter.diamond_row(offset, is_field)
     for kind, stencil in config.stencils.items():
         painter.stencil_rows(kind, stencil)
     return painter.layout
@@ -100,14 +100,14 @@ class _Painter:
     layout: Layout
 
     def _paint(
-        self, kind: str, polygon: FloatArray, worn: tuple[float, float], seed: int, colour: Bgr = WHITE_PAINT
+        self, kind: str, polygon: FloatArray, worn: _Worn, seed: int, colour: Bgr = WHITE_PAINT
     ) -> None:
         wear, dirt = worn
         self.layout.paints.append(
             Paint(kind=kind, polygon_map=polygon, albedo_bgr=colour, wear=wear, dirt=dirt, seed=seed)
         )
 
-    def _worn(self) -> tuple[float, float]:
+    def _worn(self) -> _Worn:
         """Wear and dirt of one marking: gamma distributed about the means, never gone altogether."""
         wear = self.config.wear * float(self.rng.gamma(2.0, 0.5))
         dirt = self.config.dirt * float(self.rng.gamma(2.0, 0.5))
@@ -200,7 +200,7 @@ class _Painter:
                     beside = float(route.distance_to(centre[None])[0]) >= abs(offset_m) - 0.5
                     if at < route.length_m - 2.0 and beside and self.layout.is_free(centre, lines):
                         yaw = float(route.yaw_at(np.array([at]))[0]) + turned
-                        self._place(kind, shapes, centre, yaw, worn, colour)
+                        self._place(kind, shapes, (centre, yaw), worn, colour)
                         break
 
     def other_paint(self) -> None:
@@ -215,7 +215,7 @@ class _Painter:
                 at = station + rng.uniform(-2.0, 2.0)
                 offset = 0.0 if shapes is not None else float(rng.choice([-7.2, -3.5, 3.5, 7.2]))
                 drawn = shapes if shapes is not None else self._lettering()
-                self._place(kind, drawn, *route.pose_at(at, offset), self._worn(), self._colour())
+                self._place(kind, drawn, route.pose_at(at, offset), self._worn(), self._colour())
 
     def _lettering(self) -> list[FloatArray]:
         """Block letters of upright and level bars, as bay numbers are painted."""
@@ -229,16 +229,10 @@ class _Painter:
         return bars
 
     def _place(
-        self,
-        kind: str,
-        shapes: Sequence[FloatArray],
-        centre: FloatArray | tuple[float, float],
-        yaw_rad: float,
-        worn: tuple[float, float],
-        colour: Bgr,
+        self, kind: str, shapes: Sequence[FloatArray], place: _Place, worn: _Worn, colour: Bgr
     ) -> None:
         for shape in shapes:
-            polygon = placed(shape, centre, yaw_rad)
+            polygon = placed(shape, *place)
             self.layout.occupied_map.extend(polygon)
             self._paint(kind, polygon, worn, 7, colour)
             own = kind not in PAINT_CLASSES and len(shapes) == 1 and len(shape) == 4
@@ -343,21 +337,14 @@ class _Alterer:
 
 
 def _painted(layout: Layout, done: list[Alteration], rng: np.random.Generator) -> Layout:
-    altered = {id(one.before): one.after for one in done if one.before is not None}
-
-    def now(corners: FloatArray) -> FloatArray | None:
-        return altered.get(id(corners), corners)
-
-    paints = [
-        replace(one, polygon_map=polygon)
-        for one in layout.paints
-        if (polygon := now(one.polygon_map)) is not None
-    ]
-    markings = [
-        replace(one, corners_map=corners)
-        for one in layout.markings
-        if (corners := now(one.corners_map)) is not None
-    ]
+    now = {id(one.before): one.after for one in done if one.before is not None}
+    paints, markings = [], []
+    for paint in layout.paints:
+        if (polygon := now.get(id(paint.polygon_map), paint.polygon_map)) is not None:
+            paints.append(replace(paint, polygon_map=polygon))
+    for marking in layout.markings:
+        if (corners := now.get(id(marking.corners_map), marking.corners_map)) is not None:
+            markings.append(replace(marking, corners_map=corners))
     like = next((paint for paint in layout.paints if paint.kind == DIAMOND), None)
     for one in done:
         if one.before is None and one.after is not None and like is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
+from v2hdm.geometry.rigid import heading_rad, make_transform, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
@@ -128,44 +128,29 @@ def drive_along(
     stamp_s = np.round(times[:-1], 6)
     recorded_s = np.arange(0.0, times[-1], 1.0 / config.pose_rate_hz)
     stamp_s = stamp_s[stamp_s < recorded_s[-1]]
-    return DrivenPoses(
-        stamp_s, _true_poses(route, stamp_s, disturbance, rng), _recorded(route, recorded_s, disturbance, rng)
-    )
 
-
-def _true_poses(
-    route: Route, stamp_s: FloatArray, config: DisturbanceConfig, rng: np.random.Generator
-) -> FloatArray:
     station = route.station_at(stamp_s)
-    sigma = np.deg2rad(config.roll_pitch_deg) / np.sqrt(2.0)
-    jitter = correlated_noise(stamp_s, sigma, config.jitter_correlation_s, rng, 2)
+    sigma = np.deg2rad(disturbance.roll_pitch_deg) / np.sqrt(2.0)
+    jitter = correlated_noise(stamp_s, sigma, disturbance.jitter_correlation_s, rng, 2)
     jitter += rng.normal(0.0, sigma, (len(stamp_s), 2))
-    heave = correlated_noise(stamp_s, config.heave_m, config.jitter_correlation_s, rng)
-    return _poses(route.points_at(station), heave[:, 0], jitter[:, 0], jitter[:, 1], route.yaw_at(station))
+    heave = correlated_noise(stamp_s, disturbance.heave_m, disturbance.jitter_correlation_s, rng)
+    true = _poses(route.points_at(station), heave[:, 0], jitter, route.yaw_at(station))
 
-
-def _recorded(
-    route: Route, stamp_s: FloatArray, config: DisturbanceConfig, rng: np.random.Generator
-) -> Trajectory:
-    station = route.station_at(stamp_s)
+    station = route.station_at(recorded_s)
     points = route.points_at(station)
-    points = points + correlated_noise(station, config.rtk_correlated_m, config.rtk_correlation_m, rng, 2)
-    points += rng.normal(0.0, config.rtk_white_m, points.shape)
-    sigma = np.deg2rad(config.heading_deg) / np.sqrt(2.0)
-    yaw = route.yaw_at(station) + rng.normal(0.0, sigma, len(stamp_s))
-    yaw += correlated_noise(stamp_s, sigma, config.heading_correlation_s, rng)[:, 0]
-    zero = np.zeros(len(stamp_s))
-    return Trajectory(stamp_s=stamp_s, map_from_vehicle=_poses(points, zero, zero, zero, yaw))
+    points += correlated_noise(station, disturbance.rtk_correlated_m, disturbance.rtk_correlation_m, rng, 2)
+    points += rng.normal(0.0, disturbance.rtk_white_m, points.shape)
+    sigma = np.deg2rad(disturbance.heading_deg) / np.sqrt(2.0)
+    yaw = route.yaw_at(station) + rng.normal(0.0, sigma, len(recorded_s))
+    yaw += correlated_noise(recorded_s, sigma, disturbance.heading_correlation_s, rng)[:, 0]
+    level = np.zeros((len(recorded_s), 2))
+    return DrivenPoses(stamp_s, true, Trajectory(recorded_s, _poses(points, level[:, 0], level, yaw)))
 
 
-def _poses(
-    points: FloatArray, height: FloatArray, roll: FloatArray, pitch: FloatArray, yaw: FloatArray
-) -> FloatArray:
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    poses[:, :3, :3] = rotation_from_euler(roll, pitch, yaw)
-    poses[:, :2, 3] = points
-    poses[:, 2, 3] = height
-    return poses
+def _poses(points: FloatArray, height: FloatArray, tilt: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of points (N, 2), heights (N,), rolls and pitches (N, 2), and headings (N,)."""
+    rotation = rotation_from_euler(tilt[:, 0], tilt[:, 1], yaw)
+    return make_transform(rotation, np.column_stack([points, height]))
 
 
 def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,19 +12,8 @@ from numpy.typing import NDArray
 from v2hdm.records import FloatArray
 from v2hdm.simulate.port.config import SurfaceConfig, YardConfig
 from v2hdm.simulate.port.route import Route
-from v2hdm.simulate.render.scene import (
-    RECTANGLE,
-    Backdrop,
-    Bgr,
-    Box,
-    Ground,
-    GroundMarks,
-    Light,
-    Scene,
-    Shadow,
-    box_footprint,
-    placed,
-)
+from v2hdm.simulate.render import scene as parts
+from v2hdm.simulate.render.scene import RECTANGLE, Bgr, Box, box_footprint, placed
 
 _CONTAINER_M = (12.19, 2.44, 2.59)
 _CONTAINER_COLOURS: tuple[Bgr, ...] = (
@@ -36,8 +24,6 @@ _PATH_CLEARANCE_M = 3.0
 _RASTER_M = 0.05
 _RASTER_BORDER_M = 18.0
 _SUBPIXEL_BITS = 3
-
-_ToPixels = Callable[[FloatArray], NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
@@ -80,16 +66,15 @@ def _truck(centre_map: tuple[float, float], yaw_rad: float, colour: Bgr, seed: i
 
 def build_scene(
     surface: SurfaceConfig, yard: YardConfig, route: Route, rng: np.random.Generator, seed: int
-) -> Scene:
+) -> parts.Scene:
     """A port without its paint."""
     azimuth, elevation = np.deg2rad(yard.sun_azimuth_deg), np.deg2rad(yard.sun_elevation_deg)
     east, north = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
-    blue, green, red = (yard.sun_strength * channel for channel in Light().sun_bgr)
-    light = Light(
-        sun_direction_map=(float(east), float(north), float(np.sin(elevation))), sun_bgr=(blue, green, red)
-    )
+    blue, green, red = (yard.sun_strength * channel for channel in parts.Light().sun_bgr)
+    direction = (float(east), float(north), float(np.sin(elevation)))
+    light = parts.Light(sun_direction_map=direction, sun_bgr=(blue, green, red))
     a, slab_m = surface.albedo, (surface.slab_m[0], surface.slab_m[1])
-    ground = Ground(
+    ground = parts.Ground(
         albedo_bgr=(0.95 * a, a, 1.03 * a),
         texture=surface.texture,
         contrast=surface.contrast,
@@ -101,12 +86,12 @@ def build_scene(
         marks=_ground_marks(surface, route, rng),
         seed=seed,
     )
-    return Scene(
+    return parts.Scene(
         ground=ground,
         boxes=(*_stacks(yard, route, rng), *_occluders(yard, route, rng)),
         shadows=tuple(_strips(yard, route, rng)),
         light=light,
-        backdrop=Backdrop(seed=seed, haze_m=yard.haze_m),
+        backdrop=parts.Backdrop(seed=seed, haze_m=yard.haze_m),
     )
 
 
@@ -157,8 +142,7 @@ def _keeps_clear(box: Box, route: Route, others: list[Box], clearance_m: float) 
     for other in others:
         gap = np.hypot(*(np.array(other.centre_map) - box.centre_map))
         along = abs(np.cos(other.yaw_rad - box.yaw_rad)) > 0.99
-        needed = min(other.size_m[1], box.size_m[1]) if along else reach
-        if gap < needed:
+        if gap < (min(other.size_m[1], box.size_m[1]) if along else reach):
             return False
     return True
 
@@ -182,7 +166,7 @@ def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list
     return [box for box in boxes if float(route.distance_to(box_footprint(box)).min()) > 1.9]
 
 
-def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Shadow]:
+def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[parts.Shadow]:
     """Hard shadows of cranes, gantries and cables across the route."""
     strips = []
     for _ in range(yard.shadow_strips):
@@ -193,11 +177,11 @@ def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Sh
         length, width = rng.uniform(8.0, 30.0), rng.choice([0.15, 0.4, 0.9, 2.5])
         corners = RECTANGLE * (length / 2, width / 2)
         polygon = centre + corners[:, :1] * axis + corners[:, 1:] * across
-        strips.append(Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
+        strips.append(parts.Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
     return strips
 
 
-def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator) -> GroundMarks:
+def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator) -> parts.GroundMarks:
     """Tyre marks along the route, repaired patches and oil stains, as a raster of factors."""
     low = route.points_map.min(axis=0) - _RASTER_BORDER_M
     high = route.points_map.max(axis=0) + _RASTER_BORDER_M
@@ -208,7 +192,9 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
         return np.asarray(np.round((points_map - low) / _RASTER_M * 2**_SUBPIXEL_BITS), dtype=np.int32)
 
     for _ in range(surface.patches):
-        _patch(dark, pixels, route, rng)
+        centre, yaw = route.pose_at(rng.uniform(0.0, route.length_m), rng.uniform(-5.0, 5.0))
+        polygon = pixels(placed(RECTANGLE * rng.uniform(0.6, 3.0, 2), centre, yaw))
+        cv2.fillPoly(dark, [polygon], int(rng.uniform(6, 26)), cv2.LINE_AA, _SUBPIXEL_BITS)
     for _ in range(surface.oil_stains):
         centre, _ = route.pose_at(rng.uniform(0.0, route.length_m), rng.normal(0.0, 3.5))
         x, y = pixels(np.array(centre)).tolist()
@@ -217,25 +203,15 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
         cv2.ellipse(dark, (x, y), axes, turn, 0, 360, shade, -1, cv2.LINE_AA, 3)
     tracks = np.zeros_like(dark)
     for _ in range(int(40 * surface.tyre_marks)):
-        _tyre_marks(tracks, pixels, route, rng)
+        start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)
+        station = np.arange(start, min(start + length, route.length_m), 0.5)
+        if len(station) < 2:
+            continue
+        drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
+        shade, width = int(rng.uniform(8, 38)), int(rng.integers(4, 8))
+        for wheel in (-0.9, 0.9):
+            points = pixels(route.points_at(station, drift + wheel))
+            cv2.polylines(tracks, [points], False, shade, width, cv2.LINE_AA, _SUBPIXEL_BITS)
     soft = cv2.GaussianBlur(cv2.add(dark, tracks), (0, 0), 1.2)
     factor = np.asarray(np.clip(128 - soft.astype(np.int16), 40, 128), dtype=np.uint8)
-    return GroundMarks(factor=factor, origin_map=(float(low[0]), float(low[1])), resolution_m=_RASTER_M)
-
-
-def _patch(dark: NDArray[np.uint8], pixels: _ToPixels, route: Route, rng: np.random.Generator) -> None:
-    centre, yaw = route.pose_at(rng.uniform(0.0, route.length_m), rng.uniform(-5.0, 5.0))
-    polygon = placed(RECTANGLE * rng.uniform(0.6, 3.0, 2), centre, yaw)
-    cv2.fillPoly(dark, [pixels(polygon)], int(rng.uniform(6, 26)), cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _tyre_marks(dark: NDArray[np.uint8], pixels: _ToPixels, route: Route, rng: np.random.Generator) -> None:
-    start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)
-    station = np.arange(start, min(start + length, route.length_m), 0.5)
-    if len(station) < 2:
-        return
-    drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
-    shade, width = int(rng.uniform(8, 38)), int(rng.integers(4, 8))
-    for wheel in (-0.9, 0.9):
-        points = pixels(route.points_at(station, drift + wheel))
-        cv2.polylines(dark, [points], False, shade, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+    return parts.GroundMarks(factor=factor, origin_map=(float(low[0]), float(low[1])), resolution_m=_RASTER_M)

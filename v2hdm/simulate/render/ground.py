@@ -160,7 +160,9 @@ def sun_visibility(
 
 def _cast(shadow: Shadow, view: View, field: GroundField, out: Float32) -> None:
     polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
-    grown = polygon + 0.5 * shadow.softness_m * _outward(polygon)
+    away = polygon - polygon.mean(axis=0)
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    grown = polygon + 0.5 * shadow.softness_m * away
     shape = outline(view, view.homogeneous_px(np.column_stack([grown, np.zeros(len(grown))])))
     if shape is None:
         return
@@ -169,11 +171,6 @@ def _cast(shadow: Shadow, view: View, field: GroundField, out: Float32) -> None:
         soft = np.float32(1.0) / (np.float32(shadow.softness_m) + field.footprint_m[part])
         dark = _ground_coverage(polygon, field.x_m[part], field.y_m[part], soft)
         out[part] = np.minimum(out[part], np.float32(1.0) - dark * np.float32(1.0 - shadow.transmission))
-
-
-def _outward(polygon: NDArray[np.float64]) -> NDArray[np.float64]:
-    away = polygon - polygon.mean(axis=0)
-    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
 
 
 def _ground_coverage(polygon: NDArray[np.float64], x: Float32, y: Float32, sharpness: Float32) -> Float32:
@@ -263,22 +260,17 @@ def _opacity(
     shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
     flaking = _faded(_WEAR_TILE, x, y, footprint, shift)
     flaking += np.float32(0.7) * _faded(MEDIUM_TILE, x, y, footprint, shift)
-    threshold = np.float32(_normal_quantile(paint.wear) * 1.22)
+    # The standard normal quantile by Tukey's lambda approximation (0.14), good to 0.01 within +-2.5.
+    p = min(max(paint.wear, 1e-3), 1 - 1e-3)
+    threshold = np.float32(float((p**0.14 - (1 - p) ** 0.14) * 4.91) * 1.22)
     softness = np.float32(0.35) + footprint * np.float32(12.0)
     kept = np.clip((flaking - threshold) / softness + np.float32(0.5), 0, 1)
     grain = fine_tile("asphalt")
     tone = np.float32(1.0) + np.float32(0.06) * _faded(grain, x, y, footprint, shift)
     dirt = np.float32(paint.dirt) * np.clip(np.float32(0.8) - np.float32(0.4) * flaking, 0, 1.6)
-    return covered * kept * (np.float32(1.0) - np.float32(0.6) * dirt), tone * (
-        np.float32(1.0) - np.float32(0.4) * dirt
-    )
+    opacity = covered * kept * (np.float32(1.0) - np.float32(0.6) * dirt)
+    return opacity, tone * (np.float32(1.0) - np.float32(0.4) * dirt)
 
 
 def _faded(tile: Tile, x: Float32, y: Float32, footprint: Float32, shift: tuple[float, float]) -> Float32:
     return np.asarray(sample(tile, x, y, shift) * fade(tile, footprint))
-
-
-def _normal_quantile(fraction: float) -> float:
-    """The standard normal quantile by Tukey's lambda approximation (0.14), good to 0.01 within +-2.5."""
-    p = min(max(fraction, 1e-3), 1 - 1e-3)
-    return float((p**0.14 - (1 - p) ** 0.14) * 4.91)

@@ -19,14 +19,8 @@ from numpy.typing import NDArray
 
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.records import CameraInfo, FloatArray
-from v2hdm.simulate.render.ground import (
-    GroundField,
-    PaintLayer,
-    intersect_ground,
-    sun_visibility,
-    tone,
-    wetness,
-)
+from v2hdm.simulate.render import ground as on_ground
+from v2hdm.simulate.render.ground import GroundField, PaintLayer
 from v2hdm.simulate.render.scene import Box, Light, Scene, Shadow, box_shadow
 from v2hdm.simulate.render.surroundings import draw_background, draw_boxes
 from v2hdm.simulate.render.textures import Float32
@@ -93,7 +87,7 @@ class Renderer:
         """Radiance (H, W, 3) of sky and ground."""
         scene = self.scene
         height, width = labels.shape
-        ground = intersect_ground(view)
+        ground = on_ground.intersect_ground(view)
         if ground is None:
             return draw_background(view, scene.light, scene.backdrop, height)
         sky_rows = np.flatnonzero(~ground.below.all(axis=1))
@@ -103,18 +97,23 @@ class Renderer:
         if last_row:
             background = draw_background(view, scene.light, scene.backdrop, last_row)
             radiance[: ground.first_row] = background[: ground.first_row]
-            _haze(radiance, background, ground, last_row, scene.backdrop.haze_m)
+            # The ground's far rows fade into the background of the same pixels.
+            rows, part = slice(ground.first_row, last_row), slice(0, last_row - ground.first_row)
+            clear = np.exp(ground.depth_m[part] * np.float32(-1.0 / scene.backdrop.haze_m))
+            clear = np.where(ground.below[part], clear, 0)[..., None]
+            radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
         return radiance
 
     def _ground(
         self, view: View, ground: GroundField, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]
     ) -> Float32:
         scene = self.scene
-        bare = tone(scene.ground, ground)
+        bare = on_ground.tone(scene.ground, ground)
         albedo = [bare * np.float32(c) for c in scene.ground.albedo_bgr]
         self._paint.draw(view, ground, albedo, labels)
-        sun = sun_visibility(shadows, scene.dapples, view, ground)
-        return _lit(albedo, sun, wetness(scene.ground, ground), ground, view, scene.light)
+        sun = on_ground.sun_visibility(shadows, scene.dapples, view, ground)
+        wet = on_ground.wetness(scene.ground, ground)
+        return _lit(albedo, sun, wet, ground, view, scene.light)
 
 
 def _lit(
@@ -139,15 +138,6 @@ def _fresnel(ground: GroundField, view: View) -> Float32:
     grazing = np.float32(1.0) - np.maximum(sine, np.float32(0.12))
     squared = grazing * grazing
     return np.asarray(np.float32(0.02) + np.float32(0.45) * squared * squared * grazing)
-
-
-def _haze(radiance: Float32, background: Float32, ground: GroundField, last_row: int, haze_m: float) -> None:
-    """Let the ground's far rows fade into the background of the same pixels."""
-    rows = slice(ground.first_row, last_row)
-    part = slice(0, last_row - ground.first_row)
-    clear = np.exp(ground.depth_m[part] * np.float32(-1.0 / haze_m))
-    clear = np.where(ground.below[part], clear, 0)[..., None]
-    radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
 
 
 _CODE_STEPS = 16384

@@ -34,7 +34,9 @@ def draw_boxes(
     centre = view.centre_map
     if not boxes:
         return
-    corners = np.array([_corners(box) for box in boxes])
+    footprints = np.array([box_footprint(box) for box in boxes])
+    levels = np.array([[box.base_m, box.base_m + box.size_m[2]] for box in boxes])
+    corners = np.concatenate([np.insert(footprints, 2, level[:, None], axis=2) for level in levels.T], axis=1)
     visible = [boxes[k] for k in in_view(view, view.homogeneous_px(corners), _FARTHEST_M)]
 
     def distance(box: Box) -> float:
@@ -45,12 +47,6 @@ def draw_boxes(
         for face in _faces(box):
             if (centre - face.corners_map[0]) @ face.normal > 1e-3:
                 _draw_face(box, face, light, view, radiance, hidden)
-
-
-def _corners(box: Box) -> FloatArray:
-    """The eight corners (8, 3), lower ones first."""
-    footprint = box_footprint(box)
-    return np.vstack([np.insert(footprint, 2, box.base_m + up, axis=1) for up in (0.0, box.size_m[2])])
 
 
 def _faces(box: Box) -> list[_Face]:
@@ -99,12 +95,8 @@ def _tone(box: Box, face: _Face, view: View, window: Window) -> Float32:
     offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
     tone = np.float32(1.0) + np.float32(0.1) * sample(_DIRT_TILE, along_m, up_m * np.float32(0.35), offset)
     if box.corrugated and face.upright:
-        wave = np.sin(along_m * np.float32(2 * np.pi / _CORRUGATION_M))
-        tone += (
-            np.float32(0.16)
-            * np.clip(wave * np.float32(2.5), -1, 1)
-            / (np.float32(1.0) + (footprint * 20) ** 2)
-        )
+        wave = np.clip(np.sin(along_m * np.float32(2 * np.pi / _CORRUGATION_M)) * np.float32(2.5), -1, 1)
+        tone += np.float32(0.16) * wave / (np.float32(1.0) + (footprint * 20) ** 2)
     if face.upright:
         tone *= np.float32(0.8) + np.float32(0.2) * np.clip(up_m * np.float32(1.2), 0, 1)
     return np.asarray(np.clip(tone * np.float32(1.0), 0.2, 1.8))
@@ -113,23 +105,17 @@ def _tone(box: Box, face: _Face, view: View, window: Window) -> Float32:
 def _face_coordinates(face: _Face, view: View, window: Window) -> tuple[Float32, Float32, Float32]:
     """Metres along the face's first and last edge for each pixel of a window, and the size of a pixel."""
     origin, first, last = face.corners_map[0], face.corners_map[1], face.corners_map[3]
-    axes = np.column_stack([_unit(first - origin), _unit(last - origin)])
-    pinhole_from_face = view.rays.info.intrinsic @ np.column_stack(
-        [
-            view.cam_from_map[:3, :3] @ axes,
-            view.cam_from_map[:3, :3] @ origin + view.cam_from_map[:3, 3],
-        ]
-    )
+    sides = (first - origin, last - origin)
+    axes = np.column_stack([side / max(float(np.linalg.norm(side)), 1e-9) for side in sides])
+    rotation, translation = view.cam_from_map[:3, :3], view.cam_from_map[:3, 3]
+    cam_from_face = np.column_stack([rotation @ axes, rotation @ origin + translation])
+    pinhole_from_face = view.rays.info.intrinsic @ cam_from_face
     face_from_pinhole = np.linalg.inv(pinhole_from_face).astype(np.float32)
     u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
     a, b, w = (m[0] * u + m[1] * v + m[2] for m in face_from_pinhole)
     depth = np.float32(1.0) / np.where(np.abs(w) < 1e-6, np.float32(1e-6), w)
     footprint = np.abs(depth) * np.float32(1.0 / view.rays.info.intrinsic[0, 0])
     return np.clip(a * depth, -50, 50), np.clip(b * depth, -50, 50), footprint
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))
 
 
 _CLOUD_TILE = noise_tile(18, 3.0, 1.5)
@@ -158,12 +144,9 @@ def draw_background(view: View, light: Light, backdrop: Backdrop, last_row: int)
     out *= np.float32(1.0) + np.float32(0.05) * clouds
     blocks = max(int(2 * np.pi / backdrop.block_rad), 8)
     skyline = _skyline(backdrop.seed, blocks)
-    index = (
-        np.floor((azimuth + np.float32(np.pi)) * np.float32(blocks / (2 * np.pi))).astype(np.int32) % blocks
-    )
-    pixel_rad = 1.0 / view.rays.info.intrinsic[0, 0]
-    covered = np.clip(
-        (skyline[0][index] * np.float32(backdrop.height_rad) - elevation) / np.float32(pixel_rad) + 0.5, 0, 1
-    )
+    turn = (azimuth + np.float32(np.pi)) * np.float32(blocks / (2 * np.pi))
+    index = np.floor(turn).astype(np.int32) % blocks
+    above = skyline[0][index] * np.float32(backdrop.height_rad) - elevation
+    covered = np.clip(above / np.float32(1.0 / view.rays.info.intrinsic[0, 0]) + 0.5, 0, 1)
     wall = np.array(backdrop.albedo_bgr, dtype=np.float32) * skyline[1][index][..., None]
     return np.asarray(out + covered[..., None] * (wall - out), dtype=np.float32)

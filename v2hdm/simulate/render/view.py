@@ -43,14 +43,11 @@ class Rays:
 def _rays(width: int, height: int, intrinsic: bytes, model: str, distortion: tuple[float, ...]) -> Rays:
     k = np.frombuffer(intrinsic, dtype=np.float64).reshape(3, 3)
     info = CameraInfo("", width, height, k, model, distortion)
-    columns = np.arange(0, width + _GRID_STEP_PX, _GRID_STEP_PX, dtype=np.float64)
-    rows = np.arange(0, height + _GRID_STEP_PX, _GRID_STEP_PX, dtype=np.float64)
-    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+    sides = (np.arange(0, n + _GRID_STEP_PX, _GRID_STEP_PX, dtype=np.float64) for n in (width, height))
+    grid = np.stack(np.meshgrid(*sides), axis=-1)
     shift = (undistort_points(info, grid.reshape(-1, 2)).reshape(grid.shape) - grid).astype(np.float32)
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    dense = np.asarray(
-        cv2.remap(shift, u / _GRID_STEP_PX, v / _GRID_STEP_PX, cv2.INTER_LINEAR), dtype=np.float32
-    )
+    dense = cv2.remap(shift, u / _GRID_STEP_PX, v / _GRID_STEP_PX, cv2.INTER_LINEAR)
     u, v = u + dense[..., 0], v + dense[..., 1]
     bounds = (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
     return Rays(info, u, v, bounds)
@@ -141,15 +138,9 @@ def following_row(array: FloatArray) -> FloatArray:
 def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
     """The part (M, 3) of a homogeneous polygon in front of the camera and near the image."""
     u0, v0, u1, v1 = view.rays.bounds
-    limits = np.array(
-        [
-            [0.0, 0.0, 1.0],
-            [1.0, 0.0, _MARGIN_PX - u0],
-            [-1.0, 0.0, u1 + _MARGIN_PX],
-            [0.0, 1.0, _MARGIN_PX - v0],
-            [0.0, -1.0, v1 + _MARGIN_PX],
-        ]
-    )
+    sides = [[1.0, 0.0, _MARGIN_PX - u0], [-1.0, 0.0, u1 + _MARGIN_PX]]
+    sides += [[0.0, 1.0, _MARGIN_PX - v0], [0.0, -1.0, v1 + _MARGIN_PX]]
+    limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
     inside = polygon @ limits.T >= least
     if inside.all():
@@ -163,8 +154,6 @@ def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
 
 def _clip(polygon: FloatArray, line: FloatArray, least: float) -> FloatArray:
     """The part (M, 3) of a homogeneous polygon (N, 3) where ``line . p >= least`` (Sutherland-Hodgman)."""
-    if len(polygon) == 0:
-        return polygon
     inside = polygon @ line - least
     if (inside >= 0).all():
         return polygon
@@ -211,7 +200,12 @@ def coverage(view: View, shape: Outline, window: Window, grown_px: float = 0.0) 
     faces that share one.
     """
     u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
-    parts = [_edge_coverage(u, v, edge, grown_px) for edge in shape.edges]
+    parts: list[Float32] = []
+    for edge in shape.edges:
+        distance = u * np.float32(edge[0])
+        distance += v * np.float32(edge[1])
+        distance += np.float32(edge[2] + 0.5 + grown_px)
+        parts.append(np.clip(distance, 0, 1, out=distance))
     if len(parts) == 4:
         across = np.maximum(parts[0] + parts[2] - np.float32(1.0), 0)
         return np.asarray(across * np.maximum(parts[1] + parts[3] - np.float32(1.0), 0))
@@ -219,11 +213,3 @@ def coverage(view: View, shape: Outline, window: Window, grown_px: float = 0.0) 
     for part in parts[1:]:
         total += part
     return np.asarray(np.maximum(total, 0))
-
-
-def _edge_coverage(u: Float32, v: Float32, edge: FloatArray, grown_px: float) -> Float32:
-    a, b = np.float32(edge[0]), np.float32(edge[1])
-    distance = u * a
-    distance += v * b
-    distance += np.float32(edge[2] + 0.5 + grown_px)
-    return np.asarray(np.clip(distance, 0, 1, out=distance))

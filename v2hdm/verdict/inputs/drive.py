@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate
+from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
 from v2hdm.records import Drive
 from v2hdm.verdict.inputs import ground as ground_checks
@@ -60,7 +62,7 @@ HIDES: Mapping[str, tuple[str, ...]] = {
 
 
 def check_drive(
-    drive: Drive,
+    drive: Drive | str | Path,
     *,
     ground: bool | Mapping[str, GroundEstimate] = True,
     workers: int = 1,
@@ -69,14 +71,22 @@ def check_drive(
     """Check a drive before any long work: poses, clocks, noise, cameras, images, and bare ground.
 
     Args:
-        drive: the drive.
+        drive: the drive, or its folder.
         ground: whether to match bare ground (seconds a camera), or the estimates where they are at hand.
         workers: processes that match ground.
         progress: called as ``progress(done, total)`` cameras.
 
+    Returns:
+        All findings, the worst first: each with value, limit, unit, cause and remedy.
+
     Raises:
-        DriveError: an image cannot be read.
+        DriveError: the drive, or an image, cannot be read.
+
+    >>> verdict = check_drive(port, ground=False)
+    >>> verdict.status.value, len(verdict.raised)
+    ('PASS', 0)
     """
+    drive = as_drive(drive)
     if isinstance(ground, bool):
         ground = estimate_cameras(drive, workers, progress) if ground else {}
     return Verdict.of(input_findings(drive, ground))

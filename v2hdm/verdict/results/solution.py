@@ -15,7 +15,14 @@ import numpy as np
 
 from v2hdm.adjust import Fault
 from v2hdm.ground import GroundEstimate
-from v2hdm.mapping.recovery import CLOCK_OBSERVABLE_S, CONTRADICTED_SIGMAS, OBSERVABLE_SIGMA, is_contradicted
+from v2hdm.mapping.recovery import (
+    CLOCK_OBSERVABLE_S,
+    CONTRADICTED_SIGMAS,
+    OBSERVABLE_SIGMA,
+    is_contradicted,
+    is_physical,
+    log_odds,
+)
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.markings import TOO_UNCERTAIN
@@ -35,8 +42,8 @@ _REJECTED_LIMIT = 0.06
 # Variance of observations over the detector's statement: clean drives reach .2, no distortion 6.
 _VARIANCE_LIMIT = 3.0
 _WINDOW_LIMIT = 8.0  # the worst window of the route as a multiple of the median one: clean drives reach 2
-# Root mean square of a recorded pose's corrections, in its sigmas: at most 1 where these are right.
-_POSE_PULL_LIMIT = 1.4
+# Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
+_POSE_NOISE_LIMIT = 3.0
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
 # Sigma of the point that the poses are of, m, up to which a drive makes it observable.
 _LEVER_OBSERVABLE_M = 0.15
@@ -46,6 +53,13 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
     Fault.CLOCK: (
         "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
     ),
+    Fault.CLOCK_DRIFT: (
+        "clock drift", "give images the times at which they were taken, on the clock of the receiver",
+    ),
+    Fault.CROWN: ("crown", "keep to one side of the road's crown, or map the sides by themselves"),
+    Fault.COURSE: ("heading", "record the heading of the vehicle, as two antennas or an INS measure it"),
+    Fault.STEP: ("position step", "check the receiver's log there, and leave out what has no RTK fix"),
+    Fault.KNOCK: ("mounting", "fasten the camera, and map what was driven before and after by themselves"),
     Fault.FOCAL: (
         "focal length",
         "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
@@ -78,7 +92,9 @@ _CORRECTED_BY = {
     Fault.SIZE: "all known sizes were left out of the result",
 }
 
-_POSE_KEYS = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}
+_RIVAL_LOG_ODDS = float(np.log(10.0))
+"""A cause that is up to ten times less likely than the likeliest is named beside it."""
+
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 _MAP_AXES = ("east", "north")
 
@@ -136,7 +152,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     still = [one for one in evidence.score_tests if is_contradicted(one)]
     if still:
         # Other inputs would explain part of the same residuals: the one that explains most is named.
-        findings.append(_contradicted(still[0], still[1:]))
+        findings.append(_contradicted(still[0], still[1:]) if is_physical(still[0]) else _unknown(still[0]))
         raised.add(findings[-1].check)
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.score_tests:
@@ -158,8 +174,17 @@ def _corrected(one: Contradiction) -> Finding:
     )
 
 
+def _unknown(one: Contradiction) -> Finding:
+    """No input can be off by as much as would explain the residuals."""
+    says = (
+        "the markings contradict the inputs, and no wrong input of a plausible size explains them: compare "
+        "images and poses, in time and in place"
+    )
+    return Finding("cause unknown", Status.FAIL, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, "map")
+
+
 def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
-    rivals = [_words(other) for other in others if other.sigmas > 0.8 * one.sigmas]
+    rivals = [_words(other) for other in others if log_odds(other) > log_odds(one) - _RIVAL_LOG_ODDS]
     says = f"{_words(one)}{f' or {rivals[0]}' if rivals else ''} ({one.sigmas:.0f} sigmas)"
     return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
 
@@ -244,18 +269,18 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
             wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
             "left",
         )  # fmt: skip
-    if evidence.pose_innovations:
+    if evidence.pose_noise:
         yield from _poses(evidence)
 
 
 def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
-    state = max(evidence.pose_innovations, key=lambda name: evidence.pose_innovations[name])
-    pull = evidence.pose_innovations[state]
+    kind = max(evidence.pose_noise, key=lambda name: evidence.pose_noise[name])
+    factor = evidence.pose_noise[kind]
     yield judge(
-        "pose noise", "poses", pull, _POSE_PULL_LIMIT, "sigmas",
-        fine="the poses are as good as pose_noise says, or better",
-        wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map "
-        f"are too small; state a larger {_POSE_KEYS.get(state, 'position_m')}",
+        "pose noise", "poses", factor, _POSE_NOISE_LIMIT, "",
+        fine=f"the poses err {factor:.1f} times as much as pose_noise says, which map and tests allow for",
+        wrong=f"the poses err {factor:.1f} times as much as pose_noise.{kind} says: state it, or find out "
+        "why the receiver, or its clock, is worse than it says",
         status=Status.WARN,
     )  # fmt: skip
     yield judge(
@@ -296,6 +321,27 @@ def _words(one: Contradiction) -> str:
                 f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than stamped: their "
                 "clock is off"
             )
+        case Fault.CLOCK_DRIFT:
+            return (
+                f"the clock of the images of {whose} runs {'slow' if one.value > 0 else 'fast'}: by "
+                f"{1e3 * size:.0f} ms over the drive"
+            )
+        case Fault.CROWN:
+            way = "falls" if one.value > 0 else "rises"
+            return f"the ground {way} by {100 * size:.1f} % to both sides of the route, as on a crown"
+        case Fault.COURSE:
+            return (
+                f"the heading is not the vehicle's, but the course of a point {size:.1f} m "
+                f"{'ahead of' if one.value > 0 else 'behind'} the rear axle"
+            )
+        case Fault.STEP:
+            axis = _MAP_AXES[one.axis]
+            return f"the position steps by {100 * one.value:+.0f} cm {axis} and stays there, {one.about}"
+        case Fault.KNOCK:
+            turned = ("in roll", "in pitch", "in yaw")[one.axis]
+            cause = "by load" if len(one.cameras) > 1 else "as by a knock"
+            by = f"{np.rad2deg(size):.1f} deg {turned}"
+            return f"the mounting of {whose} is turned by {by} {one.about}, {cause}"
         case Fault.FOCAL:
             longer = "longer" if one.value > 0 else "shorter"
             return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -46,7 +46,14 @@ def kernel(function: _Function) -> _Function:
 
     Where nothing can be kept, or what was kept cannot be read, every process compiles anew.
     """
-    compiled = _kept(function)
+    folder, settings = _folder(), cast(Any, numba.config)
+    usual, settings.CACHE_DIR = settings.CACHE_DIR, str(folder or "")
+    try:
+        compiled: Callable[..., Any] = numba.njit(cache=folder is not None, **_OPTIONS)(function)
+    except (OSError, RuntimeError):  # numba has no use for the folder
+        compiled = numba.njit(**_OPTIONS)(function)
+    finally:
+        settings.CACHE_DIR = usual
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
@@ -58,23 +65,6 @@ def kernel(function: _Function) -> _Function:
             return compiled(*arguments)
 
     return call  # type: ignore[return-value]
-
-
-def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
-    folder = _folder()
-    compiled: Callable[..., Any] = numba.njit(**_OPTIONS)(function)
-    if folder is None:
-        return compiled
-    settings: Any = numba.config
-    usual = settings.CACHE_DIR
-    settings.CACHE_DIR = str(folder)
-    try:
-        kept: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)
-    except (OSError, RuntimeError):  # numba has no use for the folder
-        return compiled
-    finally:
-        settings.CACHE_DIR = usual
-    return kept
 
 
 @cache

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array, triu
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
-from v2hdm.adjust.engine import Evaluated
+from v2hdm.adjust.engine import Engine, Evaluated, Linearised
 from v2hdm.adjust.engines.numba import evaluate, frames, linearise, motion, observe
 from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.adjust.engines.numba.evaluate import Evaluation
-from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Layout, make_layout
+from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
 from v2hdm.adjust.engines.numba.pool import share
-from v2hdm.adjust.engines.numba.tables import Sums, cam_from_map, prior_blocks_of, spread_of, with_priors
+from v2hdm.adjust.engines.numba.tables import cam_from_map, prior_blocks_of, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
 from v2hdm.adjust.tiles import find_pattern
@@ -35,35 +36,17 @@ _CLEARLY_LESS = 0.5
 _PAIR_BLOCK = torch.triu_indices(6, 6)
 
 
-class NumbaEngine:
+class NumbaEngine(Engine):
     """The kernels over one problem's arrays."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        self._arrays = arrays
-        self._shape = (arrays.camera_count, arrays.frame_count, 6)
-
-    @property
-    def arrays(self) -> Arrays:
-        """The problem."""
-        return self._arrays
-
-    def over(self, arrays: Arrays) -> NumbaEngine:
-        """The engine over another problem."""
-        return NumbaEngine(arrays)
 
     @cached_property
     def _whole(self) -> Layout:
-        return make_layout(self._arrays)
+        return make_layout(self.arrays)
 
     @cached_property
     def layout(self) -> Layout:
         """The problem as kernels read it, with the corners marked that the plan keeps."""
         return self._with_kept(self._plan.kept)
-
-    @cached_property
-    def kept_run(self) -> Run:
-        """The observations of the corners that are kept."""
-        return self._arrays.gather(self._plan.kept)
 
     def share(self, work: Callable[[int, int], None]) -> None:
         """Call ``work(begin, end)`` for ranges of chunks that are all of them together."""
@@ -76,7 +59,7 @@ class NumbaEngine:
     @cached_property
     def _plan(self) -> Plan:
         """The cheapest: all corners eliminated first, in either order, or those of several drives kept."""
-        arrays, per_tile = self._arrays, frames_per_tile(self._arrays)
+        arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
         none, states = arrays.corner_order[:0], len(arrays.states)
         if not states:
             return Plan(per_tile, 0, 0, find_pattern(0, []), none)
@@ -99,13 +82,13 @@ class NumbaEngine:
         return best
 
     def _with_kept(self, kept: Tensor) -> Layout:
-        mask = np.zeros(self._arrays.corner_count, dtype=np.bool_)
+        mask = np.zeros(self.arrays.corner_count, dtype=np.bool_)
         mask[kept.numpy()] = True
         return self._whole._replace(kept=mask[self._whole.unit[:-1]])
 
     def _shared_corners(self) -> Tensor:
         """Corners (n,) that several drives observed, with those that known lengths join to them."""
-        arrays, layout = self._arrays, self._whole
+        arrays, layout = self.arrays, self._whole
         visit = arrays.visit[arrays.pair.long() % arrays.frame_count].numpy()
         begin = layout.begin[layout.unit[:-1]]
         shared = np.minimum.reduceat(visit, begin) < np.maximum.reduceat(visit, begin)
@@ -116,22 +99,22 @@ class NumbaEngine:
 
     def _coupled_tiles(self, layout: Layout, per_tile: int, tile_count: int) -> tuple[list[list[int]], int]:
         """The pairs of tiles that eliminated corners couple, and how many tiles a unit touches at most."""
-        counts = np.zeros(2, dtype=np.int64)
-        room = frames.Scratch.of(layout, tile_count, 0, 0)
-        frames.count_edges(layout, per_tile, room, counts)
-        edges = np.empty(counts[0], dtype=np.int64)
-        room.mark.fill(-1)
-        frames.list_edges(layout, per_tile, room, edges)
-        low, high = np.divmod(np.unique(edges), tile_count)
-        return np.stack([low, high], axis=1).tolist(), int(counts[1])
+        tile = layout.pair % layout.frames // per_tile
+        units, seen = len(layout.kept), layout.begin[layout.unit]
+        touched = csr_array((np.ones(len(tile), dtype=np.int32), tile, seen), shape=(units, tile_count))
+        touched.sum_duplicates()
+        touched = touched[~layout.kept]
+        touched.data[:] = 1
+        edges = np.stack(triu(touched.T @ touched, 1).nonzero(), axis=1)
+        return edges.tolist(), int(np.diff(touched.indptr).max(initial=0))
 
     def poses(self, estimate: Estimate) -> Tensor:
         """``cam_from_map`` of every pair, (C, J, 4, 4)."""
-        return cam_from_map(self._arrays, estimate)
+        return cam_from_map(self.arrays, estimate)
 
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
         """Corners (N, 2) by weighted back-projection from recorded poses, and which a ray fixes."""
-        arrays, count = self._arrays, self._arrays.corner_count
+        arrays, count = self.arrays, self.arrays.corner_count
         corners, fixed = np.empty((count, 2)), np.empty(count, dtype=np.bool_)
         state = torch.zeros_like(arrays.state_information_root)
         table = _table(self.poses(Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())))
@@ -150,14 +133,14 @@ class NumbaEngine:
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         count = len(self._whole.pair)
         out = observe.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
-        order, focal = self._arrays.order.numpy(), np.ascontiguousarray(focal_px)
+        order, focal = self.arrays.order.numpy(), np.ascontiguousarray(focal_px)
         self.share(lambda b, e: observe.report(b, e, self._whole, table, corners, order, focal, out))
         return out
 
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
         """The cost, by name."""
         spread = self.spread(estimate)
-        system = ReducedSystem(self._arrays, self.plan(), spread)
+        system = ReducedSystem(self.arrays, self.plan(), spread)
         return self.eliminate(system, estimate, robust, 0.0).terms
 
     def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
@@ -165,17 +148,19 @@ class NumbaEngine:
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         wrench, by_corner = np.zeros((len(table), 6)), np.zeros_like(corners)
         observe.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
-        gathered = self.spread(estimate).gather(torch.from_numpy(wrench).view(self._shape))
+        gathered = self.spread(estimate).gather(
+            torch.from_numpy(wrench).view(self.arrays.camera_count, -1, 6)
+        )
         camera = gathered.camera
         return Gradient(camera[:, :6], gathered.frame_state, torch.from_numpy(by_corner), camera[:, 6:])
 
     def spread(self, estimate: Estimate) -> Spread:
         """How pairs move with frame states and clock offsets."""
-        return spread_of(self._arrays, estimate)
+        return spread_of(self.arrays, estimate)
 
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
         """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
-        return prior_blocks_of(self._arrays, estimate)
+        return prior_blocks_of(self.arrays, estimate)
 
     def eliminate(
         self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
@@ -185,63 +170,65 @@ class NumbaEngine:
         Raises:
             AdjustError: corners that lengths join cannot be solved for together.
         """
-        arrays, layout, spread = self._arrays, self.layout, system.spread
-        table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
-        clock = _by_pair(spread.clock)
-        code, scale = LOSS_CODES[robust.name], float(robust.scale)
+        arrays, layout, spread = self.arrays, self.layout, system.spread
+        clock, width, pairs = _by_pair(spread.clock), system.tip, arrays.pair_count
         touched, chunks = len(layout.touched), len(layout.chunk) - 1
         owners = touched if system.by_pair else chunks * arrays.camera_count
         joined, states = np.diff(layout.unit), bool(arrays.states)
+        base = Base(
+            table=_table(self.poses(estimate)),
+            corners=_rows(estimate.corners_map),
+            code=LOSS_CODES[robust.name],
+            scale=float(robust.scale),
+            lower=np.empty((3, arrays.corner_count)),
+            joint=np.empty(int(4 * np.square(joined[joined > 1]).sum())),
+            rows=np.empty((0 if states else 2 * arrays.corner_count, width)),
+        )
         out = linearise.Linearisation(
             costs=np.zeros((chunks, 3)),
             wrench=np.zeros((touched, 6)),
             coupled=np.zeros((touched if states else 0, 6)),
-            carried=np.zeros((chunks, system.tip)),
-            rows=np.empty((0 if states else 2 * arrays.corner_count, system.tip)),
-            whitened=np.empty((arrays.corner_count, 2)),
-            lower=np.empty((3, arrays.corner_count)),
-            joint=np.empty(int(4 * np.square(joined[joined > 1]).sum())),
+            carried=np.zeros((chunks, width)),
+            whitened=np.empty(2 * arrays.corner_count),
             own=np.zeros((owners, 21)),
-            tip=np.zeros((chunks, system.tip, system.tip)),
+            tip=np.zeros((chunks, width, width)),
             failed=np.zeros(chunks),
         )
         growth, by_pair = 1.0 + damping, system.by_pair
 
-        def room() -> linearise.Scratch:
-            return linearise.Scratch.of(layout, len(table), system.tip)
+        def work(begin: int, end: int) -> None:
+            room = Scratch.of(layout, pairs, width)
+            linearise.linearise(begin, end, layout, base, clock, growth, by_pair, room, out)
 
-        self.share(
-            lambda b, e: linearise.linearise(
-                b, e, layout, table, clock, corners, code, scale, growth, by_pair, states, room(), out
-            )
-        )
+        self.share(work)
         if out.failed.any():
             raise AdjustError(INSEPARABLE)
         own = self.gather(out.own) if by_pair else out.own.reshape(chunks, -1, 21).sum(0)
         tip = torch.from_numpy(out.tip.sum(0))
         system.add(_symmetric(torch.from_numpy(own), arrays.camera_count), tip + tip.tril(-1).mT)
-        base = evaluate.Base(table, corners, out.lower, out.joint, out.rows)
         if len(system.plan.kept):
-            self._keep(system, base, robust)
+            self._keep(system, base)
         if states:
-            self._subtract_frames(base, code, scale, system)
-        terms, gradient = with_priors(arrays, estimate, spread, self.sums(out.costs, out.wrench))
+            self._subtract_frames(base, system)
+        terms, gradient = with_priors(
+            arrays, estimate, spread, torch.from_numpy(out.costs.sum(0)), self.pairs(out.wrench)
+        )
         return NumbaLinearised(
+            terms,
+            gradient,
+            _corner_factor(arrays, base),
+            torch.from_numpy(out.whitened).view(-1, 2),
+            self.coupled(out.coupled, out.carried, spread),
             self,
             base,
             estimate,
-            robust,
             spread,
-            terms,
-            gradient,
-            whitened=torch.from_numpy(out.whitened),
-            coupled=self.coupled(out.coupled, out.carried, spread),
         )
 
-    def _keep(self, system: ReducedSystem, base: evaluate.Base, robust: Loss) -> None:
+    def _keep(self, system: ReducedSystem, base: Base) -> None:
         """Add the kept corners' blocks, found where factors belong, to the system; factors are then 1."""
         layout, kept = self.layout, system.plan.kept
-        number = np.full(self._arrays.corner_count, -1)
+        number = np.full(self.arrays.corner_count, -1)
         number[kept.numpy()] = np.arange(len(kept))
         index, blocks = [], []
         for u in np.flatnonzero(layout.kept):
@@ -259,154 +246,121 @@ class NumbaEngine:
                     index.append((number[first + high], number[first + low]))
                     blocks.append(joint[high, :, low].copy())
             joint.reshape(2 * size, -1)[:] = np.eye(2 * size)
-        coupling = self.coupling(self.kept_run, base.table, base.corners[kept.numpy()], robust)
-        system.add_kept(
-            self.kept_run, coupling, torch.tensor(np.array(index).T), torch.from_numpy(np.array(blocks))
-        )
+        run = self.arrays.gather(kept)
+        coupling = self.coupling(run, base._replace(corners=base.corners[kept.numpy()]))
+        system.add_kept(run, coupling, torch.tensor(np.array(index).T), torch.from_numpy(np.array(blocks)))
 
-    def coupling(self, run: Run, table: FloatArray, corners: FloatArray, robust: Loss) -> Tensor:
-        """W' (k, 2, 6) of a run's observations, of corners (n, 2)."""
+    def coupling(self, run: Run, base: Base) -> Tensor:
+        """W' (k, 2, 6) of a run's observations, whose corners (n, 2) are the base's."""
         layout = self._whole._replace(
             pair=run.pair.to(torch.int32).numpy(),
             measured=_rows(run.measured),
             root=_rows(run.root_information),
         )
-        code, scale, out = LOSS_CODES[robust.name], float(robust.scale), np.empty((len(run.pair), 12))
-        observe.couplings(layout, table, run.corner.numpy(), corners, code, scale, np.empty(16), out)
+        out = np.empty((len(run.pair), 12))
+        observe.couplings(layout, base, run.corner.numpy(), np.empty(16), out)
         return torch.from_numpy(out).view(-1, 2, 6)
 
-    def _subtract_frames(self, base: evaluate.Base, code: int, scale: float, system: ReducedSystem) -> None:
-        plan, matrix, spread = system.plan, system.matrix, system.spread
-        pattern, layout = plan.pattern, self.layout
-        below_at = np.zeros(plan.tile_count + 1, dtype=np.int64)
-        np.cumsum([len(rows) for rows in pattern.below], out=below_at[1:])
+    def _subtract_frames(self, base: Base, system: ReducedSystem) -> None:
+        plan, matrix, spread, layout = system.plan, system.matrix, system.spread, self.layout
+        column, row = np.divmod(matrix.keys, plan.tile_count + 1)
         tiles = frames.TileMap(
             per_tile=plan.frames_per_tile,
             size=plan.size,
-            position=np.array(pattern.position, dtype=np.int64),
-            diagonal_at=np.array(matrix.diagonal_at, dtype=np.int64),
-            panel_at=np.array(matrix.panel_at, dtype=np.int64),
-            below=np.array([row for rows in pattern.below for row in rows], dtype=np.int64),
-            below_at=below_at,
+            position=plan.position.numpy(),
+            begin=np.searchsorted(column, np.arange(plan.tile_count)),
+            row=row,
+            at=matrix.at,
         )
         by_state, clock = _by_pair(spread.state), _by_pair(spread.clock)
-        each, values = self._arrays.camera_unknowns, matrix.values.numpy()
+        each, values = self.arrays.camera_unknowns, matrix.values.numpy()
         cuts = np.linspace(0, plan.tile_count, min(_COLUMN_RANGES, plan.tile_count) + 1).astype(int)
-        width = plan.most_tiles * tiles.size + system.tip
 
         def work(begin: int, end: int) -> None:
-            room = frames.Scratch.of(layout, plan.frame_tiles, plan.most_tiles, width)
+            marks = np.full((5, plan.tile_count + 1), -1)
+            room = Scratch.of(layout, 0, plan.most_tiles * plan.size + system.tip)
             frames.subtract_frames(
-                cuts[begin], cuts[end], layout, base, tiles, by_state, clock, each, code, scale, room, values
+                cuts[begin], cuts[end], layout, base, tiles, by_state, clock, each, marks, room, values
             )
 
         share(work, len(cuts) - 1, len(layout.pair))
 
-    def sums(self, costs: FloatArray, wrench: FloatArray) -> Sums:
-        """Sums over the chunks, (Q, 3) and (R, 6)."""
-        observed, control, lengths = torch.from_numpy(costs.sum(0))
-        return Sums(observed, control, lengths, self._pairs(wrench))
-
     def coupled(self, by_pair: FloatArray, carried: FloatArray, spread: Spread) -> Coupled:
         """W V^-1 g, from what chunks add up by pair (R, 6) or by the cameras' unknowns (Q, D)."""
-        if self._arrays.states:
-            return spread.gather(self._pairs(by_pair))
-        cameras = torch.from_numpy(carried.sum(0)).view(self._arrays.camera_count, -1)
-        return Coupled(cameras.new_zeros(self._arrays.frame_count, 0), cameras)
+        if self.arrays.states:
+            return spread.gather(self.pairs(by_pair))
+        cameras = torch.from_numpy(carried.sum(0)).view(self.arrays.camera_count, -1)
+        return Coupled(cameras.new_zeros(self.arrays.frame_count, 0), cameras)
 
-    def _pairs(self, parts: FloatArray) -> Tensor:
-        return torch.from_numpy(self.gather(parts)).view(self._shape)
+    def pairs(self, parts: FloatArray) -> Tensor:
+        """Sums (C, J, n) of the chunks' (R, n)."""
+        return torch.from_numpy(self.gather(parts)).view(self.arrays.camera_count, -1, 6)
 
     def gather(self, parts: FloatArray) -> FloatArray:
         """Sums (P, n) of the chunks' (R, n) by the pairs that they touch."""
-        out = np.zeros((self._arrays.pair_count, parts.shape[1]))
+        out = np.zeros((self.arrays.pair_count, parts.shape[1]))
         _gather(self._whole.touched, parts, out)
         return out
 
 
-class NumbaLinearised:
-    """A problem linearised by kernels, its corners eliminated: :class:`v2hdm.adjust.engine.Linearised`."""
+@dataclass(frozen=True)
+class NumbaLinearised(Linearised):
+    """A problem linearised by kernels, its corners eliminated."""
 
-    def __init__(
-        self,
-        engine: NumbaEngine,
-        base: evaluate.Base,
-        estimate: Estimate,
-        robust: Loss,
-        spread: Spread,
-        terms: dict[str, Tensor],
-        gradient: Gradient,
-        whitened: Tensor,
-        coupled: Coupled,
-    ) -> None:
-        self._engine, self._base, self._estimate, self._robust = engine, base, estimate, robust
-        self._spread, self.terms, self.gradient = spread, terms, gradient
-        self.whitened, self.coupled = whitened, coupled
-        self.corner_factor = _corner_factor(engine.arrays, base)
+    engine: NumbaEngine
+    base: Base
+    estimate: Estimate
+    spread: Spread
 
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""
-        engine, base, before = self._engine, self._base, self._estimate
-        arrays, layout = engine.arrays, engine.layout
+        engine, base, before, arrays = self.engine, self.base, self.estimate, self.engine.arrays
         cameras, chart = motion.move(_rows(step.extrinsic), _rows(before.cam_from_vehicle))
-        at = Estimate(
-            torch.from_numpy(cameras),
-            before.frame_state + step.frame_state,
-            before.corners_map,
-            before.clock_s + step.clock_s,
-        )
-        table, whitened = _table(engine.poses(at)), _rows(own)
+        state, clock = before.frame_state + step.frame_state, before.clock_s + step.clock_s
+        at = Estimate(torch.from_numpy(cameras), state, before.corners_map, clock)
+        table, whitened = _table(engine.poses(at)), _rows(own.reshape(-1))
         moved = _rows(tangents.reshape(-1, 6)) if arrays.states else np.empty((0, 6))
-        by_camera = _rows(torch.cat([step.extrinsic, step.clock_s], dim=1)).ravel()
-        code, scale, out = *self._loss, self._room(len(by_camera))
+        by_camera = _rows(torch.cat([step.extrinsic, step.clock_s], dim=1).ravel())
+        layout, out, pairs = engine.layout, self._room(), len(table)
 
         def work(begin: int, end: int) -> None:
-            room = evaluate.Scratch.of(layout, len(table))
-            evaluate.evaluate(
-                begin, end, layout, base, table, moved, by_camera, whitened, code, scale, room, out
-            )
+            room = Scratch.of(layout, pairs)
+            evaluate.evaluate(begin, end, layout, base, table, moved, by_camera, whitened, room, out)
 
         engine.share(work)
-        sums = engine.sums(out.costs, out.wrench)
-        terms, gradient = with_priors(arrays, at, engine.spread(at), sums)
+        costs, wrench = torch.from_numpy(out.costs.sum(0)), engine.pairs(out.wrench)
+        terms, gradient = with_priors(arrays, at, engine.spread(at), costs, wrench)
         by_tangent = (torch.from_numpy(chart).mT @ gradient.extrinsic[..., None])[..., 0]
-        return Evaluated(
-            replace(at, corners_map=torch.from_numpy(out.corners)),
-            terms,
-            replace(gradient, extrinsic=by_tangent),
-            torch.from_numpy(out.whitened),
-            engine.coupled(out.coupled, out.carried, self._spread),
-        )
+        at = replace(at, corners_map=torch.from_numpy(out.corners))
+        return Evaluated(at, terms, replace(gradient, extrinsic=by_tangent), *self._carried(out))
 
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""
-        engine, base, layout, rows = self._engine, self._base, self._engine.layout, _rows(by_corner)
-        code, scale, out = *self._loss, self._room(base.rows.shape[1])
+        layout, base, rows, out = self.engine.layout, self.base, _rows(by_corner), self._room()
 
         def work(begin: int, end: int) -> None:
-            room = evaluate.Scratch.of(layout, len(base.table))
-            evaluate.carry(begin, end, layout, base, rows, code, scale, room, out)
+            evaluate.carry(begin, end, layout, base, rows, Scratch.of(layout, len(base.table)), out)
 
-        engine.share(work)
-        return torch.from_numpy(out.whitened), engine.coupled(out.coupled, out.carried, self._spread)
+        self.engine.share(work)
+        return self._carried(out)
 
     def coupling(self, run: Run, corners_map: Tensor) -> Tensor:
         """W' (k, 2, 6) of a run's observations."""
-        return self._engine.coupling(run, self._base.table, _rows(corners_map), self._robust)
+        return self.engine.coupling(run, self.base._replace(corners=_rows(corners_map)))
 
-    @property
-    def _loss(self) -> tuple[int, float]:
-        return LOSS_CODES[self._robust.name], float(self._robust.scale)
+    def _carried(self, out: Evaluation) -> tuple[Tensor, Coupled]:
+        coupled = self.engine.coupled(out.coupled, out.carried, self.spread)
+        return torch.from_numpy(out.whitened).view(-1, 2), coupled
 
-    def _room(self, width: int) -> Evaluation:
-        chunks, touched = len(self._engine.layout.chunk) - 1, len(self._engine.layout.touched)
-        return evaluate.Evaluation(
+    def _room(self) -> Evaluation:
+        chunks, touched = len(self.engine.layout.chunk) - 1, len(self.engine.layout.touched)
+        return Evaluation(
             costs=np.zeros((chunks, 3)),
             wrench=np.zeros((touched, 6)),
-            coupled=np.zeros((touched if self._engine.arrays.states else 0, 6)),
-            carried=np.zeros((chunks, width)),
-            corners=np.empty_like(self._base.corners),
-            whitened=np.empty_like(self._base.corners),
+            coupled=np.zeros((touched if self.engine.arrays.states else 0, 6)),
+            carried=np.zeros((chunks, self.base.rows.shape[1])),
+            corners=np.empty_like(self.base.corners),
+            whitened=np.empty(self.base.corners.size),
         )
 
 
@@ -428,7 +382,7 @@ def _gather(touched: IntArray, parts: FloatArray, out: FloatArray) -> None:
             out[touched[i], p] += parts[i, p]
 
 
-def _corner_factor(arrays: Arrays, base: evaluate.Base) -> CornerFactor:
+def _corner_factor(arrays: Arrays, base: Base) -> CornerFactor:
     """The kernels' factors of V for torch, on the same memory."""
     if not len(base.joint):
         return CornerFactor(torch.from_numpy(base.lower), ())

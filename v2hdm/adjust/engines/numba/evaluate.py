@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from v2hdm.adjust.engine import WEIGHT_FLOOR
 from v2hdm.adjust.engines.numba.build import inlined, kernel
 from v2hdm.adjust.engines.numba.inline import (
     add_corner_priors,
     add_force,
     add_loss,
     along_axes,
+    floored,
     number_touched,
     see,
     solve_unit,
@@ -21,46 +19,14 @@ from v2hdm.adjust.engines.numba.inline import (
     weigh,
     whiten,
 )
-from v2hdm.adjust.engines.numba.layout import Layout
-from v2hdm.records import FloatArray, IntArray
-
-
-class Base(NamedTuple):
-    """Where a whitening was made: its pairs' table (P, 16), corners (N, 2), and the factors of V.
-
-    ``rows`` is L^-1 W' (2 N, D) where frames have no states; else it is computed anew, by observation.
-    """
-
-    table: FloatArray
-    corners: FloatArray
-    lower: FloatArray
-    joint: FloatArray
-    rows: FloatArray
-
-
-class Scratch(NamedTuple):
-    """The workspace of :func:`evaluate`: numbers of pairs (P,), a unit's observations and steps."""
-
-    slot: IntArray
-    known: FloatArray
-    step: FloatArray
-    gradient: FloatArray
-
-    @classmethod
-    def of(cls, layout: Layout, pairs: int) -> Scratch:
-        """Room for any chunk."""
-        return cls(
-            np.empty(pairs, dtype=np.int32),
-            np.empty((layout.most_seen, 8)),
-            np.empty(2 * layout.most_joined),
-            np.empty(2 * layout.most_joined),
-        )
+from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
+from v2hdm.records import FloatArray
 
 
 class Evaluation(NamedTuple):
     """The output of :func:`evaluate`, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
 
-    ``corners`` (N, 2) are those moved; ``whitened`` (N, 2) is the gradient by their whitened variables.
+    ``corners`` (N, 2) are those moved; ``whitened`` (2 N,) is the gradient by their whitened variables.
     """
 
     costs: FloatArray
@@ -81,42 +47,33 @@ def _oppose(known: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple
 
 
 @inlined
-def _recall(
-    layout: Layout,
-    table: FloatArray,
-    k: int,
-    x: float,
-    y: float,
-    code: int,
-    scale: float,
-    known: FloatArray,
-    i: int,
-) -> None:
+def _recall(layout: Layout, base: Base, k: int, c: int, known: FloatArray, i: int) -> None:
     """Write a linearised observation (8,): point, inverse depth, slope, weighted information at depth 1."""
-    px, py, pz, inverse, slope, u, v = see(layout, table, k, x, y)
-    a, b, c = layout.root[0, k], layout.root[1, k], layout.root[2, k]
+    px, py, pz, inverse, slope, u, v = see(layout, base.table, k, base.corners[c, 0], base.corners[c, 1])
+    a, b, d = layout.root[0, k], layout.root[1, k], layout.root[2, k]
     weight = 1.0
-    if code:
+    if base.code:
         r0, r1 = whiten(layout, k, u, v)
-        weight = weigh(code, scale, r0 * r0 + r1 * r1)
-        weight = WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight
+        weight = floored(weigh(base, r0 * r0 + r1 * r1))
     known[i, 0], known[i, 1], known[i, 2], known[i, 3], known[i, 4] = px, py, pz, inverse, slope
-    known[i, 5], known[i, 6], known[i, 7] = (a * a + b * b) * weight, b * c * weight, c * c * weight
+    known[i, 5], known[i, 6], known[i, 7] = (a * a + b * b) * weight, b * d * weight, d * d * weight
 
 
 @inlined
-def _carry_back(
-    layout: Layout,
-    base: Base,
-    u: int,
-    gradient: FloatArray,
-    known: FloatArray,
-    slot: IntArray,
-    coupled: FloatArray,
+def _carry(
+    layout: Layout, base: Base, q: int, u: int, coupled: bool, scratch: Scratch, out: Evaluation
 ) -> None:
-    """Add W V^-1 g of unit u to the pairs', of its whitened gradient L^-1 g (2g,), which is overwritten."""
+    """Whiten the gradient of unit u of chunk q, and add W V^-1 g to the pairs' or to the cameras'."""
+    slot, _, _, known, _, _, gradient, _ = scratch
     first, last = layout.unit[u], layout.unit[u + 1]
-    solve_unit_transposed(last - first, base.lower, first, base.joint, layout.joint_at[u], gradient)
+    solve_unit(layout, base, u, gradient)
+    for i in range(2 * (last - first)):
+        out.whitened[2 * first + i] = gradient[i]
+        for p in range(base.rows.shape[1] if len(base.rows) else 0):
+            out.carried[q, p] += base.rows[2 * first + i, p] * gradient[i]
+    if not coupled:
+        return
+    solve_unit_transposed(layout, base, u, gradient)
     for c in range(first, last):
         x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
@@ -128,7 +85,7 @@ def _carry_back(
                 base.table[t, 4] * x + base.table[t, 5] * y,
                 base.table[t, 8] * x + base.table[t, 9] * y,
             )
-            add_force(coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
+            add_force(out.coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
 
 
 @kernel
@@ -138,33 +95,21 @@ def carry(
     layout: Layout,
     base: Base,
     by_corner: FloatArray,
-    code: int,
-    scale: float,
     scratch: Scratch,
     out: Evaluation,
 ) -> None:
     """Whiten a gradient (N, 2) by the corners of chunks ``begin`` to ``end``; see :func:`evaluate`."""
-    slot, known, _, gradient = scratch
-    states = len(base.rows) == 0
     for q in range(begin, end):
-        number_touched(layout, q, slot)
+        number_touched(layout, q, scratch.slot)
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
-            first, last = layout.unit[u], layout.unit[u + 1]
-            for c in range(first, last):
-                gradient[2 * (c - first)], gradient[2 * (c - first) + 1] = by_corner[c, 0], by_corner[c, 1]
-            solve_unit(last - first, base.lower, first, base.joint, layout.joint_at[u], gradient)
-            for c in range(first, last):
+            first = layout.unit[u]
+            coupled = len(base.rows) == 0 and not layout.kept[u]
+            for c in range(first, layout.unit[u + 1]):
                 i = 2 * (c - first)
-                out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
-                for p in range(0 if states else base.rows.shape[1]):
-                    out.carried[q, p] += base.rows[2 * c, p] * gradient[i]
-                    out.carried[q, p] += base.rows[2 * c + 1, p] * gradient[i + 1]
-            if states and not layout.kept[u]:
-                for c in range(first, last):
-                    x, y = base.corners[c, 0], base.corners[c, 1]
-                    for k in range(layout.begin[c], layout.begin[c + 1]):
-                        _recall(layout, base.table, k, x, y, code, scale, known, k - layout.begin[first])
-                _carry_back(layout, base, u, gradient, known, slot, out.coupled)
+                scratch.gradient[i], scratch.gradient[i + 1] = by_corner[c, 0], by_corner[c, 1]
+                for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
+                    _recall(layout, base, k, c, scratch.known, k - layout.begin[first])
+            _carry(layout, base, q, u, coupled, scratch, out)
 
 
 @kernel
@@ -177,8 +122,6 @@ def evaluate(
     motion: FloatArray,
     cameras: FloatArray,
     own: FloatArray,
-    code: int,
-    scale: float,
     scratch: Scratch,
     out: Evaluation,
 ) -> None:
@@ -192,32 +135,27 @@ def evaluate(
         table: of the pairs (P, 16) after the step.
         motion: the step as left tangents (P, 6) of the pairs, where frames have states.
         cameras: that of the cameras' unknowns (D,).
-        own: the whitened variables (N, 2) of the corners.
-        code: the loss.
-        scale: of the loss.
+        own: the whitened variables (2 N,) of the corners.
         scratch: room to work in.
         out: where the results go.
     """
-    slot, known, step, gradient = scratch
+    slot, _, _, known, _, step, gradient, _ = scratch
     states = len(base.rows) == 0
     for q in range(begin, end):
         number_touched(layout, q, slot)
         total, product = 0.0, 1.0
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
             first, last = layout.unit[u], layout.unit[u + 1]
-            size, seen = last - first, layout.begin[first]
-            joint_at = layout.joint_at[u]
             coupled = states and not layout.kept[u]
             for c in range(first, last):
-                x, y = base.corners[c, 0], base.corners[c, 1]
                 sx = sy = 0.0
                 if not states:
                     for p in range(len(cameras)):
                         sx += base.rows[2 * c, p] * cameras[p]
                         sy += base.rows[2 * c + 1, p] * cameras[p]
                 for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
-                    j, t = k - seen, layout.pair[k]
-                    _recall(layout, base.table, k, x, y, code, scale, known, j)
+                    j, t = k - layout.begin[first], layout.pair[k]
+                    _recall(layout, base, k, c, known, j)
                     fx, fy, fz = _oppose(
                         known,
                         j,
@@ -231,11 +169,10 @@ def evaluate(
                 i = 2 * (c - first)
                 step[i], step[i + 1] = sx, sy
             if coupled:
-                solve_unit(size, base.lower, first, base.joint, joint_at, step)
-            for c in range(first, last):
-                i = 2 * (c - first)
-                step[i], step[i + 1] = own[c, 0] - step[i], own[c, 1] - step[i + 1]
-            solve_unit_transposed(size, base.lower, first, base.joint, joint_at, step)
+                solve_unit(layout, base, u, step)
+            for i in range(2 * (last - first)):
+                step[i] = own[2 * first + i] - step[i]
+            solve_unit_transposed(layout, base, u, step)
             for c in range(first, last):
                 i = 2 * (c - first)
                 x, y = base.corners[c, 0] + step[i], base.corners[c, 1] + step[i + 1]
@@ -245,8 +182,8 @@ def evaluate(
                     px, py, pz, inverse, slope, du, dv = see(layout, table, k, x, y)
                     r0, r1 = whiten(layout, k, du, dv)
                     squared = r0 * r0 + r1 * r1
-                    total, product = add_loss(code, scale, squared, total, product)
-                    weight = weigh(code, scale, squared)
+                    total, product = add_loss(base, squared, total, product)
+                    weight = weigh(base, squared)
                     w0, w1 = weight * r0, weight * r1
                     fu = layout.root[0, k] * w0 + layout.root[1, k] * w1
                     fv = layout.root[2, k] * w1
@@ -257,16 +194,7 @@ def evaluate(
                     add_force(out.wrench, slot[layout.pair[k]], px, py, pz, fx, fy, fz)
                 gradient[i], gradient[i + 1] = gx, gy
             add_corner_priors(layout, u, out.corners, gradient, out.costs[q])
-            solve_unit(size, base.lower, first, base.joint, joint_at, gradient)
-            for c in range(first, last):
-                i = 2 * (c - first)
-                out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
-                if not states:
-                    for p in range(len(cameras)):
-                        out.carried[q, p] += base.rows[2 * c, p] * gradient[i]
-                        out.carried[q, p] += base.rows[2 * c + 1, p] * gradient[i + 1]
-            if coupled:
-                _carry_back(layout, base, u, gradient, known, slot, out.coupled)
-        if code == 2:
-            total += scale * scale * math.log(product)
+            _carry(layout, base, q, u, coupled, scratch, out)
+        if base.code == 2:
+            total += base.scale * base.scale * math.log(product)
         out.costs[q, 0] = total / 2

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 from v2hdm.adjust.corner_factor import CORNER_FLOOR, PIVOT_FLOOR
+from v2hdm.adjust.engine import WEIGHT_FLOOR
 from v2hdm.adjust.engines.numba.build import inlined
-from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.layout import Base, Layout
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
@@ -31,15 +32,8 @@ def see(layout: Layout, table: FloatArray, k: int, x: float, y: float) -> _Seen:
     reciprocal = 1.0 / near
     slope = -reciprocal * reciprocal
     inverse = reciprocal + slope * (pz - near)
-    return (
-        px,
-        py,
-        pz,
-        inverse,
-        slope,
-        px * inverse - layout.measured[0, k],
-        py * inverse - layout.measured[1, k],
-    )
+    u, v = px * inverse - layout.measured[0, k], py * inverse - layout.measured[1, k]
+    return px, py, pz, inverse, slope, u, v
 
 
 @inlined
@@ -49,27 +43,33 @@ def whiten(layout: Layout, k: int, u: float, v: float) -> tuple[float, float]:
 
 
 @inlined
-def weigh(code: int, scale: float, squared: float) -> float:
+def weigh(base: Base, squared: float) -> float:
     """The derivative of the loss."""
-    if code == 0:
+    if base.code == 0:
         return 1.0
-    cut = scale * scale
-    if code == 1:
-        return 1.0 if squared <= cut else scale / math.sqrt(squared)
+    cut = base.scale * base.scale
+    if base.code == 1:
+        return 1.0 if squared <= cut else base.scale / math.sqrt(squared)
     weight = cut / (cut + squared)
-    return weight if code == 2 else weight * weight
+    return weight if base.code == 2 else weight * weight
 
 
 @inlined
-def add_loss(code: int, scale: float, squared: float, total: float, product: float) -> tuple[float, float]:
+def floored(weight: float) -> float:
+    """A weight as the Hessian has it."""
+    return WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight
+
+
+@inlined
+def add_loss(base: Base, squared: float, total: float, product: float) -> tuple[float, float]:
     """Add the loss to a total, the Cauchy loss as a factor of a product: one logarithm for many."""
-    if code == 0:
+    if base.code == 0:
         return total + squared, product
-    cut = scale * scale
-    if code == 1:
-        return total + (squared if squared <= cut else 2 * scale * math.sqrt(squared) - cut), product
+    cut = base.scale * base.scale
+    if base.code == 1:
+        return total + (squared if squared <= cut else 2 * base.scale * math.sqrt(squared) - cut), product
     ratio = squared / cut
-    if code == 3:
+    if base.code == 3:
         return total + squared / (1 + ratio), product
     if not ratio < _LARGE:
         return total + cut * math.log1p(ratio), product
@@ -127,21 +127,26 @@ def length_residual(layout: Layout, m: int, corners: FloatArray) -> tuple[float,
 
 
 @inlined
-def factorise_unit(
-    size: int, block: FloatArray, growth: float, lower: FloatArray, c: int, joint: FloatArray, at: int
-) -> bool:
-    """Factorise a unit's block (2g, 2g): into column c of ``lower`` (3, N), or ``joint`` from ``at`` on."""
-    n = 2 * size
+def unit_of(layout: Layout, u: int) -> tuple[int, int, int]:
+    """Twice a unit's number of corners, the first of them, and where its factor begins if they are joined."""
+    first = layout.unit[u]
+    return 2 * (layout.unit[u + 1] - first), first, layout.joint_at[u]
+
+
+@inlined
+def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray, growth: float) -> bool:
+    """Factorise a unit's block (2g, 2g): into ``base.lower``, or ``base.joint`` where corners are joined."""
+    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
     for i in range(n):
         block[i, i] = block[i, i] * growth + CORNER_FLOOR
-    if size == 1:
+    if n == 2:
         first = math.sqrt(block[0, 0])
         below = block[1, 0] / first
         rest = block[1, 1] - below * below
         least = PIVOT_FLOOR * block[1, 1]
         lower[0, c], lower[1, c], lower[2, c] = first, below, math.sqrt(least if rest < least else rest)
         return True
-    for i in range(size):
+    for i in range(n // 2):
         lower[0, c + i], lower[1, c + i], lower[2, c + i] = 1.0, 0.0, 1.0
     for i in range(n):
         for j in range(i + 1):
@@ -160,27 +165,27 @@ def factorise_unit(
 
 
 @inlined
-def keep_unit(size: int, block: FloatArray, lower: FloatArray, c: int, joint: FloatArray, at: int) -> None:
+def keep_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> None:
     """Write a unit's block as it is, in the place of its factor."""
-    n = 2 * size
-    if size == 1:
-        lower[0, c], lower[1, c] = block[0, 0] + CORNER_FLOOR, block[1, 0]
-        lower[2, c] = block[1, 1] + CORNER_FLOOR
-        return
+    n, c, at = unit_of(layout, u)
     for i in range(n):
         block[i, i] += CORNER_FLOOR
+    if n == 2:
+        base.lower[0, c], base.lower[1, c], base.lower[2, c] = block[0, 0], block[1, 0], block[1, 1]
+        return
+    for i in range(n):
         for j in range(n):
-            joint[at + i * n + j] = block[i, j] if j <= i else 0.0
+            base.joint[at + i * n + j] = block[i, j] if j <= i else 0.0
 
 
 @inlined
-def solve_unit(size: int, lower: FloatArray, c: int, joint: FloatArray, at: int, right: FloatArray) -> None:
+def solve_unit(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
     """L^-1 b in the place of b (2g,)."""
-    if size == 1:
+    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    if n == 2:
         right[0] /= lower[0, c]
         right[1] = (right[1] - lower[1, c] * right[0]) / lower[2, c]
         return
-    n = 2 * size
     for i in range(n):
         rest = right[i]
         for m in range(i):
@@ -189,15 +194,13 @@ def solve_unit(size: int, lower: FloatArray, c: int, joint: FloatArray, at: int,
 
 
 @inlined
-def solve_unit_transposed(
-    size: int, lower: FloatArray, c: int, joint: FloatArray, at: int, right: FloatArray
-) -> None:
+def solve_unit_transposed(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
     """L^-T b in the place of b (2g,)."""
-    if size == 1:
+    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    if n == 2:
         right[1] /= lower[2, c]
         right[0] = (right[0] - lower[1, c] * right[1]) / lower[0, c]
         return
-    n = 2 * size
     for i in range(n - 1, -1, -1):
         rest = right[i]
         for m in range(i + 1, n):
@@ -206,17 +209,15 @@ def solve_unit_transposed(
 
 
 @inlined
-def solve_unit_rows(
-    size: int, lower: FloatArray, c: int, joint: FloatArray, at: int, rows: FloatArray, begin: int, end: int
-) -> None:
+def solve_unit_rows(layout: Layout, base: Base, u: int, rows: FloatArray, begin: int, end: int) -> None:
     """L^-1 b in the place of b (2g, end - begin), the columns of ``rows`` from ``begin`` to ``end``."""
-    if size == 1:
+    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    if n == 2:
         first, below, last = lower[0, c], lower[1, c], lower[2, c]
         for p in range(begin, end):
             rows[0, p] /= first
             rows[1, p] = (rows[1, p] - below * rows[0, p]) / last
         return
-    n = 2 * size
     for i in range(n):
         for m in range(i):
             factor = joint[at + i * n + m]

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
@@ -29,7 +28,7 @@ class Layout(NamedTuple):
         unit: (M + 1,) where each unit's corners begin.
         joint_at: (M,) where the factor of a unit of several corners begins among those of all.
         chunk: (Q + 1,) where each chunk's units begin.
-        touched, touched_at: the pairs that chunks touch, as they come, and (Q + 1,) where they begin.
+        touched, touched_at: the pairs that chunks touch, ascending in each, and (Q + 1,) where they begin.
         control, control_information: as in Arrays.
         length_at: (M + 1,) where each unit's known lengths begin.
         length_first, length_second, length_m, length_root: the lengths, sorted by unit.
@@ -65,7 +64,7 @@ def make_layout(arrays: Arrays) -> Layout:
     unit = arrays.unit_bounds[0].numpy()
     chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
     pair = arrays.pair.numpy()
-    touched, touched_at = _touched(pair, begin[unit[chunk]], arrays.pair_count)
+    touched = [_distinct(part, arrays.pair_count) for part in np.split(pair, begin[unit[chunk[1:-1]]])]
     joined = np.diff(unit)
     known = arrays.lengths
     of_length = np.searchsorted(unit, known.first.numpy(), side="right") - 1
@@ -79,8 +78,8 @@ def make_layout(arrays: Arrays) -> Layout:
         unit=unit,
         joint_at=joint_offsets(joined),
         chunk=chunk,
-        touched=touched,
-        touched_at=touched_at,
+        touched=np.concatenate(touched),
+        touched_at=np.cumsum([0, *(len(part) for part in touched)]),
         control=arrays.control.numpy(),
         control_information=arrays.control_information.numpy(),
         length_at=np.searchsorted(of_length[order], np.arange(len(joined) + 1)),
@@ -94,12 +93,16 @@ def make_layout(arrays: Arrays) -> Layout:
     )
 
 
+def _distinct(pair: IntArray, pairs: int) -> IntArray:
+    """The different ones among a chunk's pairs: by a mask of them all, which takes less than to sort."""
+    there = np.zeros(pairs, dtype=np.bool_)
+    there[pair] = True
+    return np.flatnonzero(there).astype(np.int32)
+
+
 def joint_offsets(joined: IntArray) -> IntArray:
     """Where the factors (2g, 2g) of units of g > 1 corners begin (M,), those of a size side by side."""
-    out = np.zeros(len(joined), dtype=np.int64)
-    if joined.max() == 1:
-        return out
-    begin = 0
+    out, begin = np.zeros(len(joined), dtype=np.int64), 0
     for size in np.unique(joined[joined > 1]):
         same = np.flatnonzero(joined == size)
         out[same] = begin + 4 * size * size * np.arange(len(same))
@@ -107,34 +110,41 @@ def joint_offsets(joined: IntArray) -> IntArray:
     return out
 
 
-def _touched(pair: IntArray, bounds: IntArray, pairs: int) -> tuple[IntArray, IntArray]:
-    """The pairs that each chunk of observations touches, as they come, and where those of each begin."""
-    touched_at = np.zeros(len(bounds), dtype=np.int64)
-    _count_touched(pair, bounds, np.full(pairs, -1, dtype=np.int32), touched_at)
-    touched = np.empty(touched_at[-1], dtype=np.int32)
-    _list_touched(pair, bounds, np.full(pairs, -1, dtype=np.int32), touched_at, touched)
-    return touched, touched_at
+class Base(NamedTuple):
+    """Where a problem is linearised, and the factors of V there.
+
+    Attributes:
+        table: of the pairs (P, 16).
+        corners: (N, 2).
+        code, scale: of the loss.
+        lower, joint: L of corners that stand alone (3, N), and of units of several, one after the other.
+        rows: L^-1 W' (2 N, D) where frames have no states; else (0, D): it is computed anew, by observation.
+    """
+
+    table: FloatArray
+    corners: FloatArray
+    code: int
+    scale: float
+    lower: FloatArray
+    joint: FloatArray
+    rows: FloatArray
 
 
-@kernel
-def _count_touched(pair: IntArray, bounds: IntArray, last: IntArray, touched_at: IntArray) -> None:
-    for q in range(len(bounds) - 1):
-        count = 0
-        for k in range(bounds[q], bounds[q + 1]):
-            if last[pair[k]] != q:
-                last[pair[k]] = q
-                count += 1
-        touched_at[q + 1] = touched_at[q] + count
+class Scratch(NamedTuple):
+    """A workspace: numbers of pairs (P,), and what belongs to one observation or to those of a unit."""
 
+    slot: IntArray
+    jacobian: FloatArray
+    coupling: FloatArray
+    known: FloatArray
+    block: FloatArray
+    step: FloatArray
+    gradient: FloatArray
+    rows: FloatArray
 
-@kernel
-def _list_touched(
-    pair: IntArray, bounds: IntArray, last: IntArray, touched_at: IntArray, touched: IntArray
-) -> None:
-    for q in range(len(bounds) - 1):
-        at = touched_at[q]
-        for k in range(bounds[q], bounds[q + 1]):
-            if last[pair[k]] != q:
-                last[pair[k]] = q
-                touched[at] = pair[k]
-                at += 1
+    @classmethod
+    def of(cls, layout: Layout, pairs: int, width: int = 0) -> Scratch:
+        """Room for any unit, and rows of ``width`` columns."""
+        n = 2 * layout.most_joined
+        sizes = (16,), (layout.most_seen, 12), (layout.most_seen, 8), (n, n), (n,), (n,), (n, width)
+        return cls(np.empty(pairs, dtype=np.int32), *(np.empty(size) for size in sizes))

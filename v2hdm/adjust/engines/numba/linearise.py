@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from v2hdm.adjust.engine import WEIGHT_FLOOR
 from v2hdm.adjust.engines.numba.build import inlined, kernel
 from v2hdm.adjust.engines.numba.inline import (
     add_corner_priors,
     add_force,
     add_loss,
     factorise_unit,
+    floored,
     keep_unit,
     length_residual,
     number_touched,
@@ -24,8 +22,8 @@ from v2hdm.adjust.engines.numba.inline import (
     weigh,
     whiten,
 )
-from v2hdm.adjust.engines.numba.layout import Layout
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
+from v2hdm.records import FloatArray
 
 
 class Linearisation(NamedTuple):
@@ -36,9 +34,7 @@ class Linearisation(NamedTuple):
         wrench: (R, 6) the gradient by the pairs.
         coupled: (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states.
         carried: (Q, D) the same by the cameras' unknowns, where they have none.
-        rows: (2 N, D) then L^-1 W', one corner after the other; else (0, D).
-        whitened: (N, 2) the gradient by the corners, L^-1 g.
-        lower, joint: the factors of V, see ``inline.factorise_unit``; of kept units V.
+        whitened: (2 N,) the gradient by the corners, L^-1 g.
         own: J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21).
         tip: (Q, D, D) B'B of the cameras' unknowns, its lower triangle.
         failed: (Q,) units whose block has no factor.
@@ -48,37 +44,10 @@ class Linearisation(NamedTuple):
     wrench: FloatArray
     coupled: FloatArray
     carried: FloatArray
-    rows: FloatArray
     whitened: FloatArray
-    lower: FloatArray
-    joint: FloatArray
     own: FloatArray
     tip: FloatArray
     failed: FloatArray
-
-
-class Scratch(NamedTuple):
-    """The workspace of :func:`linearise`: numbers of pairs (P,), derivatives and blocks of a unit."""
-
-    slot: IntArray
-    jacobian: FloatArray
-    coupling: FloatArray
-    block: FloatArray
-    gradient: FloatArray
-    rows: FloatArray
-
-    @classmethod
-    def of(cls, layout: Layout, pairs: int, width: int) -> Scratch:
-        """Room for any chunk; ``width`` is the number of the cameras' unknowns."""
-        n = 2 * layout.most_joined
-        return cls(
-            np.empty(pairs, dtype=np.int32),
-            np.empty(16),
-            np.empty((layout.most_seen, 12)),
-            np.empty((n, n)),
-            np.empty(n),
-            np.empty((n, width)),
-        )
 
 
 @inlined
@@ -120,14 +89,10 @@ def linearise(
     begin: int,
     end: int,
     layout: Layout,
-    table: FloatArray,
+    base: Base,
     clock: FloatArray,
-    corners: FloatArray,
-    code: int,
-    scale: float,
     growth: float,
     by_pair: bool,
-    states: bool,
     scratch: Scratch,
     out: Linearisation,
 ) -> None:
@@ -137,23 +102,20 @@ def linearise(
         begin: the first chunk.
         end: the chunk after the last.
         layout: the problem.
-        table: of the pairs (P, 16).
+        base: where; its factors and rows are written.
         clock: (P, 6 Q) the pairs' left tangents by the clock offset of their camera.
-        corners: (N, 2) where.
-        code: the loss.
-        scale: of the loss.
         growth: what the diagonal of V is multiplied by.
         by_pair: whether J'J is asked for by pair.
-        states: whether frames have states.
         scratch: room to work in.
         out: where the results go.
     """
-    cameras = len(table) // layout.frames
-    each = out.tip.shape[1] // cameras
-    slot, jacobian, coupling, block, gradient, rows = scratch
+    table, corners, states = base.table, base.corners, len(base.rows) == 0
+    cameras, width = len(table) // layout.frames, out.tip.shape[1]
+    each = width // cameras
+    slot, jacobian, coupling, _, block, _, gradient, rows = scratch
     for q in range(begin, end):
         number_touched(layout, q, slot)
-        total, product, cut = 0.0, 1.0, scale * scale
+        total, product = 0.0, 1.0
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
             first, last = layout.unit[u], layout.unit[u + 1]
             size, seen = last - first, layout.begin[first]
@@ -167,8 +129,8 @@ def linearise(
                 for k in range(layout.begin[c], layout.begin[c + 1]):
                     r0, r1, px, py, pz = differentiate(layout, table, k, x, y, jacobian)
                     squared = r0 * r0 + r1 * r1
-                    total, product = add_loss(code, scale, squared, total, product)
-                    weight = weigh(code, scale, squared)
+                    total, product = add_loss(base, squared, total, product)
+                    weight = weigh(base, squared)
                     w0, w1 = weight * r0, weight * r1
                     gx += jacobian[12] * w0 + jacobian[14] * w1
                     gy += jacobian[13] * w0 + jacobian[15] * w1
@@ -176,7 +138,7 @@ def linearise(
                     fx, fy = jacobian[0] * w0 + jacobian[6] * w1, jacobian[7] * w1
                     fz = jacobian[2] * w0 + jacobian[8] * w1
                     add_force(out.wrench, at, px, py, pz, fx, fy, fz)
-                    weight = WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight
+                    weight = floored(weight)
                     xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
                     yx += weight * (jacobian[13] * jacobian[12] + jacobian[15] * jacobian[14])
                     yy += weight * (jacobian[13] * jacobian[13] + jacobian[15] * jacobian[15])
@@ -202,28 +164,23 @@ def linearise(
                 gradient[i], gradient[i + 1] = gx, gy
             add_corner_priors(layout, u, corners, gradient, out.costs[q])
             _add_lengths(layout, u, corners, block)
-            joint_at = layout.joint_at[u]
             if layout.kept[u]:
-                keep_unit(size, block, out.lower, first, out.joint, joint_at)
-                for c in range(first, last):
-                    i = 2 * (c - first)
-                    out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
+                keep_unit(layout, base, u, block)
+                for i in range(2 * size):
+                    out.whitened[2 * first + i] = gradient[i]
                 continue
-            if not factorise_unit(size, block, growth, out.lower, first, out.joint, joint_at):
+            if not factorise_unit(layout, base, u, block, growth):
                 out.failed[q] += 1.0
                 continue
-            solve_unit(size, out.lower, first, out.joint, joint_at, gradient)
-            width = cameras * each
-            solve_unit_rows(size, out.lower, first, out.joint, joint_at, rows, 0, width)
-            for c in range(first, last):
-                i = 2 * (c - first)
-                out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
-                if not states:
-                    for p in range(width):
-                        out.rows[2 * c, p], out.rows[2 * c + 1, p] = rows[i, p], rows[i + 1, p]
-                        out.carried[q, p] += rows[i, p] * gradient[i] + rows[i + 1, p] * gradient[i + 1]
+            solve_unit(layout, base, u, gradient)
+            solve_unit_rows(layout, base, u, rows, 0, width)
+            for i in range(2 * size):
+                out.whitened[2 * first + i] = gradient[i]
+                for p in range(0 if states else width):
+                    base.rows[2 * first + i, p] = rows[i, p]
+                    out.carried[q, p] += rows[i, p] * gradient[i]
             if states:
-                solve_unit_transposed(size, out.lower, first, out.joint, joint_at, gradient)
+                solve_unit_transposed(layout, base, u, gradient)
                 for c in range(first, last):
                     i = 2 * (c - first)
                     x, y = gradient[i], gradient[i + 1]
@@ -237,8 +194,8 @@ def linearise(
                     top, low = rows[i, p], rows[i + 1, p]
                     for s in range(p + 1):
                         tip[p, s] += top * rows[i, s] + low * rows[i + 1, s]
-        if code == 2:
-            total += cut * math.log(product)
+        if base.code == 2:
+            total += base.scale * base.scale * math.log(product)
         out.costs[q, 0] = total / 2
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.engine import WEIGHT_FLOOR
 from v2hdm.adjust.engines.numba.build import kernel
-from v2hdm.adjust.engines.numba.inline import see, weigh, whiten
-from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.inline import floored, see, weigh, whiten
+from v2hdm.adjust.engines.numba.layout import Base, Layout
 from v2hdm.adjust.engines.numba.linearise import couple, differentiate
 from v2hdm.adjust.model import MIN_DEPRESSION_SINE
 from v2hdm.geometry.tensors import NEAR_M
@@ -130,19 +129,9 @@ def pull(
 
 
 @kernel
-def couplings(
-    layout: Layout,
-    table: FloatArray,
-    corner: IntArray,
-    corners: FloatArray,
-    code: int,
-    scale: float,
-    jacobian: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write W' (k, 12) of the layout's observations, of the corners (n, 2) that ``corner`` (k,) numbers."""
+def couplings(layout: Layout, base: Base, corner: IntArray, jacobian: FloatArray, out: FloatArray) -> None:
+    """Write W' (k, 12) of the layout's observations, of the base's corners, numbered by ``corner``."""
     for k in range(len(corner)):
-        x, y = corners[corner[k], 0], corners[corner[k], 1]
-        r0, r1, _, _, _ = differentiate(layout, table, k, x, y, jacobian)
-        weight = weigh(code, scale, r0 * r0 + r1 * r1)
-        couple(jacobian, WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight, out, k)
+        x, y = base.corners[corner[k], 0], base.corners[corner[k], 1]
+        r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)
+        couple(jacobian, floored(weigh(base, r0 * r0 + r1 * r1)), out, k)

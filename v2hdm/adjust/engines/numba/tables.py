@@ -11,23 +11,23 @@ forces and of their moments p x force. Extrinsics, frame states and clock offset
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, CameraQuadratic
-from v2hdm.adjust.model import Estimate, Gradient, centre_residual, clock_residual, state_residual
+from v2hdm.adjust.model import (
+    Estimate,
+    Gradient,
+    centre_residual,
+    clock_residual,
+    frame_tangent,
+    state_residual,
+)
 from v2hdm.adjust.reduced import PriorBlocks, Spread
 from v2hdm.geometry.rigid import left_jacobian as rigid_left_jacobian
 from v2hdm.geometry.rigid import log
 from v2hdm.geometry.tensors import adjoint, exp, inverse, left_jacobian
-
-
-def _frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
-    tangent = frame_state.new_zeros(arrays.frame_count, 6)
-    return tangent.index_add(1, torch.tensor(arrays.states, dtype=torch.int64), frame_state)
 
 
 def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
@@ -43,7 +43,7 @@ def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Poses of every pair, (C, J, 4, 4)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
-        vehicle_from_map = exp(-_frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
+        vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
     cameras = _cam_from_vehicle_then(arrays, estimate)
     if cameras.shape[1] > 1:
         return cameras @ vehicle_from_map
@@ -56,44 +56,37 @@ def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
     """How pairs move with frame states and clock offsets."""
     state = clock = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6, 0)
     if arrays.states:
-        by_tangent = left_jacobian(-_frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
+        by_tangent = left_jacobian(-frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
         state = -adjoint(_cam_from_vehicle_then(arrays, estimate)) @ by_tangent
     if arrays.clock_twist.shape[-1]:
         clock = -adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
     return Spread(state, clock)
 
 
-@dataclass(frozen=True)
-class Sums:
-    """Sums over observations and corners.
+def with_priors(
+    arrays: Arrays, estimate: Estimate, spread: Spread, costs: Tensor, wrench: Tensor
+) -> tuple[dict[str, Tensor], Gradient]:
+    """The cost by name and its gradient; by corners, where it is whitened already, (0, 2).
 
-    Attributes:
-        observations, control, lengths: the costs of the observations, the survey and the known lengths.
+    Args:
+        arrays: the problem.
+        estimate: where.
+        spread: how pairs move there.
+        costs: (3,) of the observations, the survey and the known lengths.
         wrench: (C, J, 6) the observations' gradient by the pairs' left tangents.
     """
-
-    observations: Tensor
-    control: Tensor
-    lengths: Tensor
-    wrench: Tensor
-
-
-def with_priors(
-    arrays: Arrays, estimate: Estimate, spread: Spread, sums: Sums
-) -> tuple[dict[str, Tensor], Gradient]:
-    """The cost by name and its gradient; by corners, where it is whitened already, (0, 2)."""
     centre = centre_residual(arrays, estimate.cam_from_vehicle)
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
     clock = clock_residual(arrays, estimate.clock_s)
     terms = {
-        "observations": sums.observations,
+        "observations": costs[0],
         "camera_centre": centre.square().sum() / 2,
         "frame_states": state.square().sum() / 2,
         "clock_offsets": clock.square().sum() / 2,
-        "control_points": sums.control,
-        "known_lengths": sums.lengths,
+        "control_points": costs[1],
+        "known_lengths": costs[2],
     }
-    gathered = spread.gather(sums.wrench)
+    gathered = spread.gather(wrench)
     by_corner = state.new_empty(0, 2)
     gradient = Gradient(gathered.camera[:, :6], gathered.frame_state, by_corner, gathered.camera[:, 6:])
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.

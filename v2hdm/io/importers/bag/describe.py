@@ -6,7 +6,7 @@ description so far, to be completed and put beside the bag.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.calibration.mounting import roi_ahead
 from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import messages as kinds
@@ -27,7 +27,6 @@ from v2hdm.store.folders import entry_folder, is_whole
 
 _VEHICLES = ("base_footprint", "base_link")  # frames, the one on the ground first (REP-105, REP-120)
 _MAPS = ("map", "odom")
-_LEAST_MESSAGES = 2
 _IMAGE_WORDS = frozenset(
     {"image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "compressed",
      "camera", "cameras", "sensing", "sensors", "raw", "image_raw_compressed"}
@@ -46,9 +45,10 @@ def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
     if not is_whole(folder):
         description = _Description(path, cache)
         if description.missing:
+            flow = yaml.safe_dump(description.content, sort_keys=False, default_flow_style=True, width=10**6)
             raise DriveError(
                 f"{path}: says no {', no '.join(description.missing)}; complete this and save it as "
-                f"drive.yaml in a folder beside the bag: {dump_flow(description.content)}"
+                f"drive.yaml in a folder beside the bag: {flow.strip()}"
             )
         with new_entry(folder) as partial:
             (partial / _DESCRIPTION).write_text(dump_yaml(description.content), encoding="utf-8")
@@ -66,11 +66,6 @@ def list_topics(path: Path, cache: Path) -> str:
     found = _Description(path, cache)
     said = f"; still to be said: {', '.join(found.missing)}" if found.missing else ""
     return "\n".join([*lines, "", f"# drive.yaml{said}", dump_yaml(found.content).rstrip()])
-
-
-def dump_flow(content: Mapping[str, Any]) -> str:
-    """``content`` as YAML on one line."""
-    return str(yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=True, width=10**6)).strip()
 
 
 class _Description:
@@ -95,10 +90,13 @@ class _Description:
             stream = TfStream(has_tf, f"{path}: tf")
             self._frames = stream.frames(import_streams(path, [stream], cache)[0])
         self._vehicle = next((name for name in _VEHICLES if name in self._frames.names), None)
-        self.content: dict[str, Any] = {"name": path.stem, "bag": path.name}
-        self.content["poses"] = self._poses(position, heading)
-        self.content["cameras"] = {
-            name: self._camera(name, topic, infos[name]) for name, topic in images.items()
+        poses = self._poses(position, heading)
+        cameras = {name: self._camera(name, topic, infos[name]) for name, topic in images.items()}
+        self.content: dict[str, Any] = {
+            "name": path.stem,
+            "bag": path.name,
+            "poses": poses,
+            "cameras": cameras,
         }
         self.missing = list(dict.fromkeys(self._missing))
 
@@ -128,7 +126,7 @@ class _Description:
             self._missing.append("turn of the heading's sensor on the vehicle (mounting_rpy_deg)")
             entry["mounting_rpy_deg"] = "?"
         elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:
-            entry["mounting_rpy_deg"] = _rpy_deg(turned[:3, :3])
+            entry["mounting_rpy_deg"] = np.degrees(euler_from_rotation(turned[:3, :3])).tolist()
         return entry
 
     def _camera(self, name: str, topic: Topic, info: Topic | None) -> dict[str, Any]:
@@ -175,15 +173,13 @@ def _cameras(bag: Bag) -> dict[str, Topic]:
     by_base: dict[str, Topic] = {}
     for topic in sorted(topics, key=lambda topic: topic.kind != kinds.COMPRESSED):
         by_base.setdefault(topic.name.removesuffix("/compressed"), topic)
-    names = {base: _camera_name(base) for base in by_base}
+    words = {
+        base: [word for word in base.split("/") if word and word not in _IMAGE_WORDS] for base in by_base
+    }
+    names = {base: own[-1] if own else "camera" for base, own in words.items()}
     if len(set(names.values())) < len(names):
         names = {base: base.strip("/").replace("/", "_") for base in by_base}
     return {names[base]: topic for base, topic in sorted(by_base.items())}
-
-
-def _camera_name(base: str) -> str:
-    words = [word for word in base.split("/") if word and word not in _IMAGE_WORDS]
-    return words[-1] if words else "camera"
 
 
 def _info_topic(bag: Bag, image: Topic) -> Topic | None:
@@ -194,12 +190,5 @@ def _info_topic(bag: Bag, image: Topic) -> Topic | None:
 
 
 def _only(bag: Bag, kinds: Sequence[str]) -> Topic | None:
-    found = [one for one in bag.topics.values() if one.kind in kinds and one.messages >= _LEAST_MESSAGES]
+    found = [one for one in bag.topics.values() if one.kind in kinds and one.messages > 1]
     return found[0] if len(found) == 1 else None
-
-
-def _rpy_deg(rotation: FloatArray) -> list[float]:
-    """Roll, pitch and yaw in degrees, about fixed axes (REP-103)."""
-    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
-    roll, yaw = np.arctan2(rotation[2, 1], rotation[2, 2]), np.arctan2(rotation[1, 0], rotation[0, 0])
-    return [float(np.degrees(angle)) for angle in (roll, pitch, yaw)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 import cv2
@@ -11,11 +10,9 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
-from v2hdm.geometry.rigid import rotation_from_quaternion
-from v2hdm.io.importers.nmea import nmea_readings
 from v2hdm.io.importers.tables import Attitudes, Readings
 from v2hdm.io.safe.pixels import png
-from v2hdm.io.trajectory import in_order
+from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import FloatArray
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -61,9 +58,8 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
     if fields.encoding not in _ENCODINGS:
-        raise DriveError(
-            f"{where}: encoding '{fields.encoding}' is not known; record one of {', '.join(_ENCODINGS)}"
-        )
+        known = ", ".join(_ENCODINGS)
+        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {known}")
     channels, to_bgr = _ENCODINGS[fields.encoding]
     height, width, step = int(fields.height), int(fields.width), int(fields.step)
     row = width * channels
@@ -74,8 +70,7 @@ def _pixels(fields: Any, where: str) -> np.ndarray:
         )
     data = np.zeros(step * height, dtype=np.uint8)
     data[: len(fields.data)] = fields.data[: len(data)]
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    pixels = data.reshape(height, step)[:, :row].reshape(shape)
+    pixels = data.reshape(height, step)[:, :row].reshape((height, width, channels)[: 2 + (channels > 1)])
     if to_bgr is not None:
         pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), to_bgr), dtype=np.uint8)
     return pixels
@@ -143,7 +138,12 @@ Row = tuple[float, ...]
 def position_row(kind: str, fields: Any) -> Row:
     """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
     if kind == FIX:
-        return _fix(fields)
+        sigma_m = np.nan
+        if fields.position_covariance_type:
+            sigma_m = _sigma((fields.position_covariance[0] + fields.position_covariance[4]) / 2)
+        if fields.status.status <= _NO_FIX:
+            sigma_m = np.inf
+        return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
     return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
 
 
@@ -170,31 +170,18 @@ def readings_of(
     stamp_s, rows = stamp_s[order], rows[order]
     if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
         raise DriveError(f"{where}: holds a position that is not finite; record it anew")
-    if headings is not None:
-        heading_s, turned = headings
-        by_time = in_order(heading_s, where, "message of the heading")
-        heading_s, turned = heading_s[by_time], turned[by_time]
-    else:
-        heading_s, turned = stamp_s, rows[:, 4:]
+    heading_s, turned = headings or (stamp_s, rows[:, 4:])
+    by_time = in_order(heading_s, where, "message of the heading")
+    heading_s, turned = heading_s[by_time], turned[by_time]
     # A dual antenna writes nan where it has none.
     known = np.isfinite(turned[:, :4]).all(axis=1)
     attitudes = None
     if known.any():
-        norm = np.linalg.norm(turned[known, :4], axis=1, keepdims=True)
-        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
-            raise DriveError(
-                f"{where}: holds a quaternion of norm {norm[np.argmax(np.abs(norm - 1)), 0]:.3g}: no "
-                "orientation was measured there; choose another topic for the heading"
-            )
-        rotation = rotation_from_quaternion(turned[known, :4] / norm)
+        advice = "no orientation was measured there: choose another topic for the heading"
+        rotation = checked_rotations(turned[known, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[known], rotation, turned[known, 4])
     geodetic = kind == FIX
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
-
-
-def readings_of_sentences(first_s: float, lines: list[str], where: str) -> Readings:
-    """Readings of NMEA sentences in messages, the first of which was stamped ``first_s``."""
-    return nmea_readings(lines, where, datetime.fromtimestamp(first_s, tz=UTC).date())
 
 
 def _pose(pose: Any, covariance: Any) -> Row:
@@ -203,15 +190,6 @@ def _pose(pose: Any, covariance: Any) -> Row:
     if covariance is not None:
         sigma_m, sigma_rad = _sigma((covariance[0] + covariance[7]) / 2), _sigma(covariance[_YAW])
     return (place.x, place.y, place.z, sigma_m, *_quaternion(pose.orientation), sigma_rad)
-
-
-def _fix(fields: Any) -> Row:
-    sigma_m = np.nan
-    if fields.position_covariance_type:
-        sigma_m = _sigma((fields.position_covariance[0] + fields.position_covariance[4]) / 2)
-    if fields.status.status <= _NO_FIX:
-        sigma_m = np.inf
-    return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
 
 
 def _quaternion(orientation: Any) -> Row:

@@ -114,9 +114,9 @@ class Bag:
     def _fields(self, connection: Any, data: bytes) -> Any:
         kind = connection.msgtype
         if kind not in self._stores:
-            self._stores[kind] = self._store_of(connection)
-        read = self._stores[kind].deserialize_ros1 if self._is_ros1 else self._stores[kind].deserialize_cdr
-        return read(data, kind)
+            store = self._store_of(connection)
+            self._stores[kind] = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+        return self._stores[kind](data, kind)
 
     def _store_of(self, connection: Any) -> Any:
         """The types of one connection: as the bag defines them, else the common ones."""
@@ -131,11 +131,9 @@ class Bag:
             store.register(get_types_from_msg(definition.data, connection.msgtype))
             return store
         types: dict[str, Any] = {}
-        for part in definition.data.split("=" * 80 + "\n"):
+        for part in filter(str.strip, definition.data.split("=" * 80 + "\n")):
             head, _, rest = part.partition("\n")
-            types.update(
-                get_types_from_idl(rest if head.startswith("IDL: ") else part) if part.strip() else {}
-            )
+            types |= get_types_from_idl(rest if head.startswith("IDL: ") else part)
         store.register(types)
         return store
 
@@ -147,10 +145,8 @@ class Bag:
         if topic is None:
             raise DriveError(f"{where}: {self.path} has no topic {name}; of type {wanted} it has: {fitting}")
         if topic.kind not in kinds:
-            raise DriveError(
-                f"{where}: topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}; it has: "
-                f"{fitting}"
-            )
+            problem = f"topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}"
+            raise DriveError(f"{where}: {problem}; it has: {fitting}")
         if not topic.messages:
             raise DriveError(f"{where}: topic {name} of {self.path} holds no message; record it")
         return topic
@@ -169,7 +165,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
     with ExitStack() as opened:
         with _one_line(path):
             readers: list[Any] = []
-            if files[0].name == _METADATA and _is_compressed(path):
+            # The files of a folder, or each of its messages, may be compressed.
+            about = load_yaml(files[0], DriveError) if files[0].name == _METADATA else {}
+            about = take_mapping(about.get("rosbag2_bagfile_information", {}), str(files[0]), DriveError)
+            if str(about.get("compression_mode") or "none").lower() not in ("none", "storage"):
                 readers.append(opened.enter_context(rosbag2.Reader(path)))
             else:
                 # rosbags skips, without a word, topics of which the folder's description and the file state
@@ -188,26 +187,16 @@ def _check_database(path: Path) -> None:
         header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
-        raise DriveError(
-            f"{path}: was not closed, {journal.name} holds its end; mend it with 'ros2 bag reindex'"
-        )
+        problem = f"was not closed, {journal.name} holds its end"
+        raise DriveError(f"{path}: {problem}; mend it with 'ros2 bag reindex'")
     if len(header) < 100:
         return
-    # One stands for 65536, which two bytes cannot.
     page_bytes = int.from_bytes(header[16:18], "big")
-    page_bytes = 65536 if page_bytes == 1 else page_bytes
-    pages = int.from_bytes(header[28:32], "big")
-    counts = header[24:28] == header[92:96]
-    if counts and path.stat().st_size < pages * page_bytes:
-        there = f"{path.stat().st_size} of {pages * page_bytes}"
-        raise DriveError(f"{path}: is cut off: {there} bytes are there; copy it again")
-
-
-def _is_compressed(path: Path) -> bool:
-    """Whether the files of a folder, or each of its messages, are compressed."""
-    about = load_yaml(path / _METADATA, DriveError).get("rosbag2_bagfile_information")
-    mode = take_mapping(about, f"{path / _METADATA}", DriveError).get("compression_mode")
-    return str(mode or "none").lower() not in ("none", "storage")
+    # One stands for 65536, which two bytes cannot.
+    expected = int.from_bytes(header[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
+    there = path.stat().st_size
+    if header[24:28] == header[92:96] and there < expected:
+        raise DriveError(f"{path}: is cut off: {there} of {expected} bytes are there; copy it again")
 
 
 @contextmanager

@@ -10,7 +10,9 @@ import logging
 from abc import ABC, abstractmethod
 from array import array
 from collections import defaultdict
-from collections.abc import Generator, Sequence
+from collections.abc import Collection, Generator, Sequence
+from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -19,15 +21,17 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
+from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Edge, Frames, frame_name, transform_rows
+from v2hdm.io.importers.nmea import nmea_readings
 from v2hdm.io.importers.tables import Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
-from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, entry_folder, finish_entry, is_whole
+from v2hdm.store.folders import entry_folder, is_whole
 
 _log = logging.getLogger(__name__)
 
@@ -43,14 +47,19 @@ Writer = Generator[None, Message | None, None]
 
 
 class Stream(ABC):
-    """One stream, which ``label`` and ``settings`` distinguish from others of the bag."""
+    """One stream, which ``label`` and ``settings`` distinguish from others of the bag.
 
-    def __init__(self, label: str, settings: Any, where: str) -> None:
-        self.label, self.settings, self.where = label, settings, where
+    ``needs`` are its topics, each with the types that it may be of and the place that names it.
+    """
 
-    @abstractmethod
+    def __init__(
+        self, label: str, settings: Any, where: str, *needs: tuple[str, Collection[str], str]
+    ) -> None:
+        self.label, self.settings, self.where, self.needs = label, settings, where, needs
+
     def topics(self, bag: Bag) -> Sequence[str]:
         """The topics to be read; raises DriveError where the bag lacks them or they are of another type."""
+        return [bag.need(*one).name for one in self.needs]
 
     @abstractmethod
     def write(self, folder: Path) -> Writer:
@@ -61,12 +70,8 @@ class ImageStream(Stream):
     """Images of a topic as files, with their list."""
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
-        super().__init__(topic, ["images", stamps], where)
+        super().__init__(topic, ["images", stamps], where, (topic, (*IMAGE_KINDS, VIDEO), where))
         self._stamps = stamps
-
-    def topics(self, bag: Bag) -> Sequence[str]:
-        """Its topic, of a type of images."""
-        return [bag.need(self.label, (*IMAGE_KINDS, VIDEO), self.where).name]
 
     def write(self, folder: Path) -> Writer:
         """Write an image file per message, or per frame of a video, and the list of them."""
@@ -113,35 +118,26 @@ class InfoStream(Stream):
     """Intrinsics of the first message of a topic."""
 
     def __init__(self, topic: str, where: str) -> None:
-        super().__init__(topic, ["camera_info"], where)
-
-    def topics(self, bag: Bag) -> Sequence[str]:
-        """Its topic, of the type of intrinsics."""
-        return [bag.need(self.label, [INFO_KIND], self.where).name]
+        super().__init__(topic, ["camera_info"], where, (topic, [INFO_KIND], where))
 
     def write(self, folder: Path) -> Writer:
         """Write the first message as ``camera_info``."""
-        done = False
-        while (message := (yield)) is not None:
-            if not done:
-                info = info_of(message.fields, self.label, f"{self.where}: topic {self.label}")
-                write_camera_info(info, folder / INFO_FILE)
-                done = True
+        if (first := (yield)) is not None:
+            info = info_of(first.fields, self.label, f"{self.where}: topic {self.label}")
+            write_camera_info(info, folder / INFO_FILE)
+            while (yield) is not None:
+                pass
 
 
 class PoseStream(Stream):
     """Positions of a topic, and headings of another one if need be, as rows of numbers."""
 
     def __init__(self, topic: str, heading_topic: str | None, stamps: str, where: str) -> None:
-        super().__init__(topic, ["poses", heading_topic, stamps], where)
+        needs: list[tuple[str, Collection[str], str]] = [(topic, kinds.POSE_KINDS, where)]
+        if heading_topic is not None:
+            needs.append((heading_topic, kinds.HEADING_KINDS, f"{where}, heading_topic"))
+        super().__init__(topic, ["poses", heading_topic, stamps], where, *needs)
         self._heading, self._stamps = heading_topic, stamps
-
-    def topics(self, bag: Bag) -> Sequence[str]:
-        """Its topics, of types of poses and headings."""
-        names = [bag.need(self.label, kinds.POSE_KINDS, self.where).name]
-        if self._heading is not None:
-            names.append(bag.need(self._heading, kinds.HEADING_KINDS, f"{self.where}, heading_topic").name)
-        return names
 
     def write(self, folder: Path) -> Writer:
         """Write rows of positions and of headings, and the type of the messages."""
@@ -159,9 +155,9 @@ class PoseStream(Stream):
                     if kind == kinds.NMEA:
                         positions.write(f"{stamp_s!r} {message.fields.sentence.strip()}\n")
                     else:
-                        _write_row(positions, stamp_s, kinds.position_row(kind, message.fields))
+                        _write_row(positions, stamp_s, *kinds.position_row(kind, message.fields))
                 if message.topic == self._heading:
-                    _write_row(headings, stamp_s, kinds.heading_row(message.kind, message.fields))
+                    _write_row(headings, stamp_s, *kinds.heading_row(message.kind, message.fields))
         (folder / _KIND).write_text(kind, encoding="utf-8")
 
     def readings(self, folder: Path) -> Readings:
@@ -171,7 +167,8 @@ class PoseStream(Stream):
         if kind == kinds.NMEA:
             text = (folder / _POSES).read_text(encoding="utf-8")
             rows = [line.split(" ", 1) for line in text.splitlines()]
-            return kinds.readings_of_sentences(float(rows[0][0]), [sentence for _, sentence in rows], where)
+            first_day = datetime.fromtimestamp(float(rows[0][0]), tz=UTC).date()
+            return nmea_readings([sentence for _, sentence in rows], where, first_day)
         headings = None if self._heading is None else _read_rows(folder / _HEADINGS, 6)
         return kinds.readings_of(kind, _read_rows(folder / _POSES, 10), headings, where)
 
@@ -223,28 +220,20 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     labels = ", ".join(stream.label for stream in missing.values())
     _log.info("%s: importing %s from %.0f MB into %s, once", path, labels, size_mb, cache)
     writers: list[Writer] = []
-    try:
-        with open_bag(path) as bag:
-            takers: dict[str, list[Writer]] = defaultdict(list)
-            for folder, stream in missing.items():
-                topics = stream.topics(bag)
-                writers.append(stream.write(begin_entry(folder)))
-                next(writers[-1])
-                for topic in topics:
-                    takers[topic].append(writers[-1])
-            for message in bag.messages(takers):
-                for writer in takers[message.topic]:
-                    writer.send(message)
-            for folder, writer in zip(missing, writers, strict=True):
-                next(writer, None)  # sends None
-                finish_entry(folder)
-    except OSError as failure:
-        raise cannot_write(cache, failure) from None
-    finally:
+    with open_bag(path) as bag, ExitStack() as entries:
+        takers: dict[str, list[Writer]] = defaultdict(list)
+        for folder, stream in missing.items():
+            topics = stream.topics(bag)
+            writers.append(stream.write(entries.enter_context(new_entry(folder))))
+            entries.callback(writers[-1].close)
+            next(writers[-1])
+            for topic in topics:
+                takers[topic].append(writers[-1])
+        for message in bag.messages(takers):
+            for writer in takers[message.topic]:
+                writer.send(message)
         for writer in writers:
-            writer.close()
-        for folder in missing:
-            drop_entry(folder)
+            next(writer, None)  # sends None
     return folders
 
 
@@ -267,8 +256,8 @@ def frame_of(message: Message) -> str:
     return frame_name(message.fields.header.frame_id)
 
 
-def _write_row(file: TextIO, stamp_s: float, row: Sequence[float]) -> None:
-    file.write(" ".join(map(repr, map(float, (stamp_s, *row)))) + "\n")
+def _write_row(file: TextIO, *row: float) -> None:
+    file.write(" ".join(map(repr, map(float, row))) + "\n")
 
 
 def _read_rows(path: Path, columns: int) -> tuple[FloatArray, FloatArray]:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
+from v2hdm.geometry.rigid import inverse, make_transform, rotation_from_quaternion
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.io.trajectory import in_order, pose_matrices
+from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray, Trajectory
 
 Edge = tuple[str, str]
@@ -38,7 +38,7 @@ class Frames:
             norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
             if not np.isfinite(table).all() or (norm < 0.5).any():
                 raise DriveError(f"{where}: the transform of {child} in {parent} is none; record it anew")
-            poses = pose_matrices(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
+            poses = make_transform(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
             # Old recorders publish fixed frames again and again.
             moves = len(poses) > 1 and bool(np.ptp(poses, axis=0).max() > _FIXED)
             count = len(poses) if moves else 1
@@ -63,15 +63,13 @@ class Frames:
         """
         path = self._path(dst, src)
         if path is None:
-            raise DriveError(
-                f"{where}: no transforms lead from {src} to {dst}; there are: {', '.join(self.names)}"
-            )
+            names = ", ".join(self.names)
+            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; there are: {names}")
         tracks = [(self._edges[edge], forward) for edge, forward in path]
         busiest = max((track for track, _ in tracks), key=lambda track: len(track.stamp_s), default=None)
         if busiest is None or len(busiest.stamp_s) < 2:
-            raise DriveError(
-                f"{where}: {src} does not move in {dst}; name the frame of the map and the vehicle's"
-            )
+            advice = "name the frame of the map and the vehicle's"
+            raise DriveError(f"{where}: {src} does not move in {dst}; {advice}")
         stamp_s = busiest.stamp_s
         inside = np.ones(len(stamp_s), dtype=bool)
         out = np.tile(np.eye(4), (len(stamp_s), 1, 1))
@@ -82,10 +80,8 @@ class Frames:
                 inside &= known
             out = out @ (poses if forward else inverse(poses))
         if not inside.any():
-            raise DriveError(
-                f"{where}: the transforms between {src} and {dst} are never known at one time; record them "
-                "anew"
-            )
+            problem = f"the transforms between {src} and {dst} are never known at one time"
+            raise DriveError(f"{where}: {problem}; record them anew")
         return Trajectory(stamp_s[inside], out[inside])
 
     def _path(self, dst: str, src: str) -> list[tuple[Edge, bool]] | None:
@@ -96,8 +92,7 @@ class Frames:
             neighbours[child].append((parent, (parent, child), False))
         paths: dict[str, list[tuple[Edge, bool]]] = {dst: []}
         queue = [dst]
-        while queue:
-            here = queue.pop(0)
+        for here in queue:  # which grows
             for there, edge, forward in neighbours[here]:
                 if there not in paths:
                     paths[there] = [*paths[here], (edge, forward)]

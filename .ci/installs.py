@@ -1,0 +1,197 @@
+"""Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
+
+The wheel is built once. An environment begins with the base install and grows to ``[map]``; ``[map,ros]`` and
+``[map,video]`` stand beside it, each on top of ``[map]`` alone. A page says in its second line what it needs;
+its commands are run in the environment with just that, on the small drive that the documents' tests use.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+
+from tests.docs.blocks import ROOT, blocks, document
+from tests.docs.sandbox import furnish
+from tests.docs.smaller import SMALL_PORT, smaller
+from v2hdm.cli.main import COMMANDS
+
+_NEEDS = re.compile(r"\*Needs `pip install '?\.(?:\[([a-z,]+)\])?'?`")
+_PIP = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+PROMISES = {
+    "docs/detect.md": ("detect",),
+    "docs/extrinsic.md": ("calibrate ground",),
+    "docs/exports.md": ("--format csv", "--format kalibr"),
+    "docs/cache.md": ("cache list",),
+    "docs/check.md": ("check",),
+    "docs/calibrate.md": ("calibrate points",),
+    "docs/calibration.md": ("calibrate compare",),
+    "docs/localize.md": ("localize",),
+    "docs/report.md": ("report",),
+    "docs/mosaic.md": ("mosaic",),
+    "docs/bags.md": ("--list-topics", "check site"),
+}
+"""Words by document: each line of a block with one of them is run."""
+
+MORE = {
+    "": (
+        "v2hdm export map.geojson --format geojson --output exported",
+        "v2hdm detect film.mp4 --limit 1",
+        "v2hdm --version",
+    ),
+    "map": (
+        f"v2hdm map +run=port2 workers=1 resume=false all_maps=true {' '.join(map(repr, SMALL_PORT))}",
+        "v2hdm export map.geojson --format lanelet2",
+        "v2hdm experiment --cfg job",
+        "v2hdm detect images --limit 1",
+    ),
+    "map,ros": ("v2hdm detect site --limit 1",),
+    "map,video": ("v2hdm check drives/film --no-ground --workers 1", "v2hdm detect drives/film --limit 1"),
+}
+"""What no page has as a short command of its own, by extras."""
+
+MISSING = "needs [a-z0-9_.]+: install the [a-z]+ extra, pip install 'v2hdm\\[[a-z]+\\]'"
+
+
+@dataclass
+class Environment:
+    """A Python with some extras: of its own, or in folders of packages on top of another."""
+
+    python: Path
+    packages: list[Path] = field(default_factory=list)
+
+    def install(self, *what: str) -> None:
+        """Install packages."""
+        subprocess.run([self.python, *_PIP, *what], check=True)
+
+    def beside(self, folder: Path, *what: str) -> Environment:
+        """This environment with packages beside its own."""
+        subprocess.run([self.python, *_PIP, "--target", folder, *what], check=True)
+        return Environment(self.python, [folder])
+
+    def run(self, line: str, here: Path) -> subprocess.CompletedProcess[str]:
+        """Run a line of shell in which ``v2hdm`` and ``python`` are this environment's."""
+        path = f"{self.python.parent}:/usr/bin:/bin"
+        own = {"PATH": path, "HOME": str(here), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+        own |= {"PYTHONPATH": os.pathsep.join(map(str, self.packages))} if self.packages else {}
+        return subprocess.run(["bash", "-c", line], cwd=here, env=own, capture_output=True, text=True)
+
+
+def lines_of(extras: str) -> list[str]:
+    """The commands that the documents promise with just these extras."""
+    lines = []
+    for page, words in PROMISES.items():
+        needs = _NEEDS.search(document(page))
+        assert needs is not None, f"{page}: its second line says what it needs"
+        if (needs.group(1) or "") == extras:
+            listed = [line for block in blocks(page, "sh") for line in block.lines]
+            chosen = [one for one in listed if "v2hdm" in one and any(word in one for word in words)]
+            assert chosen, f"{page}: none of its commands has {words}"
+            lines += [_small(line) for line in chosen]
+    return [*lines, *MORE[extras]]
+
+
+def _small(line: str) -> str:
+    program, *rest = line.split()
+    if program == "python":
+        return line
+    return " ".join([program, *smaller(rest)])
+
+
+def prepare(folder: Path) -> None:
+    """The folder in which the documents' commands find what they name, and a drive with a video."""
+    given = ["map", "+run=port2", *SMALL_PORT, "workers=1"]
+    subprocess.run(
+        [sys.executable, "-m", "v2hdm", *given], cwd=folder, check=True, stdout=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    furnish(folder)
+    film = folder / "drives" / "film"
+    shutil.copytree(folder / "drives" / "mysite", film)
+    images = sorted((film / "front" / "images").iterdir())
+    size = cv2.imread(str(images[0])).shape[1::-1]
+    writer = cv2.VideoWriter(str(film / "front.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, size)
+    for image in images:
+        writer.write(cv2.imread(str(image)))
+    writer.release()
+    stamps = [
+        line.split()[0] for line in (film / "front" / "images.txt").read_text().splitlines() if line[0] != "#"
+    ]
+    (film / "times.txt").write_text("\n".join(stamps) + "\n")
+    described = (film / "drive.yaml").read_text()
+    video = "images: {video: front.mp4, stamps: times.txt}"
+    (film / "drive.yaml").write_text(described.replace("images: front/images.txt", video))
+    shutil.copy(film / "front.mp4", folder / "film.mp4")
+
+
+def tried(name: str, environment: Environment, lines: list[str], here: Path) -> int:
+    """Run lines in an environment; how many failed."""
+    failed = 0
+    for line in lines:
+        began = time.perf_counter()
+        done = environment.run(line, here)
+        good = done.returncode in (0, 3) and "Traceback" not in done.stderr
+        failed += not good
+        shown = line if len(line) < 90 else f"{line[:87]}..."
+        print(
+            f"{'ok  ' if good else 'FAIL'} {time.perf_counter() - began:5.1f} s  [{name}]  {shown}",
+            flush=True,
+        )
+        if not good:
+            print(done.stdout[-2000:], done.stderr[-4000:], sep="\n", flush=True)
+    return failed
+
+
+def missing(environment: Environment, here: Path) -> int:
+    """Run what the base install cannot do: each is one line that names an extra; how many are not."""
+    failed = 0
+    for name, command in COMMANDS.items():
+        if command.extra is None or name == "calibrate ground":  # which the base install can do
+            continue
+        arguments = {"calibrate points": "points.csv --intrinsics camera_info.yaml"}
+        given = {"map": "+run=port2", "experiment": "", "fleet": "a.yaml", "check": "drives/mysite"}
+        words = arguments.get(name) or given.get(name, "outputs/port2")
+        words += " outputs/friday" * (name in ("calibrate compare", "localize"))
+        done = environment.run(f"v2hdm {name} {words}", here)
+        good = done.returncode == 2 and re.fullmatch(f"error: v2hdm {name} {MISSING}\n", done.stderr)
+        failed += not good
+        print(f"{'ok  ' if good else 'FAIL'} missing  {done.stderr.strip()[-300:]}", flush=True)
+    return failed
+
+
+def main() -> int:
+    """Try all environments; the number of what failed."""
+    with TemporaryDirectory(prefix="v2hdm-installs-") as scratch:
+        here, wheels, packages = (Path(scratch) / name for name in ("here", "wheels", "packages"))
+        here.mkdir()
+        build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+        subprocess.run([*build, "--disable-pip-version-check", "-w", wheels, ROOT], check=True)
+        (wheel,) = wheels.glob("*.whl")
+        prepare(here)
+        subprocess.run([sys.executable, "-m", "venv", Path(scratch) / "venv"], check=True)
+        base = Environment(Path(scratch) / "venv" / "bin" / "python")
+        base.install(str(wheel))
+        failed = tried("base", base, lines_of(""), here) + missing(base, here)
+        base.install(f"{wheel}[map]")
+        failed += tried("map", base, lines_of("map"), here)
+        ros = base.beside(packages / "ros", *EXTRAS["ros"])
+        failed += tried("map,ros", ros, lines_of("map,ros"), here)
+        video = base.beside(packages / "video", *EXTRAS["video"])
+        failed += tried("map,video", video, lines_of("map,video"), here)
+    print(f"{failed} failed" if failed else "every promise is kept")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(min(main(), 1))

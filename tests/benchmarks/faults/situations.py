@@ -1,0 +1,110 @@
+"""Doors that write: what each is given, and what it has made when nothing fails."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tests.calibration.site import INFO, clicked, write_table
+from tests.faults.judge import Case, Outcome
+from v2hdm.io.calibration import write_camera_info
+from v2hdm.store.inputs import LIST
+
+HERE = "work/here/"
+
+
+@dataclass(frozen=True)
+class Situation:
+    """A door and its inputs.
+
+    Attributes:
+        case: of the judge.
+        grows: whether its files appear one by one; otherwise all of them do at once.
+        cache: of the inputs' folder, what is a cache.
+    """
+
+    case: Case
+    grows: bool = False
+    cache: str = "cache"
+
+    @property
+    def name(self) -> str:
+        """Of the case."""
+        return self.case.name
+
+
+def calibrating() -> Situation:
+    """The door to a pre-calibration."""
+    words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
+    return Situation(Case("calibrate", "v2hdm calibrate points", words, _points, ""))
+
+
+def _points(root: Path) -> None:
+    write_camera_info(INFO, root / "camera_info.yaml")
+    write_table(root, *clicked(seed=1))
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a door leaves where nothing fails: its exit code, files, and which differ from run to run."""
+
+    code: int | str
+    files: dict[str, str]
+    loose: frozenset[str]
+
+    @classmethod
+    def of(cls, situation: Situation, first: Outcome, second: Outcome) -> Expected:
+        """As two runs show."""
+        assert first.code in (0, 3), (situation.name, first.code, first.error)
+        assert first.code == second.code, (situation.name, second.code, second.error)
+        files = _without(situation, first.after)
+        loose = {name for name, digest in files.items() if second.after.get(name) != digest}
+        return cls(first.code, files, frozenset(loose))
+
+    def defects(self, situation: Situation, outcome: Outcome, again: Outcome | None = None) -> list[str]:
+        """What a door may not have done on a disk that fails, and ``again`` on one that does not any more."""
+        if outcome.code != 2:
+            found = self._wrong(situation, outcome, "is")
+        else:
+            before, after = _without(situation, outcome.before), _without(situation, outcome.after)
+            made = {
+                name for name, digest in after.items() if situation.grows and self._is_whole(name, digest)
+            }
+            before = {name: one for name, one in before.items() if name not in made}
+            leaves = "|".join(f"^{re.escape(name)}$" for name in made) or r"(?!)"
+            told = replace(situation.case, says=r"\S", code=2, leaves=leaves)
+            found = replace(outcome, before=before, after=after).faults(told)
+        return found + ([] if again is None else self._wrong(situation, again, "is afterwards"))
+
+    def _is_whole(self, name: str, digest: str) -> bool:
+        """Whether a file is there as it must be in the end."""
+        return digest == self.files.get(name) or name in self.loose
+
+    def _wrong(self, situation: Situation, outcome: Outcome, when: str) -> list[str]:
+        """Whether what there is, is what there must be."""
+        found = [] if outcome.code == self.code else [f"exit code {when} {outcome.code}, not {self.code}"]
+        if "Traceback" in outcome.error:
+            found.append(f"a traceback {when} there")
+        there = _without(situation, outcome.after)
+        # Of a file that a damaged list no longer names the door says under which name it keeps it.
+        said = outcome.error + outcome.output
+        kept = {name for name in there if ".kept." in name and Path(name).name in said}
+        changed = [
+            name
+            for name in (self.files.keys() | there.keys()) - kept
+            if name not in there or not self._is_whole(name, there[name])
+        ]
+        return [*found, *([f"{when} wrong or missing: {sorted(changed)[:4]}"] if changed else [])]
+
+
+def _without(situation: Situation, state: dict[str, str]) -> dict[str, str]:
+    """A state without the cache; where files come one by one without their list, too."""
+    cache = f"{HERE}{situation.cache}"
+    return {
+        name: one
+        for name, one in state.items()
+        if name != cache
+        and not name.startswith(f"{cache}/")
+        and not (situation.grows and name.rpartition("/")[2].startswith((LIST, "events.out.")))
+    }

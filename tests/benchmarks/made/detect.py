@@ -1,0 +1,197 @@
+"""What a detector would find in the images of a made drive: true corners, projected, with its errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.benchmarks.made.world import World
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import apply, camera_centre
+from v2hdm.records import (
+    DIAMOND,
+    LANE_DASH,
+    STOP_LINE,
+    BoolArray,
+    CameraInfo,
+    Drive,
+    FloatArray,
+    ImageDetections,
+    MarkingDetection,
+)
+from v2hdm.simulate.port.drive import hidden_by
+
+_RANGE_M = 22.0  # as the detector's max_range_m
+_POINT_PX = 1.5  # as its max_corner_sigma_px for the mapping
+_BORDER_PX = 4.0
+_HIDDEN_PX = 200.0  # sigma of a corner in the direction that the image's border hides
+_NEAR_M = 0.3
+_BISECTIONS = 12
+_TANGENT = 0.98  # share of the way to the border, from which on a side is straight
+_IMAGES = 42  # stream of a seed
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The corners of all markings in one image: ``px`` (J, 4, 2), ``inside`` and ``distance_m`` (J, 4)."""
+
+    px: FloatArray
+    inside: BoolArray
+    distance_m: FloatArray
+
+
+def detect(world: World, drive: Drive) -> tuple[list[ImageDetections], FloatArray]:
+    """The detections in every image of a drive, and the share (I, J) of each marking that it shows."""
+    names, found = sorted(world.cameras), []
+    visibility = np.zeros((len(drive.images), len(world.corners_map)))
+    for i, image in enumerate(drive.images):
+        frame = world.frame_of(image)
+        source = world
+        if world.elsewhere is not None and frame in world.elsewhere[1]:
+            source = world.elsewhere[0]
+        rng = np.random.default_rng([source.recipe.seed, _IMAGES, names.index(image.camera), frame])
+        markings, shown = _in_image(source, image.camera, frame, rng)
+        if source is world:
+            visibility[i] = shown
+        found.append(ImageDetections(i, tuple(markings), ()))
+    return found, visibility
+
+
+def _in_image(
+    world: World, camera: str, frame: int, rng: np.random.Generator
+) -> tuple[list[MarkingDetection], FloatArray]:
+    """The detections in one image, and the share (J,) of each marking that it shows."""
+    errors, corners = world.recipe.detector, world.corners_map
+    cam_from_map = world.cam_from_vehicle[camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
+    lens = world.lenses[camera]
+    seen = project(lens, cam_from_map, corners)
+    candidates = (seen.distance_m.max(axis=1) < _RANGE_M) & (seen.inside.sum(axis=1) >= 2)
+    covered = np.zeros_like(seen.inside)
+    covered[candidates] = _covered(world, frame, camera_centre(cam_from_map), corners[candidates])
+    shown = (seen.inside & ~covered).mean(axis=1)
+    # All is drawn for all markings, so that a fault which hides some leaves the errors of the others alone.
+    count = len(corners)
+    light = np.exp(rng.normal(0.0, errors.sigma_spread))
+    spread = np.exp(rng.normal(0.0, errors.sigma_spread, (count, 4)))
+    sigma = errors.sigma_px * light * spread * (1 + (seen.distance_m / errors.doubled_at_m) ** 2)
+    off = rng.standard_normal((count, 4, 2)) * sigma[..., None]
+    missed, cut = rng.random(count) < errors.missed, rng.random(count) < errors.cut
+    found = []
+    for j in np.flatnonzero(candidates & ~covered.any(axis=1) & ~missed):
+        px, covariance = seen.px[j] + off[j], np.zeros((4, 2, 2))
+        covariance[:] = np.square(sigma[j])[:, None, None] * np.eye(2)
+        for k in np.flatnonzero(~seen.inside[j]):
+            px[k], covariance[k] = _at_border(lens, cam_from_map, corners[j], seen, j, k, sigma[j, k])
+            px[k] += rng.multivariate_normal(np.zeros(2), np.square(sigma[j, k]) * np.eye(2))
+        if cut[j]:
+            px = _cut(px, float(rng.uniform(0.2, 0.6)))
+        covariance *= errors.stated_factor
+        kind = world.port.hd_map.markings[j].kind
+        found.append(_detection(kind, px, covariance, seen.inside[j], lens))
+    for _ in range(rng.poisson(errors.false * len(found))):
+        false = _false(world, camera, frame, cam_from_map, rng)
+        if false is not None:
+            found.append(false)
+    return found, shown
+
+
+def _covered(world: World, frame: int, centre_map: FloatArray, corners_map: FloatArray) -> BoolArray:
+    """Which corners (J, 4, 3) a stack, a truck or a barrier hides from a camera."""
+    near = [
+        box
+        for box in world.port.renderer.scene.boxes + world.port.moving_boxes(frame)
+        if np.hypot(*(np.array(box.centre_map) - centre_map[:2])) < _RANGE_M + np.hypot(*box.size_m[:2])
+        and box.base_m < centre_map[2]
+    ]
+    return hidden_by(near, centre_map, corners_map[..., :2].reshape(-1, 2)).reshape(-1, 4)
+
+
+def project(lens: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> Projected:
+    """Points (J, K, 3) as a camera records them."""
+    cam = apply(cam_from_map, points_map.reshape(-1, 3))
+    depth = cam[:, 2]
+    ahead = depth > _NEAR_M
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pinhole = (cam / depth[:, None]) @ lens.intrinsic.T
+    # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
+    size = np.array([lens.width, lens.height])
+    inside = ahead & ((pinhole[:, :2] > -0.25 * size) & (pinhole[:, :2] < 1.25 * size)).all(axis=1)
+    px = np.full((len(cam), 2), np.nan)
+    px[inside] = distort_points(lens, pinhole[inside, :2])
+    inside[inside] = ((px[inside] >= 0) & (px[inside] <= size - 1)).all(axis=1)
+    distance = np.linalg.norm(points_map.reshape(-1, 3)[:, :2] - camera_centre(cam_from_map)[:2], axis=1)
+    shape = points_map.shape[:2]
+    return Projected(px.reshape(*shape, 2), inside.reshape(shape), distance.reshape(shape))
+
+
+def _at_border(
+    lens: CameraInfo,
+    cam_from_map: FloatArray,
+    corners: FloatArray,
+    seen: Projected,
+    j: int,
+    k: int,
+    sigma_px: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Where a side leaves the image on its way to a corner outside, and the covariance of that corner."""
+    beside = [n for n in ((k + 1) % 4, (k - 1) % 4) if seen.inside[j, n]]
+    if not beside:
+        corner = seen.px[j, seen.inside[j]].mean(axis=0)
+        return corner, _HIDDEN_PX**2 * np.eye(2)
+    start, end = corners[beside[0]], corners[k]
+    low, high = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        point = project(lens, cam_from_map, (start + middle * (end - start))[None, None])
+        low, high = (middle, high) if point.inside[0, 0] else (low, middle)
+    # The direction of the side where it leaves the image: the lens bends it on the way there.
+    shares = np.array([_TANGENT * low, low])[:, None]
+    before, px = project(lens, cam_from_map, (start + shares * (end - start))[None]).px[0]
+    if len(beside) == 2:  # a tip of which the border hides all: two sides may end there or beyond
+        return px, _HIDDEN_PX**2 * np.eye(2)
+    along = (px - before) / max(float(np.linalg.norm(px - before)), 1e-9)
+    return px, _HIDDEN_PX**2 * np.outer(along, along) + sigma_px**2 * np.eye(2)
+
+
+def _cut(px: FloatArray, share: float) -> FloatArray:
+    """Corners (4, 2) of a marking whose upper end in the image is hidden by this share."""
+    order = np.argsort(px[:, 1])
+    cut = px.copy()
+    for k in order[:2]:
+        neighbour = min(((k + 1) % 4, (k - 1) % 4), key=lambda n: -px[n, 1])
+        cut[k] += share * (px[neighbour] - px[k])
+    return cut
+
+
+def _detection(
+    kind: str, px: FloatArray, covariance: FloatArray, inside: BoolArray, lens: CameraInfo
+) -> MarkingDetection:
+    full = np.zeros((8, 8))
+    for k in range(4):
+        full[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = covariance[k]
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    size = np.array([lens.width, lens.height])
+    clear = ((px > _BORDER_PX) & (px < size - 1 - _BORDER_PX)).all(axis=1)
+    return MarkingDetection(kind, 0.95, px, full, inside & clear & (sigma <= _POINT_PX))
+
+
+def _false(
+    world: World, camera: str, frame: int, cam_from_map: FloatArray, rng: np.random.Generator
+) -> MarkingDetection | None:
+    """A quadrilateral on bare ground, where the camera's region of interest is."""
+    roi = world.cameras[camera].roi_vehicle
+    spot = rng.dirichlet(np.ones(len(roi))) @ roi
+    length_m, width_m = rng.uniform(0.6, 2.0), rng.uniform(0.15, 0.8)
+    turn = rng.uniform(-np.pi, np.pi)
+    quad = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length_m, width_m)
+    quad = quad @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + spot
+    points = apply(world.map_from_vehicle[frame], np.column_stack([quad, np.zeros(4)]))
+    seen = project(world.lenses[camera], cam_from_map, points[None])
+    if not seen.inside.all():
+        return None
+    kind = str(rng.choice([DIAMOND, LANE_DASH, STOP_LINE]))
+    sigma = 2.0 * world.recipe.detector.sigma_px
+    px = seen.px[0] + rng.normal(0.0, sigma, (4, 2))
+    covariance = np.tile(sigma**2 * np.eye(2), (4, 1, 1))
+    return _detection(kind, px, covariance, seen.inside[0], world.lenses[camera])

@@ -1,0 +1,372 @@
+"""Drives made without pictures: are right ones passed, spoilt ones named, and are the stated sigmas right?
+
+``python -m tests.benchmarks.right_drives [--seeds 0 200] [--spoil KIND ...] [--only PATTERN] [--workers 2]
+[--out FILE]`` draws right drives (:mod:`tests.benchmarks.made`): a port's paint, a straight, bent or turning
+route, errors of the poses, of the road and of the detector, stated as they are or left to the default. The
+detections are the true corners, projected, with these errors. Each drive goes through the checks of its poses
+and cameras, through the mapping, and through the verdict, as the product does from detections on; only what
+looks at pixels (bare ground, exposure) is left out. It prints a line a drive; how many right drives fail; of
+the score tests by kind, how well their p-values are uniform (Kolmogorov-Smirnov); and the share of errors
+inside the 95 % regions. ``--spoil`` maps each drive with each of these faults as well (``all``, or names of
+:data:`tests.benchmarks.made.faults.SPOILS`): a map whose corners are more than 1.3 times as far off as those
+of the drive as it was is wrong. ``--control`` states all errors as they are and draws none of another kind:
+what is not uniform there is a mistake of this benchmark or of the mathematics.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from scipy.stats import chi2, kstest
+
+from tests.benchmarks.made.detect import detect
+from tests.benchmarks.made.draw import ROUTES, Recipe, draw
+from tests.benchmarks.made.faults import SPOILS, Spoil
+from tests.benchmarks.made.world import drive_of, make, truth_of
+from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
+from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
+from v2hdm.errors import V2hdmError
+from v2hdm.mapping.methods import run_methods
+from v2hdm.pipeline.camera_sets import BEST, camera_sets
+from v2hdm.records import Drive
+from v2hdm.report.metrics import driven_past, marking_metrics
+from v2hdm.verdict import Finding, Verdict
+from v2hdm.verdict.inputs.cameras import check_camera
+from v2hdm.verdict.inputs.drive import causes, check_road
+from v2hdm.verdict.inputs.heading import check_heading
+from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
+from v2hdm.verdict.inputs.recording import check_clocks
+from v2hdm.verdict.results.solution import check_solution
+from v2hdm.workers import share_out
+
+CLEAN = "nothing"
+_INSIDE = float(chi2.ppf(0.95, 1))
+_MOUNTING = ("height", "roll", "pitch", "yaw")
+_LEVEL = 0.01  # of the tests whether p-values are uniform
+_REFUSED, _CRASHED = "refused", "CRASHED"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of one drive.
+
+    ``tests`` are the score tests: kind, p-value, value, sigma. ``errors`` are squared, in sigmas, by
+    quantity. ``seconds`` are of the CPU.
+    """
+
+    seed: int
+    route: str
+    name: str
+    spoil: str
+    default_noise: bool
+    road: bool
+    status: str
+    findings: list[dict[str, Any]] = field(default_factory=list)
+    untold: list[dict[str, Any]] = field(default_factory=list)
+    rmse_m: float = float("nan")
+    recall: float = float("nan")
+    false: int = 0
+    markings: int = 0
+    tests: list[dict[str, Any]] = field(default_factory=list)
+    errors: dict[str, list[float]] = field(default_factory=dict)
+    drawn: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    @property
+    def first(self) -> str:
+        """What was said first."""
+        return _sentence(self.findings[0]) if self.findings else "-"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One drive to map.
+
+    Attributes:
+        seed: of all that is drawn.
+        route: one of :data:`ROUTES`; None draws one.
+        spoil: name of the fault.
+        alone: whether each camera is mapped by itself, too.
+        control: whether errors are of the kind and the size that the product reckons with.
+    """
+
+    seed: int
+    route: str | None = None
+    spoil: str = CLEAN
+    alone: bool = False
+    control: bool = False
+
+    @property
+    def recipe(self) -> Recipe:
+        """What is drawn for it."""
+        drawn = draw(self.seed, self.route)
+        return drawn.as_modelled() if self.control else drawn
+
+
+def map_one(job: Job) -> Row:
+    """Make, map and judge one drive."""
+    recipe = job.recipe
+    world = make(recipe)
+    if job.spoil != CLEAN:
+        world = SPOILS[job.spoil].change(world)
+    drive = drive_of(world)
+    detections, visibility = detect(world, drive)
+    truth = truth_of(world, drive, visibility)
+    about: dict[str, Any] = {
+        "seed": job.seed, "route": recipe.route, "name": recipe.port.name, "spoil": job.spoil,
+        "default_noise": recipe.default_noise, "road": recipe.road is not None,
+        "drawn": recipe.as_figures(),
+    }  # fmt: skip
+    begin_s = time.process_time()
+    sets = camera_sets(drive)
+    if not job.alone:
+        sets = dict(list(sets.items())[-1:])
+    try:
+        methods = {name: run_methods(drive, detections, cameras) for name, cameras in sets.items()}
+        findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
+    except V2hdmError as error:
+        refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
+        return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)
+    except Exception as error:  # what a benchmark of robustness is for
+        crash = {"check": _CRASHED, "says": f"{type(error).__name__}: {error}", "status": _CRASHED}
+        return Row(**about, status=_CRASHED, findings=[crash], seconds=time.process_time() - begin_s)
+    seconds = time.process_time() - begin_s
+    verdict = Verdict.of(findings)
+    best = list(methods.values())[-1][BEST]
+    expected = driven_past(drive, truth, tuple(drive.cameras))
+    figures = marking_metrics(best.hd_map, truth, expected)
+    errors = squared_errors(best, truth) if figures.markings > figures.false_markings else {}
+    assert best.evidence is not None
+    return Row(
+        **about,
+        status=verdict.status.value,
+        findings=[finding.as_json() for finding in verdict.raised],
+        untold=[finding.as_json() for finding in verdict.unobservable],
+        rmse_m=figures.corner_rmse_m,
+        recall=figures.recall,
+        false=figures.false_markings,
+        markings=figures.markings,
+        tests=[_test(one) for one in (*best.evidence.corrected, *best.evidence.score_tests)],
+        errors={name: np.round(own, 3).tolist() for name, own in errors.items()},
+        seconds=seconds,
+    )
+
+
+def findings_of_inputs(drive: Drive) -> list[Finding]:
+    """The findings before the mapping, as far as they look at no picture."""
+    motion = Motion.of(drive)
+    findings = [
+        *check_path(motion),
+        *check_heading(motion),
+        *check_attitude(motion),
+        *check_jumps(motion, drive.pose_noise),
+        *check_clocks(drive, motion),
+        *check_noise(motion, drive.pose_noise),
+        *check_road(drive),
+    ]
+    for name, camera in drive.cameras.items():
+        findings += check_camera(name, camera)
+    return causes(findings)
+
+
+def _test(one: Any) -> dict[str, Any]:
+    """A score test for the record; its p-value is its own where it has one, else that of its chi-square."""
+    own = getattr(one, "p_value", None)
+    whose = "each" if len(one.cameras) == 1 else "all"
+    return {
+        "kind": f"{one.fault.value} {one.axis} {whose}",
+        "cameras": list(one.cameras),
+        "p": float(chi2.sf(one.sigmas**2, 1)) if own is None else float(own),
+        "value": one.value,
+        "sigma": one.sigma,
+    }
+
+
+def _sentence(finding: dict[str, Any]) -> str:
+    return f"{finding['check']}: {finding['says']}"
+
+
+def _clause(finding: dict[str, Any]) -> str:
+    """What a finding names, without the recovery, which may speak of other causes."""
+    return f"{finding['check']} {finding['says'].split(': ')[0]}"
+
+
+def line(row: Row, clean: Row | None) -> str:
+    """A drive as it is printed, against itself without the fault."""
+    shares = _shares([row])
+    inside = " ".join(f"{shares[name]:.2f}" for name in ("corners", "sides", "distances", "mountings"))
+    mark = ""
+    if clean is not None:
+        wrong, told, named = judge(row, clean)
+        mark = (
+            f"{'wrong' if wrong else 'right'} {'told' if told else 'SILENT' if wrong else 'pass'} {named:6}| "
+        )
+    noise = ("default" if row.default_noise else "stated") + (", road" if row.road else "")
+    return (
+        f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
+        f"{100 * row.rmse_m:6.2f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
+        f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}"
+    )
+
+
+def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
+    """Whether a spoilt map is wrong, whether the user is told, and when the cause is named."""
+    spoil = SPOILS[row.spoil]
+    wrong = not row.rmse_m <= RIGHT_FACTOR * clean.rmse_m
+    said, pattern = [_clause(finding) for finding in row.findings], spoil.cause
+    if row.route == "straight" and spoil.hidden_on_straight is not None and not said:
+        said, pattern = [_clause(finding) for finding in row.untold], spoil.hidden_on_straight
+    if pattern is None or not said:
+        return wrong, bool(said), "-"
+    hits = [re.search(pattern, one, re.IGNORECASE) is not None for one in said]
+    return wrong, True, "first" if hits[0] else "later" if any(hits) else "never"
+
+
+def _shares(rows: Iterable[Row]) -> dict[str, float]:
+    """By quantity, the share of errors inside the 95 % region."""
+    quantities, out = {**{name: (name,) for name in QUANTITIES}, "mountings": _MOUNTING}, {}
+    for name, parts in quantities.items():
+        errors = np.concatenate([[], *(row.errors.get(part, []) for row in rows for part in parts)])
+        out[name] = float(np.mean(errors <= _INSIDE)) if len(errors) else float("nan")
+    return out
+
+
+def summary_of_right(rows: Sequence[Row]) -> list[str]:
+    """Failed drives, whether p-values are uniform, and coverage, of drives without a fault."""
+    status = Counter(row.status for row in rows)
+    lines = [f"right drives: {len(rows)}, " + ", ".join(f"{count} {name}" for name, count in status.items())]
+    lines += [
+        f"  {row.status} {row.seed} ({row.name} {row.route}, {100 * row.rmse_m:.1f} cm): {row.first}"
+        for row in rows
+        if row.status != "PASS"
+    ]
+    said = Counter(finding["check"] for row in rows for finding in row.findings)
+    lines.append(
+        "raised: " + (", ".join(f"{check} {count}" for check, count in said.most_common()) or "nothing")
+    )
+    by_kind: dict[str, list[float]] = {}
+    for row in rows:
+        for one in row.tests:
+            if np.isfinite(one["sigma"]):
+                by_kind.setdefault(one["kind"], []).append(one["p"])
+    lines.append(f"{'score test':22s}{'tests':>6s}{'KS p':>10s}{'least p':>10s}{'p < .05':>9s}")
+    for kind, p in sorted(by_kind.items()):
+        uniform = float(kstest(p, "uniform").pvalue)
+        mark = "" if uniform >= _LEVEL else "  not uniform"
+        lines.append(
+            f"{kind:22s}{len(p):6d}{uniform:10.2g}{min(p):10.1g}{np.mean(np.array(p) < 0.05):9.2f}{mark}"
+        )
+    lines.append(f"{'inside 95 %':22s}" + " ".join(f"{name:>9s}" for name in (*QUANTITIES, "mountings")))
+    for name, own in (
+        ("noise stated", [row for row in rows if not row.default_noise]),
+        ("noise by default", [row for row in rows if row.default_noise]),
+        ("attitude recorded", [row for row in rows if row.road]),
+        ("all", rows),
+    ):
+        lines.append(f"{name:22s}" + " ".join(f"{share:9.3f}" for share in _shares(own).values()))
+    rmse = np.array([row.rmse_m for row in rows])
+    lines.append(
+        f"corner RMSE, median {100 * np.nanmedian(rmse):.2f} cm, recall "
+        f"{np.nanmean([r.recall for r in rows]):.3f}, {np.mean([row.seconds for row in rows]):.1f} s a drive"
+    )
+    return lines
+
+
+def summary_of_spoilt(rows: Sequence[Row], clean: dict[int, Row]) -> list[str]:
+    """By fault, how many maps are wrong, silently, and when the true cause is named."""
+    columns = ("drives", "wrong", "SILENT", "told", "first", "later", "never")
+    lines = [f"{'fault':18s}" + "".join(f"{column:>7s}" for column in columns)]
+    for spoil in dict.fromkeys(row.spoil for row in rows):
+        own = [row for row in rows if row.spoil == spoil]
+        judged = [judge(row, clean[row.seed]) for row in own]
+        named = Counter(when for _, _, when in judged)
+        lines.append(
+            f"{spoil:18s}{len(own):7d}{sum(wrong for wrong, _, _ in judged):7d}"
+            f"{sum(wrong and not told for wrong, told, _ in judged):7d}"
+            f"{sum(told for _, told, _ in judged):7d}"
+            f"{named['first']:7d}{named['later']:7d}{named['never']:7d}"
+        )
+        said = Counter(finding["check"] for row in own for finding in row.findings)
+        checks = ", ".join(f"{check} {count}" for check, count in said.most_common())
+        lines.append(f"    {checks or 'nothing'}")
+    return lines
+
+
+def _start_worker() -> None:
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+def measure(jobs: Sequence[Job], workers: int, verbose: bool) -> list[Row]:
+    """Map all drives; prints a line as each is finished. A clean drive comes before its spoilt ones."""
+    rows: list[Row] = []
+    clean: dict[int, Row] = {}
+
+    def take(row: Row) -> None:
+        rows.append(row)
+        if row.spoil == CLEAN:
+            clean[row.seed] = row
+        print(line(row, None if row.spoil == CLEAN else clean[row.seed]), flush=True)
+        if verbose:
+            for finding in row.findings:
+                print(f"        {finding['status']} {_sentence(finding)}", flush=True)
+
+    if workers == 1:
+        _start_worker()
+        for job in jobs:
+            take(map_one(job))
+    else:
+        share_out(map_one, jobs, workers, _start_worker, (), take)
+    return rows
+
+
+def wanted_spoils(names: Sequence[str]) -> list[Spoil]:
+    """The faults of these names, all for ``all``."""
+    return list(SPOILS.values()) if "all" in names else [SPOILS[name] for name in names]
+
+
+def main() -> None:
+    """Print the lines and the summary."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument(
+        "--seeds", nargs=2, type=int, default=[0, 200], help="the first, and the one after the last"
+    )
+    parser.add_argument("--route", choices=ROUTES, help="instead of a drawn one")
+    parser.add_argument("--spoil", nargs="+", default=[], choices=["all", *SPOILS], metavar="KIND")
+    parser.add_argument("--only", default="", help="pattern of 'port route seed' of the drives to map")
+    parser.add_argument(
+        "--alone", action="store_true", help="map each camera by itself, too, as the product does"
+    )
+    parser.add_argument(
+        "--control", action="store_true", help="draw no errors but those that the product reckons with"
+    )
+    parser.add_argument("--verbose", action="store_true", help="print all findings")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("outputs/right_drives.json"))
+    parsed = parser.parse_args()
+    seeds = [s for s in range(*parsed.seeds) if re.search(parsed.only, Job(s, parsed.route).recipe.name)]
+    kinds = [CLEAN, *(spoil.name for spoil in wanted_spoils(parsed.spoil))]
+    jobs = [Job(seed, parsed.route, kind, parsed.alone, parsed.control) for seed in seeds for kind in kinds]
+    rows = measure(jobs, parsed.workers, parsed.verbose or bool(parsed.spoil))
+    parsed.out.parent.mkdir(parents=True, exist_ok=True)
+    parsed.out.write_text(json.dumps([asdict(row) for row in rows]))
+    right = [row for row in rows if row.spoil == CLEAN]
+    print("\n" + "\n".join(summary_of_right(right)))
+    if parsed.spoil:
+        spoilt = [row for row in rows if row.spoil != CLEAN]
+        print("\n" + "\n".join(summary_of_spoilt(spoilt, {row.seed: row for row in right})))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""Drives that are made without pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.made.detect import detect
+from tests.benchmarks.made.draw import Recipe, draw
+from tests.benchmarks.made.faults import SPOILS
+from tests.benchmarks.made.world import drive_of, make, smooth_noise
+from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px
+from v2hdm.geometry.lens import undistort_points
+
+
+def _exact(seed: int) -> Recipe:
+    recipe = draw(seed, "straight").as_modelled()
+    return replace(recipe, detector=replace(recipe.detector, sigma_px=1e-6))
+
+
+def test_equal_seeds_draw_equal_drives() -> None:
+    assert draw(3) == draw(3) != draw(4)
+
+
+def test_exact_corners_lie_on_the_true_paint() -> None:
+    world = make(_exact(3))
+    drive = drive_of(world)
+    detections, _ = detect(world, drive)
+    true_map = world.corners_map[..., :2].reshape(-1, 2)
+    off_m = []
+    for found in detections[:20]:
+        image = drive.images[found.image]
+        frame, lens = world.frame_of(image), world.lenses[image.camera]
+        pose = world.cam_from_vehicle[image.camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
+        for marking in found.markings:
+            pinhole = undistort_points(lens, marking.corners_px[marking.corner_valid])
+            ground = apply_homography(ground_from_pinhole_px(lens.intrinsic, pose), pinhole)
+            off_m += [np.linalg.norm(true_map - corner, axis=1).min() for corner in ground]
+    assert len(off_m) > 100
+    assert max(off_m) < 1e-3
+
+
+def test_smooth_noise_has_the_size_that_was_asked_for() -> None:
+    drawn = smooth_noise(np.arange(0.0, 20_000.0, 1.0), 0.5, 5.0, np.random.default_rng(1), 2)
+    assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("name", list(SPOILS))
+def test_every_fault_changes_the_drive_and_leaves_the_map_alone(name: str) -> None:
+    world = make(_exact(5))
+    spoilt = SPOILS[name].change(world)
+    assert spoilt is not world
+    assert spoilt.port.hd_map is world.port.hd_map
+    assert len(drive_of(spoilt).images) > 0

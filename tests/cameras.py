@@ -1,0 +1,15 @@
+"""Where made-up cameras sit on their vehicles, by SciPy: none of the package's own rotations."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+OPTICAL_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def mounted(centre, pitch_deg=0.0, yaw_deg=0.0, roll_deg=0.0):
+    """``cam_from_vehicle`` of a camera at ``centre`` that looks ahead, down by pitch, to the left by yaw."""
+    vehicle_from_body = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
+    out = np.eye(4)
+    out[:3, :3] = OPTICAL_FROM_BODY @ vehicle_from_body.T
+    out[:3, 3] = -out[:3, :3] @ np.asarray(centre)
+    return out
