@@ -11,19 +11,19 @@ COUNT = 40
 ALL = np.arange(COUNT)
 
 
-def counts(rejected: np.ndarray | None = None) -> Counts:
+def counts(rejected=None):
     """Twelve images of four corners each, of which so many were rejected."""
     twelve, zero = np.full(COUNT, 12), np.zeros(COUNT, dtype=np.int64)
     agreeing = 4 * twelve - (zero if rejected is None else rejected)
     return Counts(twelve, 4 * twelve, agreeing, twelve, twelve, zero)
 
 
-def usual(rng: np.random.Generator) -> np.ndarray:
+def usual(rng):
     """Sums of squared residuals whose variance differs from marking to marking."""
     return 0.7 * rng.chisquare(88, COUNT) * 6 / rng.chisquare(6, COUNT)
 
 
-def test_right_markings_are_seldom_suspicious() -> None:
+def test_right_markings_are_seldom_suspicious():
     rng = np.random.default_rng(0)
     rejected = [rng.binomial(12, 0.05, COUNT) * 4 for _ in range(50)]
     worst = [most_suspicious(ALL, rng.uniform(size=COUNT), usual(rng), counts(one))[0].p for one in rejected]
@@ -31,7 +31,7 @@ def test_right_markings_are_seldom_suspicious() -> None:
     assert len(most_suspicious(ALL, rng.uniform(size=COUNT), usual(rng), counts())) == 10
 
 
-def test_a_wrong_shape_large_residuals_and_disputed_sightings_each_come_first() -> None:
+def test_a_wrong_shape_large_residuals_and_disputed_sightings_each_come_first():
     rng = np.random.default_rng(1)
     misfit, squared, rejected = np.full(COUNT, 0.5), usual(rng), np.zeros(COUNT, dtype=np.int64)
     misfit[7], squared[8], rejected[9] = 1e-9, 400 * squared[8], 20
@@ -44,14 +44,14 @@ def test_a_wrong_shape_large_residuals_and_disputed_sightings_each_come_first() 
     assert by_id[10].disputed == 20 / 48
 
 
-def test_ids_count_the_accepted_candidates_alone() -> None:
+def test_ids_count_the_accepted_candidates_alone():
     misfit = np.full(COUNT, 0.5)
     misfit[20] = 1e-9
     found = most_suspicious(ALL[10:], misfit, usual(np.random.default_rng(2)), counts())
     assert found[0].marking == 11
 
 
-def test_residuals_of_a_corner_behind_the_camera_are_suspicious_and_end_in_no_traceback() -> None:
+def test_residuals_of_a_corner_behind_the_camera_are_suspicious_and_end_in_no_traceback():
     squared = usual(np.random.default_rng(4))
     squared[[3, 5]] = np.nan, np.inf
     found = most_suspicious(ALL, np.ones(COUNT), squared, counts())
@@ -59,6 +59,6 @@ def test_residuals_of_a_corner_behind_the_camera_are_suspicious_and_end_in_no_tr
     assert all(np.isfinite(one.p) for one in found)
 
 
-def test_two_markings_have_no_spread_to_be_held_against() -> None:
+def test_two_markings_have_no_spread_to_be_held_against():
     found = most_suspicious(ALL[:2], np.ones(COUNT), usual(np.random.default_rng(3)), counts())
     assert [one.p for one in found] == [1.0, 1.0]

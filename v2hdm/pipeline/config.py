@@ -76,7 +76,7 @@ class RunConfig:
         device: the value that ``conf/map.yaml`` passes on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: the value that it passes on as ``mapping.mode``, ``batch`` or ``incremental``.
-        accuracy_goal_cm: the radius, cm, within which 95 % of the corners have to lie and calibrations have to be
+        accuracy_goal_cm: the radius, cm, within which 95 % of the corners, and the calibrations, have to be
             known at 95 %, else the verdict is WARN (docs/verdict.md).
         mosaic: whether the ground is shown from above, too (docs/mosaic.md).
         viewer: ``rerun`` shows and records the run while it goes on (docs/live-view.md), ``none`` does not.

@@ -238,7 +238,7 @@ class _Hypothesis:
         innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
         innovation = innovation + self.paint_m2 * np.eye(5)
         solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
-        return innovation, solved, np.sum(self.residual * solved, axis=1)
+        return innovation, np.asarray(solved), np.asarray(np.sum(self.residual * solved, axis=1))
 
     @property
     def log_likelihood(self) -> FloatArray:
