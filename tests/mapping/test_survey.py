@@ -14,7 +14,7 @@ from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.mapping.bundle import full_model, solve_bundle
+from v2hdm.mapping.bundle import full_model, pose_sigma_of, solve_bundle
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SizeOptions, SurveyOptions, check_options
@@ -213,7 +213,9 @@ def test_a_joint_solve_keeps_to_the_sizes():
     bundle = optimiser.run(optimiser.initial_tracks()).bundle
     spread = []
     for sizes in (SizeOptions(), SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)):
-        model = full_model([scene.drive.pose_noise], replace(options, known_sizes=sizes), "heave")
+        model = full_model(
+            [pose_sigma_of(scene.drive.pose_noise)], replace(options, known_sizes=sizes), "heave"
+        )
         usable = sightings.valid & (bundle.association.group >= 0)[:, None]
         solved = solve_bundle(
             sightings, bundle.association, usable, bundle.rig, scene.drive.cameras, model

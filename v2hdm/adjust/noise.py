@@ -120,6 +120,8 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
     drift_m2, total_m2 = np.mean([[drift.sigma**2, sigma**2] for sigma, drift in stated], axis=0)
     over_m = float(np.mean([drift.over_m for _, drift in stated]))
     correlation, step_m, path_m = _autocorrelation(problem, errors)
+    if not total_m2 > 0 or not correlation[0] > 0:  # not among the states of the frames
+        return _Scales()
     if not drift_m2 or len(correlation) < _LEAST_LAGS:
         count = errors.shape[1] * errors.shape[2]
         return _Scales(white=_shrunk(0.5 * math.log(correlation[0] / total_m2), 1 / (2 * count)))

@@ -83,8 +83,8 @@ _AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_OBSERVABLE_S = 0.004
-"""Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
+CLOCK_OBSERVABLE_S = 0.006
+"""Sigma of a clock offset, s, up to which it is put right: two of them are 12 ms."""
 
 _CENTRE_OBSERVABLE_M = 0.1
 """Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
