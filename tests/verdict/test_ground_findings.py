@@ -123,12 +123,17 @@ def test_ground_that_never_matches_fails_and_lists_what_to_look_at() -> None:
     assert "check the clock, the unit of the positions" in told(nothing)["ground match"]
 
 
-def test_too_little_ground_is_no_fault() -> None:
-    little = replace(
-        estimate(), status=GroundStatus.TOO_LITTLE, shares={Reading.AS_GIVEN: 0.0}, parameters={}
-    )
+@pytest.mark.parametrize(
+    ("status", "helps"),
+    [(GroundStatus.TOO_LITTLE, "drive further"), (GroundStatus.NO_TEXTURE, "drive by day")],
+)
+def test_ground_that_cannot_be_matched_is_no_fault_and_what_would_help_is_said(
+    status: GroundStatus, helps: str
+) -> None:
+    little = replace(estimate(), status=status, shares={Reading.AS_GIVEN: 0.0}, parameters={})
     (found,) = check_ground(drive(poses()), {"front": little})
     assert found.is_unobservable
+    assert helps in found.says
 
 
 def test_residuals_without_another_cause_point_to_the_lens() -> None:
@@ -181,6 +186,12 @@ def test_a_level_camera_cannot_tell_a_bent_lens_from_a_bent_road() -> None:
     findings = check_ground(drive(poses()), {"front": flat})
     assert not raised(findings)
     assert "distortion" in {finding.check for finding in findings if finding.is_unobservable}
+
+
+def test_dark_ground_that_matches_once_a_mistake_is_undone_fails() -> None:
+    dark = replace(LOST, status=GroundStatus.NO_TEXTURE, parameters={})
+    (found,) = check_ground(drive(poses()), {"front": dark}, "the images are upside down")
+    assert (found.status, found.says) == (Status.FAIL, "the images are upside down")
 
 
 LOST = replace(estimate(), status=GroundStatus.NO_MATCH, shares={Reading.AS_GIVEN: 0.0})

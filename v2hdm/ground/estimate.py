@@ -23,7 +23,7 @@ from v2hdm.ground.results import (
     Parameter,
     Reading,
 )
-from v2hdm.ground.start import Readings, try_readings
+from v2hdm.ground.start import Readings, contradicts, start_pairs, try_readings
 from v2hdm.records import Calibration, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.workers import share_out
 
@@ -96,10 +96,15 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
     matcher = Matcher(drive, camera, motion, options)
     readings = try_readings(drive, camera, matcher, stated, options.readings)
-    out = _nothing(camera, stated, readings)
-    if readings.start.mount is not None and readings.best is Reading.AS_GIVEN:
-        solved = _solve(matcher, stated, readings.start.mount, options)
-        out = out if solved is None else _found(out, solved, options)
+    out, start = _nothing(camera, stated, readings), readings.start
+    if readings.best is Reading.AS_GIVEN:
+        solved: _Solved | _Lost = _Lost(start_pairs(stated), start.share)
+        if start.mount is not None:
+            solved = _solve(matcher, stated, start.mount, options)
+        if isinstance(solved, _Solved):
+            out = _found(out, solved, options)
+        elif out.status is GroundStatus.NO_MATCH and not contradicts(matcher, stated.guess, *solved):
+            out = replace(out, status=GroundStatus.NO_TEXTURE)
     return replace(out, seconds=time.perf_counter() - began_s)
 
 
@@ -115,8 +120,15 @@ class _Solved:
     clock: Parameter | None
 
 
-def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | None:
-    """Match and adjust in turn, each round from the last one's solution; None without enough matches."""
+class _Lost(NamedTuple):
+    """A round without enough matches: only a ``share`` of the patches was found again in ``pairs``."""
+
+    pairs: IntArray
+    share: float
+
+
+def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | _Lost:
+    """Match and adjust in turn, each round from the last one's solution."""
     path_m = stated.path_m()
     pairs = spread_pairs(path_m, options.pairs, options.shortest_m, options.longest_m)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
@@ -129,13 +141,13 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
             mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m
         )
         if len(matched.correlation) < _LEAST_MATCHES:
-            return None
+            return _Lost(pairs[:: stage.every], matched.share)
         used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
         # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
         freed = free if stage.loosened <= _CLOCK_LOOSENED else None
         adjusted = adjust(used, prior, mount, freed, max(stage.loosened / 2, 1.0))
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
-            return None
+            return _Lost(pairs[:: stage.every], 0.0)
         mount = adjusted.mount
         if freed is not None:
             stated = replace(stated, clock_s=stated.clock_s + adjusted.extra)
