@@ -13,6 +13,7 @@ from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, 
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
+from v2hdm.ground.adjust import _by_stretch
 from v2hdm.ground.patches import read_grey
 from v2hdm.records import Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.ground import scaled
@@ -92,6 +93,24 @@ def test_a_focal_length_that_is_5_percent_too_long_is_told(turning):
     focal = estimate_ground(longer, "front", replace(FEW, free=("focal_scale",))).parameters["focal_scale"]
     assert focal.observable
     assert focal.value == pytest.approx(1 / 1.05 - 1, abs=0.01)
+
+
+@pytest.mark.parametrize("grain", [0.0, 4.0])
+@pytest.mark.parametrize("turn_deg", [0.0, 70.0])
+def test_the_focal_length_of_an_exact_lens_is_right_within_its_sigma(tmp_path, turn_deg, grain):
+    drive = make_drive(tmp_path, turn_deg, TRUE, 20.0, grain)
+    estimate = estimate_ground(drive, "front", replace(FEW, free=("focal_scale",)))
+    focal = estimate.parameters["focal_scale"]
+    assert focal.sigma < 0.01
+    assert abs(focal.value) < 3 * focal.sigma
+
+
+def test_errors_that_go_together_along_the_route_widen_a_variance():
+    image = np.repeat(np.arange(48), 10)
+    alone, together = np.random.default_rng(0).normal(size=(2, 480, 1))
+    together = np.repeat(together[:12], 40, axis=0)
+    assert _by_stretch(alone, image)[0] == pytest.approx(480, rel=0.6)
+    assert _by_stretch(together, image)[0] > 20 * _by_stretch(alone, image)[0]
 
 
 def test_a_lens_without_its_distortion_leaves_larger_residuals(turning):

@@ -256,28 +256,43 @@ def _free_parameters(
         if name == "clock_s" and solved.clock is not None:
             out[name] = replace(solved.clock, sigma=solved.clock.sigma * widened)
             continue
-        value, sigma = _free(name, observations, solved.stated, solved.adjusted)
+        value, adjusted, k = _free(name, observations, solved.stated, solved.adjusted)
         largest, why_not = _OBSERVABLE[name]
         # a fault widens the scatter; that it shows must not hang on it.
-        observable = name != "clock_s" and sigma < largest
+        observable = name != "clock_s" and float(np.sqrt(adjusted.covariance[k, k])) < largest
         if name == "focal_scale":
             observable = observable and (turns or solved.adjusted.mount.depression_rad > STEEP_RAD)
-        out[name] = Parameter(name, value, sigma * widened, observable, "" if observable else why_not)
+        sigma = _sigma(adjusted, k, factor)
+        out[name] = Parameter(name, value, sigma, observable, "" if observable else why_not)
     return out
 
 
-def _free(name: str, observations: Observations, stated: Stated, solved: Adjusted) -> tuple[float, float]:
+def _free(
+    name: str, observations: Observations, stated: Stated, solved: Adjusted
+) -> tuple[float, Adjusted, int]:
+    """The parameter, the solution with it free, and its place in that one's covariance."""
     if name in _FREE_CENTRE:
         axis, sigma_m = _FREE_CENTRE[name]
         wider = replace(stated, centre_sigma_m={**stated.centre_sigma_m, axis: sigma_m})
         used, prior, _ = wider.prior_of(observations)
         adjusted = adjust(used, prior, solved.mount, near=solved)
         value = adjusted.mount.centre_vehicle[axis] - prior.centre_vehicle[axis]
-        return float(value), float(np.sqrt(adjusted.covariance[CENTRE, CENTRE][axis, axis]))
+        return float(value), adjusted, CENTRE.start + axis
     held = stated.with_surveyed_height() if name == "focal_scale" else stated
     used, prior, _ = held.prior_of(observations)
     adjusted = adjust(used, prior, solved.mount, free=name, near=solved)
-    return adjusted.extra, float(np.sqrt(adjusted.covariance[6, 6]))
+    return adjusted.extra, adjusted, 6
+
+
+def _sigma(adjusted: Adjusted, k: int, usual: float) -> float:
+    """By how far stretches of the route disagree on an unknown, moderated by what is ``usual`` in this drive.
+
+    The few stretches say little of their own noise (Smyth, Statistical Applications in Genetics and Molecular
+    Biology 3, 2004).
+    """
+    data = adjusted.data_variance[k]
+    multiple = (usual + adjusted.stretch_variance[k] / max(data, 1e-300)) / 2
+    return float(np.sqrt(adjusted.covariance[k, k] + max(multiple - 1, 0.0) * data))
 
 
 _worker: tuple[Drive, GroundOptions | None] | None = None
