@@ -305,10 +305,10 @@ class Matcher:
 
     def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> tuple[int, float]:
         """How many patches of first images are found again in the second ones, anywhere, and their share."""
-        options, here = replace(self._options, grid_m=grid_m), np.eye(4)
+        options, roi, here = replace(self._options, grid_m=grid_m), self._roi, np.eye(4)
         found = [
-            match_anywhere(*(View(self._read(k), mount, here) for k in pair), self._roi, options)
-            for pair in pairs.tolist()
+            match_anywhere(View(self._read(a), mount, here), View(self._read(b), mount, here), roi, options)
+            for a, b in pairs.tolist()
         ]
         count, sought = sum(len(one.correlation) for one in found), sum(one.sought for one in found)
         return count, count / sought if sought else 0.0
