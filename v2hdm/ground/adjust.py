@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -223,15 +224,22 @@ class _Problem:
         )
         return _Weighted(information, gradient, cost, length, weight, score, sigma_px)
 
-    def _differences(self, now: _Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Differences (N, 2) m, their derivatives by the unknowns and by both poses, whitening (N, 2, 2)."""
+    def _differences(
+        self, now: _Unknowns, noise_px: Sequence[FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Differences (N, 2) m, their derivatives by the unknowns and by both poses, whitening (N, 2, 2).
+
+        Once the pixels' scale is known they are taken where pixels would be without their likeliest noise:
+        derivatives at pixels as seen go with it, and thousands of matches add that up to a focal length up to
+        a per cent too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear
+        problems, 1972).
+        """
         seen, poses = self.observations, self.poses(now)
-        points, known, pose = [], [], []
+        points, known, pose, slopes = [], [], [], []
         spread = np.zeros((len(seen.first), 2, 2))
-        for image, px, off_px in zip(
-            (seen.first, seen.second), (seen.first_px, seen.second_px), self._noise(now, poses), strict=True
-        ):
-            px = px - off_px
+        both = (seen.first, seen.first_px), (seen.second, seen.second_px)
+        for (image, seen_px), off_px in zip(both, noise_px or (0 * seen.first_px,) * 2, strict=True):
+            px = seen_px - off_px
             hits = hit_ground(now.mount, px, poses[image])
             by_px = by_pixel(now.mount, hits)
             bending = _bending(now.mount, px, by_px)
@@ -241,38 +249,20 @@ class _Problem:
             points.append(hits.points_map + bending @ now.bends + (by_px @ off_px[:, :, None])[..., 0])
             known.append(np.concatenate(columns, axis=2))
             pose.append(hits.by_pose())
+            slopes.append(by_px)
             blur = PIXEL_SIGMA * by_px
             spread = spread + blur @ np.swapaxes(blur, 1, 2)
         usable = np.isfinite(spread).all(axis=(1, 2))
         root = np.full(spread.shape, np.nan)
         root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
+        if self.sigma_px is not None and noise_px is None:
+            whitened = root @ (points[0] - points[1])[:, :, None]
+            pull = PIXEL_SIGMA**2 * np.nan_to_num(np.swapaxes(root, 1, 2) @ whitened)
+            likeliest = (np.swapaxes(np.nan_to_num(by_px), 1, 2) @ pull for by_px in (slopes[0], -slopes[1]))
+            limit_px = _LARGEST_NOISE_PX
+            return self._differences(now, [np.clip(one[..., 0], -limit_px, limit_px) for one in likeliest])
         jacobian = np.concatenate([known[0] - known[1], pose[0], -pose[1]], axis=2)
         return points[0] - points[1], jacobian, root
-
-    def _noise(self, now: _Unknowns, poses: FloatArray) -> list[FloatArray]:
-        """The likeliest noise (N, 2) of the pixels of both images at the estimate, px.
-
-        Derivatives at the pixels as seen go with their noise, and thousands of matches add that up to a focal
-        length up to a per cent too long (Pope, Some pitfalls to be avoided in the iterative adjustment of
-        nonlinear problems, 1972). A first solution needs no such care, and a guess would be mistaken for it.
-        """
-        seen = self.observations
-        if self.sigma_px is None:
-            return [np.zeros_like(seen.first_px)] * 2
-        points, slopes = [], []
-        for image, px in ((seen.first, seen.first_px), (seen.second, seen.second_px)):
-            hits = hit_ground(now.mount, px, poses[image])
-            slopes.append(by_pixel(now.mount, hits))
-            points.append(hits.points_map + _bending(now.mount, px, slopes[-1]) @ now.bends)
-        off = points[0] - points[1]
-        spread = slopes[0] @ np.swapaxes(slopes[0], 1, 2) + slopes[1] @ np.swapaxes(slopes[1], 1, 2)
-        usable = np.isfinite(spread).all(axis=(1, 2))
-        pull = np.zeros((len(off), 2, 1))
-        pull[usable] = np.linalg.solve(spread[usable], off[usable][:, :, None])
-        noise = (
-            (np.swapaxes(np.nan_to_num(slope), 1, 2) @ pull)[..., 0] for slope in (slopes[0], -slopes[1])
-        )
-        return [np.clip(one, -_LARGEST_NOISE_PX, _LARGEST_NOISE_PX) for one in noise]
 
     def _by_parameter(
         self, mount: Mount, hits: GroundHits, px: FloatArray, poses: FloatArray, image: IntArray
