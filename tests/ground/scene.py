@@ -49,8 +49,14 @@ def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:
     return Trajectory(at, poses)
 
 
-def make_drive(folder: Path, turn_deg: float, true: FloatArray, contrast: float = 30.0) -> Drive:
-    """Render a drive into ``folder``; its guess is the truth, its poses are exact."""
+def make_drive(
+    folder: Path, turn_deg: float, true: FloatArray, contrast: float = 30.0, grain: float = 0.0
+) -> Drive:
+    """Render a drive into ``folder``; its guess is the truth, its poses are exact.
+
+    ``contrast`` of the floor and ``grain`` of the sensor are standard deviations in grey levels.
+    """
+    rng = np.random.default_rng(11)
     trajectory = path(turn_deg)
     stamps = np.arange(0.2, trajectory.stamp_s[-1] - 0.2, _EVERY_M / _SPEED_MPS)
     poses, _ = interpolate(trajectory, stamps, np.inf)
@@ -60,7 +66,8 @@ def make_drive(folder: Path, turn_deg: float, true: FloatArray, contrast: float 
     images = []
     for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         file = folder / "front" / f"{k:03d}.png"
-        cv2.imwrite(str(file), _look(floor, rays, pose))
+        seen = _look(floor, rays, pose)
+        cv2.imwrite(str(file), np.clip(seen + rng.normal(0.0, grain, seen.shape), 0, 255).astype(np.uint8))
         images.append(Image("front", float(stamp), file, pose))
     camera = Camera(
         INFO,

@@ -11,10 +11,12 @@ from v2hdm.cli.main import run
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
+from v2hdm.ground.adjust import _by_stretch
 from v2hdm.ground.patches import read_grey
 from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.records import Trajectory
+from v2hdm.verdict.inputs.ground import scaled
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
 FEW = GroundOptions(pairs=14, clock_pairs=6, readings=False, free=())
@@ -93,6 +95,24 @@ def test_a_focal_length_that_is_5_percent_too_long_is_told(turning):
     assert focal.value == pytest.approx(1 / 1.05 - 1, abs=0.01)
 
 
+@pytest.mark.parametrize("grain", [0.0, 4.0])
+@pytest.mark.parametrize("turn_deg", [0.0, 70.0])
+def test_the_focal_length_of_an_exact_lens_is_right_within_its_sigma(tmp_path, turn_deg, grain):
+    drive = make_drive(tmp_path, turn_deg, TRUE, 20.0, grain)
+    estimate = estimate_ground(drive, "front", replace(FEW, free=("focal_scale",)))
+    focal = estimate.parameters["focal_scale"]
+    assert focal.sigma < 0.01
+    assert abs(focal.value) < 3 * focal.sigma
+
+
+def test_errors_that_go_together_along_the_route_widen_a_variance():
+    image = np.repeat(np.arange(48), 10)
+    alone, together = np.random.default_rng(0).normal(size=(2, 480, 1))
+    together = np.repeat(together[:12], 40, axis=0)
+    assert _by_stretch(alone, image)[0] == pytest.approx(480, rel=0.6)
+    assert _by_stretch(together, image)[0] > 20 * _by_stretch(alone, image)[0]
+
+
 def test_a_lens_without_its_distortion_leaves_larger_residuals(turning):
     pinhole = replace(turning.cameras["front"], info=replace(INFO, distortion=(0.0,) * 5))
     bare = replace(turning, cameras={"front": pinhole})
@@ -122,11 +142,27 @@ def test_a_heading_measured_from_north_matches_only_along_the_path(straight):
     assert estimate.reading is Reading.HEADING_FROM_PATH
 
 
-def test_a_floor_without_texture_tells_too_little(tmp_path):
-    even = make_drive(tmp_path, 0.0, TRUE, contrast=0.0)
+@pytest.mark.parametrize(("contrast", "grain"), [(0.0, 0.0), (0.0, 3.0), (1.0, 3.0)])
+def test_a_floor_without_texture_over_the_noise_tells_nothing(tmp_path, contrast, grain):
+    even = make_drive(tmp_path, 0.0, TRUE, contrast, grain)
     estimate = estimate_ground(even, "front", FEW)
-    assert estimate.status is GroundStatus.TOO_LITTLE
+    assert estimate.status is GroundStatus.NO_TEXTURE
     assert estimate.calibration is None
+
+
+@pytest.mark.parametrize("grain", [0.0, 3.0])
+def test_a_rough_floor_that_lies_elsewhere_contradicts_the_poses(tmp_path, grain):
+    feet = scaled(make_drive(tmp_path, 0.0, TRUE, 20.0, grain), 1 / 0.3048)
+    assert estimate_ground(feet, "front", FEW).status is GroundStatus.NO_MATCH
+
+
+def test_dirt_on_a_lens_over_a_floor_without_texture_contradicts_nothing(tmp_path):
+    dusk = make_drive(tmp_path, 0.0, TRUE, 0.0, 2.0)
+    dirt = np.random.default_rng(3).integers(0, 40, (40, 60), dtype=np.uint8)
+    dirt = cv2.resize(dirt, (INFO.width, INFO.height), interpolation=cv2.INTER_CUBIC)
+    for image in dusk.images:
+        cv2.imwrite(str(image.path), cv2.add(cv2.imread(str(image.path), 0), dirt))
+    assert estimate_ground(dusk, "front", FEW).status is GroundStatus.NO_TEXTURE
 
 
 def test_the_mapper_starts_from_the_ground_only_where_it_was_found(straight, tmp_path):

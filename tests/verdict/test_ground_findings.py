@@ -132,12 +132,15 @@ def test_poses_that_pull_are_not_told_where_something_else_is():
     assert list(told(replace(PULLED, parameters=estimate(clock_s=0.06).parameters))) == ["clock"]
 
 
-def test_too_little_ground_is_no_fault():
-    little = replace(
-        estimate(), status=GroundStatus.TOO_LITTLE, shares={Reading.AS_GIVEN: 0.0}, parameters={}
-    )
+@pytest.mark.parametrize(
+    ("status", "helps"),
+    [(GroundStatus.TOO_LITTLE, "drive further"), (GroundStatus.NO_TEXTURE, "drive by day")],
+)
+def test_ground_that_cannot_be_matched_is_no_fault_and_what_would_help_is_said(status, helps):
+    little = replace(estimate(), status=status, shares={Reading.AS_GIVEN: 0.0}, parameters={})
     (found,) = check_ground(drive(poses()), {"front": little})
     assert found.is_unobservable
+    assert helps in found.says
 
 
 def test_only_clocks_that_are_surely_off_and_correctable_are_corrected():
@@ -162,6 +165,12 @@ def test_a_mirrored_path_is_told_although_most_of_a_straight_route_matches_as_gi
 def test_a_clean_drive_that_matches_mirrored_as_well_is_taken_as_given():
     alike = replace(estimate(), shares={Reading.AS_GIVEN: 0.41, Reading.MIRRORED: 0.52})
     assert not raised(check_ground(drive(poses()), {"front": alike}))
+
+
+def test_dark_ground_that_matches_once_a_mistake_is_undone_fails():
+    dark = replace(LOST, status=GroundStatus.NO_TEXTURE, parameters={})
+    (found,) = check_ground(drive(poses()), {"front": dark}, "the images are upside down")
+    assert (found.status, found.says) == (Status.FAIL, "the images are upside down")
 
 
 def test_undoing_feet_shortens_the_path():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +28,9 @@ _BENDS = 6  # terms of a smooth error of each pixel coordinate: a polynomial of 
 _LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2
 _STEPS = 20
 _CONVERGED = 0.02  # a step below so many standard deviations is the last
+_DAMPING = 1e-3  # without it, a focal length and a height that slide together overshoot for ever
+_LARGEST_NOISE_PX = 2.0  # what is further off is no noise of a pixel
+_STRETCHES = 12  # of the route: several metres each, longer than most errors go together
 
 TURN, CENTRE, BENDS = slice(0, 3), slice(3, 6), slice(6, 6 + 2 * _BENDS)
 
@@ -44,6 +48,8 @@ class Adjusted:
         poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
         weight: (N,) 1 for a match that fits, 0 for one that does not.
+        data_variance: (K,) the part of the variances that comes from the matches and the poses.
+        stretch_variance: (K,) that part as the stretches of the route disagree.
     """
 
     mount: Mount
@@ -54,6 +60,8 @@ class Adjusted:
     poses: FloatArray
     residual: FloatArray
     weight: FloatArray
+    data_variance: FloatArray
+    stretch_variance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -68,10 +76,12 @@ class _Unknowns:
 
 @dataclass(frozen=True)
 class _Weighted(Normal):
-    """The normal equations, with the lengths (N,) of the residuals and their weights (N,)."""
+    """The normal equations, lengths (N,) of residuals, weights (N,) and each match's ``score`` (N, U)."""
 
     length: FloatArray
     weight: FloatArray
+    score: FloatArray
+    sigma_px: float
 
 
 def adjust(
@@ -93,24 +103,44 @@ def adjust(
         near: a solution for the same images, without the parameter, to start from instead.
     """
     problem = _Problem(observations, prior, free, tolerance)
+    damping = 0.0
     begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS))
     if near is not None:
-        begin = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends)
+        begin, damping = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends), _DAMPING
+        problem = replace(problem, sigma_px=problem.linearise(begin).sigma_px)
     fit = gauss_newton(
-        problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED
-    )
+        problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED,
+        damping=damping,
+    )  # fmt: skip
     found, last = fit.x, fit.last
     wanted = [*range(6), *range(BENDS.stop, problem.known)]
+    inverse = np.linalg.inv(last.information)
+    own = inverse[: problem.known, : problem.known]
     return Adjusted(
         mount=found.mount,
         extra=found.extra,
-        covariance=np.asarray(np.linalg.inv(last.information)[np.ix_(wanted, wanted)]),
+        covariance=np.asarray(inverse[np.ix_(wanted, wanted)]),
         pose_errors=found.errors,
         bends=found.bends,
         poses=problem.poses(found),
         residual=last.length,
         weight=last.weight,
+        data_variance=(np.diag(own) - own**2 @ problem.stiffness)[wanted],
+        stretch_variance=_by_stretch(last.score @ own, observations.first)[wanted],
     )
+
+
+def _by_stretch(moved: FloatArray, image: IntArray) -> FloatArray:
+    """Variances (U,) of unknowns that each match moves by (N, U), errors going together along the route.
+
+    It is a cluster-robust variance (Liang and Zeger, Biometrika 73, 1986) whose clusters are stretches with
+    as many matches each; ``image`` (N,) says where on the route a match is.
+    """
+    ends = np.quantile(image, np.arange(1, _STRETCHES) / _STRETCHES)
+    stretches, place = np.unique(np.searchsorted(ends, image), return_inverse=True)
+    sums = np.zeros((len(stretches), moved.shape[1]))
+    np.add.at(sums, place, moved)
+    return np.asarray(len(sums) * np.var(sums, axis=0, ddof=1 if len(sums) > 1 else 0))
 
 
 def _short(step: FloatArray) -> FloatArray:
@@ -120,17 +150,30 @@ def _short(step: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Unknowns, in order: turn, centre, bends, the freed parameter if any, and six errors of every pose."""
+    """Unknowns, in order: turn, centre, bends, the freed parameter if any, and six errors of every pose.
+
+    ``sigma_px`` is the standard deviation of the pixels, None to estimate it anew with every step.
+    """
 
     observations: Observations
     prior: Prior
     free: str | None
     tolerance: float
+    sigma_px: float | None = None
 
     @property
     def known(self) -> int:
         """The number of unknowns beside the poses' errors."""
         return BENDS.stop + (self.free is not None)
+
+    @property
+    def stiffness(self) -> FloatArray:
+        """Prior information (U,) of the unknowns beside the poses' errors."""
+        stiffness = np.zeros(self.known)
+        # Too few matches must not make it singular: an angle is known to a radian, a parameter to ten units.
+        stiffness[TURN], stiffness[BENDS.stop :] = 1.0, 0.01
+        stiffness[CENTRE], stiffness[BENDS] = self.prior.centre_sigma_m**-2, _LENS_SIGMA_PX**-2
+        return stiffness
 
     def moved(self, now: _Unknowns, step: FloatArray) -> _Unknowns:
         """The estimate after a step."""
@@ -165,36 +208,59 @@ class _Problem:
         length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
         usable = np.isfinite(length)
         scale = float(np.median(length[usable])) / _RAYLEIGH_MEDIAN if usable.any() else 1.0
-        sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, self.tolerance * PIXEL_SIGMA))
-        unit = PIXEL_SIGMA / sigma_px
-        weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * self.tolerance)) ** 2), 0.0)
+        sigma_px = self.sigma_px or float(
+            np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, self.tolerance * PIXEL_SIGMA)
+        )
+        unit, far = PIXEL_SIGMA / sigma_px, _CAUCHY * self.tolerance
+        weight = np.where(usable, 1 / (1 + (length * unit / far) ** 2), 0.0)
         good = weight > 0
         scaled = np.sqrt(weight[good])[:, None, None] * (root * unit)[good]
         rows, value = scaled @ jacobian[good], (scaled @ residual[good][:, :, None])[..., 0]
         information, gradient = self._sum_pairs(rows, value, self.observations.only(good))
-        cost = 0.5 * float(np.sum(value**2)) + self._add_priors(now, information, gradient)
-        return _Weighted(information, gradient, cost, length, weight)
+        score = np.zeros((len(weight), self.known))
+        score[good] = np.einsum("nij,ni->nj", rows[:, :, : self.known], value)
+        cost = -0.5 * far**2 * float(np.log(weight[good]).sum()) + self._add_priors(
+            now, information, gradient
+        )
+        return _Weighted(information, gradient, cost, length, weight, score, sigma_px)
 
-    def _differences(self, now: _Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Differences (N, 2) m, their derivatives by the unknowns and by both poses, whitening (N, 2, 2)."""
+    def _differences(
+        self, now: _Unknowns, noise_px: Sequence[FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Differences (N, 2) m, their derivatives by the unknowns and by both poses, whitening (N, 2, 2).
+
+        Once the pixels' scale is known they are taken where pixels would be without their likeliest noise:
+        derivatives at pixels as seen go with it, and thousands of matches add that up to a focal length up to
+        a per cent too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear
+        problems, 1972).
+        """
         seen, poses = self.observations, self.poses(now)
-        points, known, pose = [], [], []
+        points, known, pose, slopes = [], [], [], []
         spread = np.zeros((len(seen.first), 2, 2))
-        for image, px in ((seen.first, seen.first_px), (seen.second, seen.second_px)):
+        both = (seen.first, seen.first_px), (seen.second, seen.second_px)
+        for (image, seen_px), off_px in zip(both, noise_px or (0 * seen.first_px,) * 2, strict=True):
+            px = seen_px - off_px
             hits = hit_ground(now.mount, px, poses[image])
             by_px = by_pixel(now.mount, hits)
             bending = _bending(now.mount, px, by_px)
             columns = [hits.by_mount(), bending]
             if self.free is not None:
                 columns.append(self._by_parameter(now.mount, hits, px, poses[image], image)[:, :, None])
-            points.append(hits.points_map + bending @ now.bends)
+            points.append(hits.points_map + bending @ now.bends + (by_px @ off_px[:, :, None])[..., 0])
             known.append(np.concatenate(columns, axis=2))
             pose.append(hits.by_pose())
+            slopes.append(by_px)
             blur = PIXEL_SIGMA * by_px
             spread = spread + blur @ np.swapaxes(blur, 1, 2)
         usable = np.isfinite(spread).all(axis=(1, 2))
         root = np.full(spread.shape, np.nan)
         root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
+        if self.sigma_px is not None and noise_px is None:
+            whitened = root @ (points[0] - points[1])[:, :, None]
+            pull = PIXEL_SIGMA**2 * np.nan_to_num(np.swapaxes(root, 1, 2) @ whitened)
+            likeliest = (np.swapaxes(np.nan_to_num(by_px), 1, 2) @ pull for by_px in (slopes[0], -slopes[1]))
+            limit_px = _LARGEST_NOISE_PX
+            return self._differences(now, [np.clip(one[..., 0], -limit_px, limit_px) for one in likeliest])
         jacobian = np.concatenate([known[0] - known[1], pose[0], -pose[1]], axis=2)
         return points[0] - points[1], jacobian, root
 
@@ -235,10 +301,7 @@ class _Problem:
             information[np.ix_(at, at)] += self.prior.pose_information[state]
             gradient[at] += pull
             cost += 0.5 * float(now.errors[:, state] @ pull)
-        stiffness = np.zeros(self.known)
-        # Too few matches must not make it singular: an angle is known to a radian, a parameter to ten units.
-        stiffness[TURN], stiffness[BENDS.stop :] = 1.0, 0.01
-        stiffness[CENTRE], stiffness[BENDS] = self.prior.centre_sigma_m**-2, _LENS_SIGMA_PX**-2
+        stiffness = self.stiffness
         off = np.zeros(self.known)
         off[CENTRE], off[BENDS] = now.mount.centre_vehicle - self.prior.centre_vehicle, now.bends
         place = np.arange(self.known)

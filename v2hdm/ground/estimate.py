@@ -23,7 +23,7 @@ from v2hdm.ground.results import (
     Parameter,
     Reading,
 )
-from v2hdm.ground.start import Readings, try_readings
+from v2hdm.ground.start import Readings, contradicts, start_pairs, try_readings
 from v2hdm.records import Calibration, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.workers import share_out
 
@@ -96,10 +96,15 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
     matcher = Matcher(drive, camera, motion, options)
     readings = try_readings(drive, camera, matcher, stated, options.readings)
-    out = _nothing(camera, stated, readings)
-    if readings.start.mount is not None and readings.best is Reading.AS_GIVEN:
-        solved = _solve(matcher, stated, readings.start.mount, options)
-        out = out if solved is None else _found(out, solved, options)
+    out, start = _nothing(camera, stated, readings), readings.start
+    if readings.best is Reading.AS_GIVEN:
+        solved: _Solved | _Lost = _Lost(start_pairs(stated), start.share)
+        if start.mount is not None:
+            solved = _solve(matcher, stated, start.mount, options)
+        if isinstance(solved, _Solved):
+            out = _found(out, solved, options)
+        elif out.status is GroundStatus.NO_MATCH and not contradicts(matcher, stated.guess, *solved):
+            out = replace(out, status=GroundStatus.NO_TEXTURE)
     return replace(out, seconds=time.perf_counter() - began_s)
 
 
@@ -115,8 +120,15 @@ class _Solved:
     clock: Parameter | None
 
 
-def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | None:
-    """Match and adjust in turn, each round from the last one's solution; None without enough matches."""
+class _Lost(NamedTuple):
+    """A round without enough matches: only a ``share`` of the patches was found again in ``pairs``."""
+
+    pairs: IntArray
+    share: float
+
+
+def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | _Lost:
+    """Match and adjust in turn, each round from the last one's solution."""
     path_m = stated.path_m()
     pairs = spread_pairs(path_m, options.pairs, options.shortest_m, options.longest_m)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
@@ -129,13 +141,13 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
             mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m
         )
         if len(matched.correlation) < _LEAST_MATCHES:
-            return None
+            return _Lost(pairs[:: stage.every], matched.share)
         used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
         # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
         freed = free if stage.loosened <= _CLOCK_LOOSENED else None
         adjusted = adjust(used, prior, mount, freed, max(stage.loosened / 2, 1.0))
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
-            return None
+            return _Lost(pairs[:: stage.every], 0.0)
         mount = adjusted.mount
         if freed is not None:
             stated = replace(stated, clock_s=stated.clock_s + adjusted.extra)
@@ -244,28 +256,43 @@ def _free_parameters(
         if name == "clock_s" and solved.clock is not None:
             out[name] = replace(solved.clock, sigma=solved.clock.sigma * widened)
             continue
-        value, sigma = _free(name, observations, solved.stated, solved.adjusted)
+        value, adjusted, k = _free(name, observations, solved.stated, solved.adjusted)
         largest, why_not = _OBSERVABLE[name]
         # a fault widens the scatter; that it shows must not hang on it.
-        observable = name != "clock_s" and sigma < largest
+        observable = name != "clock_s" and float(np.sqrt(adjusted.covariance[k, k])) < largest
         if name == "focal_scale":
             observable = observable and (turns or solved.adjusted.mount.depression_rad > STEEP_RAD)
-        out[name] = Parameter(name, value, sigma * widened, observable, "" if observable else why_not)
+        sigma = _sigma(adjusted, k, factor)
+        out[name] = Parameter(name, value, sigma, observable, "" if observable else why_not)
     return out
 
 
-def _free(name: str, observations: Observations, stated: Stated, solved: Adjusted) -> tuple[float, float]:
+def _free(
+    name: str, observations: Observations, stated: Stated, solved: Adjusted
+) -> tuple[float, Adjusted, int]:
+    """The parameter, the solution with it free, and its place in that one's covariance."""
     if name in _FREE_CENTRE:
         axis, sigma_m = _FREE_CENTRE[name]
         wider = replace(stated, centre_sigma_m={**stated.centre_sigma_m, axis: sigma_m})
         used, prior, _ = wider.prior_of(observations)
         adjusted = adjust(used, prior, solved.mount, near=solved)
         value = adjusted.mount.centre_vehicle[axis] - prior.centre_vehicle[axis]
-        return float(value), float(np.sqrt(adjusted.covariance[CENTRE, CENTRE][axis, axis]))
+        return float(value), adjusted, CENTRE.start + axis
     held = stated.with_surveyed_height() if name == "focal_scale" else stated
     used, prior, _ = held.prior_of(observations)
     adjusted = adjust(used, prior, solved.mount, free=name, near=solved)
-    return adjusted.extra, float(np.sqrt(adjusted.covariance[6, 6]))
+    return adjusted.extra, adjusted, 6
+
+
+def _sigma(adjusted: Adjusted, k: int, usual: float) -> float:
+    """By how far stretches of the route disagree on an unknown, moderated by what is ``usual`` in this drive.
+
+    The few stretches say little of their own noise (Smyth, Statistical Applications in Genetics and Molecular
+    Biology 3, 2004).
+    """
+    data = adjusted.data_variance[k]
+    multiple = (usual + adjusted.stretch_variance[k] / max(data, 1e-300)) / 2
+    return float(np.sqrt(adjusted.covariance[k, k] + max(multiple - 1, 0.0) * data))
 
 
 _worker: tuple[Drive, GroundOptions | None] | None = None

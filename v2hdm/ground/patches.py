@@ -35,6 +35,10 @@ _ALL = 0.9999  # mean of flags that are all set, but for rounding
 # Matches of a pair lie on one plane to within this: off it are kerbs, shadows and moving things.
 _HOMOGRAPHY_PX = 2.0
 _LEAST_OF_A_PAIR = 8  # twice the four that a homography takes
+_AROUND_M = 2.0  # how far beyond a region its ground is looked for: neighbouring images are as far apart
+_STILL_PX = (
+    1.5  # what moves less between images far apart is bonnet, shadow of the vehicle, or dirt on the lens
+)
 _PATH_STEP_M = 0.5
 _BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
 
@@ -174,6 +178,37 @@ def match_pair(
     return _on_one_plane(Matches(first_px, second_px, table[:, 3], sought))
 
 
+def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, options: GroundOptions) -> Matches:
+    """Find patches of a region of the first image in the second wherever they are, by no pose at all.
+
+    The mounting only says how the ground is laid out; both views are at the same pose.
+    """
+    low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
+    ahead, left = np.meshgrid(*(np.arange(a, b, options.step_m) for a, b in zip(low, high, strict=True)))
+    centres = np.column_stack([ahead.ravel(), left.ravel()])
+    centres = centres[inside_convex(roi_vehicle, centres)]
+    if not len(centres):
+        return Matches.none_of(0)
+    half, wide = (round(size_m / options.grid_m) for size_m in (options.patch_m / 2, _AROUND_M))
+    sheet, cells = Sheet.around(centres, first.map_from_vehicle, half + wide, options.grid_m)
+    grey, seen = sheet.texture(first)
+    other, other_seen = sheet.texture(second)
+    other[~other_seen] = 0.0
+    found = []
+    in_view = cells[(_mean(seen, half) > _ALL)[cells[:, 0], cells[:, 1]]]
+    for row, column in in_view.tolist():
+        own = grey[row - half : row + half + 1, column - half : column + half + 1]
+        peak = _peak(np.asarray(cv2.matchTemplate(other, own, cv2.TM_CCOEFF_NORMED), np.float32))
+        if peak is not None:
+            found.append((row, column, *peak))
+    if len(found) < _LEAST_OF_A_PAIR:
+        return Matches.none_of(len(in_view))
+    table = np.array(found)
+    first_px, second_px = first.pixels(sheet.at(table[:, :2])), second.pixels(sheet.at(table[:, 2:4] + half))
+    moving = np.linalg.norm(second_px - first_px, axis=1) > _STILL_PX
+    return _on_one_plane(Matches(first_px[moving], second_px[moving], table[moving, 4], len(in_view)))
+
+
 def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
     """Means over squares of ``2 half + 1`` cells around each."""
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
@@ -267,6 +302,16 @@ class Matcher:
         )
         observations = Observations(pairs[pair, 0], pairs[pair, 1], first_px, second_px, pair)
         return Round(observations, correlation, sought, sum(counts) / sought if sought else 0.0)
+
+    def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> tuple[int, float]:
+        """How many patches of first images are found again in the second ones, anywhere, and their share."""
+        options, roi, here = replace(self._options, grid_m=grid_m), self._roi, np.eye(4)
+        found = [
+            match_anywhere(View(self._read(a), mount, here), View(self._read(b), mount, here), roi, options)
+            for a, b in pairs.tolist()
+        ]
+        count, sought = sum(len(one.correlation) for one in found), sum(one.sought for one in found)
+        return count, count / sought if sought else 0.0
 
     def _read(self, row: int) -> ImageArray:
         """The image of a row of the motion, as grey values."""

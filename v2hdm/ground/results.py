@@ -53,9 +53,11 @@ class GroundStatus(Enum):
 
     FOUND = "found"
     NO_MATCH = "no match"
-    """Patches find no partner as the poses are given."""
+    """Patches find their partners elsewhere than the poses as given put them."""
     TOO_LITTLE = "too little"
-    """Too little texture, motion or ground in view."""
+    """Too little motion or ground in view."""
+    NO_TEXTURE = "no texture"
+    """Hardly a patch is found again in the next image, wherever it is looked for: that tells nothing."""
 
 
 class Reading(Enum):

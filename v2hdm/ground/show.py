@@ -27,6 +27,7 @@ _NAMES = {
 
 _WHY = {
     GroundStatus.NO_MATCH: "the ground does not match between images: check poses, clock and guess",
+    GroundStatus.NO_TEXTURE: "the ground is too dark or too even to be found again: drive in better light",
     GroundStatus.TOO_LITTLE: "too little ground is seen by two images: drive further, or widen roi_vehicle",
 }
 

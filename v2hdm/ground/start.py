@@ -47,10 +47,7 @@ class Start:
 
 def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
     """The first of the guess and copies that look further up or down from which the ground matches."""
-    path_m = stated.path_m()
-    pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
-    if len(pairs) < _PAIRS // 2:  # images are rarer: those next to each other
-        pairs = spread_pairs(path_m, _PAIRS, _SHORT_M[0], 2 * _SHORT_M[1])
+    pairs = start_pairs(stated)
     best = Start(None, 0.0, 0)
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
@@ -59,8 +56,27 @@ def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
         tried = _settle(matcher, stated, pairs, turned, guess)
         if tried.mount is not None:
             return tried
-        best = max(best, tried, key=lambda start: start.share)
+        best = max(best, tried, key=lambda start: (start.share, start.sought))
     return best
+
+
+def start_pairs(stated: Stated) -> IntArray:
+    """The pairs (P, 2) of images that a start is found from."""
+    path_m = stated.path_m()
+    pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
+    if len(pairs) < _PAIRS // 2:  # images are rarer: those next to each other
+        pairs = spread_pairs(path_m, _PAIRS, _SHORT_M[0], 2 * _SHORT_M[1])
+    return pairs
+
+
+def contradicts(matcher: Matcher, guess: Mount, pairs: IntArray, share: float) -> bool:
+    """Whether ground that does not match in ``pairs`` says that something stated is wrong.
+
+    It does where enough patches are found again, by no pose and no clock, and far fewer as stated: only their
+    ``share``. Where they are found nowhere it is the texture that lacks, which says nothing.
+    """
+    count, anywhere = matcher.match_anywhere(guess, pairs[:: -(-len(pairs) // _PAIRS)], _GRID_M)
+    return count >= _LEAST_MATCHES and _RIVAL * anywhere > share
 
 
 def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, guess: Mount) -> Start:

@@ -66,6 +66,13 @@ NO_MATCH = (
 )
 """The sentence where no cause is known."""
 
+_UNTOLD = {
+    GroundStatus.TOO_LITTLE: "too little ground is in view, or too little motion, to check lens, clock and "
+    "mounting by it: drive further, or widen roi_vehicle",
+    GroundStatus.NO_TEXTURE: "the ground shows too little texture over the images' noise to check lens and "
+    "mounting by it: drive by day or with more light, shorter exposure, or on rougher ground",
+}
+
 
 @dataclass(frozen=True)
 class _Check:
@@ -160,7 +167,7 @@ def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
     readings = {
         rival or estimate.reading
         for estimate in ground.values()
-        if estimate.status is not GroundStatus.TOO_LITTLE and max(estimate.shares.values(), default=0.0) > 0
+        if estimate.status not in _UNTOLD and max(estimate.shares.values(), default=0.0) > 0
     }
     known = {
         Reading.AS_GIVEN: Path.AS_GIVEN,
@@ -198,10 +205,9 @@ def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None
     as_given = estimate.shares.get(Reading.AS_GIVEN, 0.0)
     if estimate.reading is not Reading.AS_GIVEN:
         return [_read_as(name, estimate, estimate.reading)]
-    if estimate.status is GroundStatus.TOO_LITTLE:
-        says = "too little ground with texture, or too little motion, to check lens, clock and mounting by it"
-        return [passed("ground match", name, says)]
-    if estimate.status is GroundStatus.NO_MATCH:
+    if estimate.status in _UNTOLD and cause is None:
+        return [passed("ground match", name, _UNTOLD[estimate.status])]
+    if estimate.status is not GroundStatus.FOUND:
         return [Finding("ground match", Status.FAIL, as_given, None, "", cause or NO_MATCH, name)]
     matched = passed("ground match", name, "bare ground matches between the images", as_given)
     surveyed = drive.cameras[name].centre_prior is not None
@@ -317,7 +323,8 @@ def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None
     lost = [
         name
         for name, estimate in ground.items()
-        if estimate.status is GroundStatus.NO_MATCH and estimate.reading is Reading.AS_GIVEN
+        if estimate.status in (GroundStatus.NO_MATCH, GroundStatus.NO_TEXTURE)
+        and estimate.reading is Reading.AS_GIVEN
     ]
     if not lost or len(lost) < len(ground):
         return None
