@@ -260,7 +260,12 @@ class Optimiser:
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
-        start = replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle)
+        seen = bundle.problem.observations
+        # As the detector states them: what is left of errors that no model knows must not shrink with them.
+        stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
+        start = replace(
+            bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated
+        )
         try:
             selection = select_model(start, bundle.model.solver)
         except AdjustError as failure:
