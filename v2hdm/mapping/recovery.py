@@ -37,6 +37,10 @@ CONTRADICTED_SIGMAS = 4.0
 it by chance."""
 
 
+_CHANGE_SIGMAS = 4.5
+"""The same where an input changes on the way: few stretches speak of it, which makes its p-values too small."""
+
+
 @dataclass(frozen=True)
 class _Size:
     """Sizes of a fault, in its unit.
@@ -262,8 +266,8 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
 
 def is_contradicted(one: ScoreTest | Contradiction) -> bool:
     """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
-    size = _SIZES[one.fault]
-    return one.sigma <= size.sigma and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > size.least
+    size, surely = _SIZES[one.fault], _CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS
+    return one.sigma <= size.sigma and one.sigmas > surely and abs(one.value) > size.least
 
 
 def is_physical(one: ScoreTest | Contradiction) -> bool:

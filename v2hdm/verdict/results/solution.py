@@ -339,7 +339,8 @@ def _words(one: Contradiction) -> str:
             return f"the position steps by {100 * one.value:+.0f} cm {axis} and stays there, {one.about}"
         case Fault.KNOCK:
             turned = ("in roll", "in pitch", "in yaw")[one.axis]
-            cause = "by load" if len(one.cameras) > 1 else "as by a knock"
+            of_all = "as if the heading stepped" if one.axis == 2 else "as by load"
+            cause = of_all if len(one.cameras) > 1 else "as by a knock"
             by = f"{np.rad2deg(size):.1f} deg {turned}"
             return f"the mounting of {whose} is turned by {by} {one.about}, {cause}"
         case Fault.FOCAL:
