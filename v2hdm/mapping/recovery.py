@@ -38,7 +38,7 @@ it by chance."""
 
 
 _CHANGE_SIGMAS = 4.5
-"""The same where an input changes on the way: few stretches speak of it, which makes its p-values too small."""
+"""The same where an input changes on the way: few stretches speak of it, and its p-values are too small."""
 
 
 @dataclass(frozen=True)
