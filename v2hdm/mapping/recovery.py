@@ -87,8 +87,11 @@ _AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_OBSERVABLE_S = 0.006
-"""Sigma of a clock offset, s, up to which it is put right: two of them are 12 ms."""
+CLOCK_OBSERVABLE_S = 0.004
+"""Sigma of a clock offset, s, up to which a drive observes it: two of them are 8 ms."""
+
+_CLOCK_CORRECTABLE_S = 0.006
+"""Sigma, s, up to which a contradicted clock is put right: a late clock scatters what tells of it."""
 
 _CENTRE_OBSERVABLE_M = 0.1
 """Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
@@ -292,7 +295,7 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
     """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
     if worst.fault is Fault.CLOCK:
-        if worst.sigma > CLOCK_OBSERVABLE_S:
+        if worst.sigma > _CLOCK_CORRECTABLE_S:
             return None
         return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
