@@ -142,15 +142,16 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
 def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, float, float]:
     """Mean products of errors (D, J, a) that lie 0, 1, 2 ... steps apart, the step, and the path, m."""
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
-    products, counts, path_m, step_m = np.zeros(0), np.zeros(0), 0.0, 1.0
+    products, counts, path_m = np.zeros(0), np.zeros(0), 0.0
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(visit) == 0]
-    step_m = max(float(np.median(moved)) if len(moved) else 0.0, _LEAST_STEP_M)
+    moved = moved[moved > _LEAST_STEP_M]
+    step_m = float(np.median(moved)) if len(moved) else _LEAST_STEP_M
     for own in (visit == number for number in range(problem.visit_count)):
         place = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(poses[own][:, :2, 3], axis=0), axis=1))]
         )
         grid = np.arange(0.0, place[-1] + step_m / 2, step_m)
-        nearest = np.abs(place[None] - grid[:, None]).argmin(axis=1)
+        nearest = np.rint(np.interp(grid, place, np.arange(len(place)))).astype(np.int64)
         even = errors[:, own][:, nearest]
         size = 2 * len(grid)
         spectrum = np.abs(np.fft.rfft(even, size, axis=1)) ** 2

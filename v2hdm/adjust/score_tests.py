@@ -27,6 +27,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy import stats
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
@@ -313,7 +314,7 @@ def _stretches(arrays: Arrays) -> Tensor:
 
 @dataclass(frozen=True)
 class _Answer:
-    """What the stretches of the route say of one fault.
+    """The scores and the information that the stretches of the route hold on one fault.
 
     Attributes:
         hypothesis: the fault.
@@ -614,7 +615,8 @@ def _crown(bench: _Bench) -> Rows:
     """Corners that lie lower by the value times their distance from the route."""
     arrays, estimate = bench.arrays, bench.whitening.estimate
     frames = arrays.vehicle_from_map.inverse()
-    nearest = torch.cdist(estimate.corners_map, frames[:, :2, 3].contiguous()).argmin(dim=1)
+    route = KDTree(frames[:, :2, 3].cpu().numpy())
+    nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
     away = estimate.corners_map - frames[nearest, :2, 3]
     aside = (away * frames[nearest, :2, 1]).sum(1).abs()[arrays.corner.long()]
     poses = bench.whitening.engine.poses(estimate).flatten(0, 1)[arrays.pair.long()]
