@@ -61,6 +61,9 @@ _STRETCHES = 24
 _STRETCHES_PER_CHANGE = 2
 """Stretches from one frame at which inputs may change to the next."""
 
+_MOST_CHANGES = 12
+"""Frames at which inputs may change, of all sessions together: each costs a test of every camera and axis."""
+
 _LEAST_SPEED_MPS = 0.5
 """Below it a vehicle has no course."""
 
@@ -545,10 +548,11 @@ def _clock_motion(problem: Problem, camera: int, visit: int) -> Callable[[Arrays
 
 
 def _changes(arrays: Arrays) -> list[int]:
-    """Frames at which inputs may change: where every other stretch of a session begins, but its first."""
+    """Frames at which inputs may change: some dozen, evenly among the stretches of all sessions."""
     stretch = _stretches(arrays)
     begins = (stretch.diff() > 0).nonzero()[:, 0] + 1
-    return [int(j) for j in begins[1::_STRETCHES_PER_CHANGE] if arrays.visit[j] == arrays.visit[j - 1]]
+    within = [int(j) for j in begins if arrays.visit[j] == arrays.visit[j - 1]]
+    return within[1 :: max(_STRETCHES_PER_CHANGE, -(-len(within) // _MOST_CHANGES))]
 
 
 def _drift_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
