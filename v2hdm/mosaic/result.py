@@ -73,7 +73,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 
 @contextmanager
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
-    """What puts sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
+    """Put sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
 
     Raises:
         ConfigError: rasterio is not installed.

@@ -227,7 +227,7 @@ def _changes(
     now: Looks,
     before: Looks,
 ) -> list[Change]:
-    """What has moved, what is missing and what is new, by the looks at the old places and at the new."""
+    """The markings that moved, are missing or are new, by the looks at the old places and at the new."""
     shift, out = decision.shift, []
     for pair in decision.pairs:
         if pair.moved <= _LIKELY:
