@@ -23,7 +23,10 @@ def random_crop(rng: np.random.Generator, sample: TrainingSample, width: int, he
     lanes = [lane - (column, row) for lane in sample.lanes_px]
     if flip < 0:
         lanes = [lane * (-1, 1) + (width - 1, 0) for lane in lanes]
-    return TrainingSample(image, labels, hidden, tuple(lanes))
+    unknown = None
+    if sample.unknown is not None:
+        unknown = np.ascontiguousarray(sample.unknown[window][:, ::flip])
+    return TrainingSample(image, labels, hidden, tuple(lanes), unknown)
 
 
 def random_photometry(rng: np.random.Generator, image: Bytes) -> Bytes:

@@ -24,7 +24,17 @@ class DataConfig:
     ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
     TuSimple's. The images' names in them start from ``coco_images`` and ``tusimple_images``, or else from the
     folder of the file. ``coco_classes`` says what categories mean that are not called like a class: a class,
-    or "none" for what is no marking. ``labelled_share`` of all views are then of these images.
+    several with "|" between them of which each piece is one, "none" for what is no marking, a class "|none"
+    for outlines within which some is paint of that class, "unknown" for ground of which nothing is known.
+    ``labelled_share`` of all views are then of these images.
+
+    ``coco_size`` (width, height) is what images of that file are stretched to, labels too, where they were
+    squeezed. ``coco_edge_px``: nobody knows what is nearer to a labelled outline than this. ``coco_complete``
+    are the classes of which all within reach is labelled; paint of others that the shipped network sees
+    outside of the labels is unknown, not bare; None means all classes. ``coco_camera`` are its camera's
+    height (m), pitch (deg, down) and horizontal field of view (deg), about: by them sizes on the ground tell
+    classes apart. One in ten blocks of neighbouring images is kept for validation where ``coco_held_out``,
+    two in ten are shown by nobody.
     """
 
     width: int = 448
@@ -52,6 +62,11 @@ class DataConfig:
     coco: str | None = None
     coco_images: str | None = None
     coco_classes: dict[str, str] = field(default_factory=dict)
+    coco_size: list[int] | None = None
+    coco_edge_px: float = 0.0
+    coco_complete: list[str] | None = None
+    coco_camera: list[float] | None = None
+    coco_held_out: bool = False
     tusimple: str | None = None
     tusimple_images: str | None = None
     labelled_share: float = 0.3
@@ -161,6 +176,9 @@ _RANGES = {
     "data.easy_samples": NOT_NEGATIVE,
     "data.workers": Within(0, MOST_PROCESSES),
     "data.labelled_share": SHARE,
+    "data.coco_size": Within(1, 2**15),
+    "data.coco_edge_px": Within(0, 100),
+    "data.coco_camera": Within(-90, 180),
     **{
         f"data.{name}": Within(0, 100)
         for name in (
@@ -188,6 +206,10 @@ def check_training(config: TrainConfig) -> None:
             f"net.widths has {len(config.net.widths)} entries: give {_LEVELS}, and some dilations"
         )
     data = config.data
+    for name, length in (("coco_size", 2), ("coco_camera", 3)):
+        value = getattr(data, name)
+        if value is not None and len(value) != length:
+            raise ConfigError(f"data.{name} has {len(value)} entries: give {length}")
     if data.width > data.render_width or data.height > data.render_height:
         raise ConfigError(
             f"data.width x data.height is {data.width} x {data.height}, and a render has "

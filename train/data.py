@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import fields
 
 import cv2
@@ -14,11 +14,10 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.augment import random_crop, random_photometry
 from train.config import DataConfig
-from train.labels import LabelledImages, read_labels
+from train.labels import LabelledImages
 from train.scenes.hardships import Hardships
 from train.scenes.scenes import TrainingSample, training_sample
 from train.targets import Targets, targets
-from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.workers import undisturbed_starts
 
 _VALIDATION_SEED_OFFSET = 1_000_003
@@ -101,16 +100,10 @@ def training_batches(
     batch: int,
     first_render: int,
     part: tuple[int, int] = (0, 1),
-    classes: Sequence[str] = PAINT_CLASSES,
+    labels: LabelledImages | None = None,
 ) -> Iterator[Pair]:
-    """Batches without end, from worker processes (or this one if ``workers`` is 0).
-
-    Users' own labels are of the ``classes`` of the network.
-
-    Raises:
-        LabelError: The users' own labels cannot be used.
-    """
-    stream = RenderStream(config, seed, first_render, part, read_labels(config, classes))
+    """Batches without end, from worker processes (or this one if ``workers`` is 0), ``labels`` among them."""
+    stream = RenderStream(config, seed, first_render, part, labels)
     workers = config.workers
     if workers is None:
         workers = max(1, ((os.cpu_count() or 2) - 1) // part[1])

@@ -2,32 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from models.marking_net import MULTIPLE
 from train.augment import random_crop, random_photometry
 from train.config import DataConfig
-from train.labels_coco import read_coco
-from train.labels_image import LabelledImage, Shape
+from train.label_hints import CELL_PX, with_hints
+from train.labels_coco import UNKNOWN, read_coco
+from train.labels_image import PAINT_ONLY, LabelledImage
 from train.labels_raster import coverage
 from train.labels_tusimple import read_tusimple
 from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
-from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.frames import read_bgr
+from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError, LabelError
 from v2hdm.io.safe.pixels import read_header
+from v2hdm.records import BoolArray, FloatArray
+
+LEARNT, VALIDATION, JUDGING = "learnt", "validation", "judging"
+"""The roles of labelled images."""
+
+_BLOCK_PLACES = 10
+_ROLES = (LEARNT, LEARNT, LEARNT, VALIDATION, LEARNT, JUDGING, LEARNT, LEARNT, JUDGING, LEARNT)
+
+_ZOOM = (0.6, 1.5)
+"""Labelled images are shown this much smaller to larger: one camera took them all, others are to be met."""
+
+_LEAST_CORE = 0.35
+"""Of the half width of a piece so much at most is edge: thin ones are paint in their middle all the same."""
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""
 
 
-def read_labels(config: DataConfig, classes: Sequence[str] = PAINT_CLASSES) -> LabelledImages | None:
-    """The labelled images that a configuration names, checked; None if it names none.
+Tell = Callable[[float, str], None]
+"""Told the share of a piece of work that is done, and what is being done."""
+
+
+def read_labels(
+    config: DataConfig,
+    classes: Sequence[str] = PAINT_CLASSES,
+    tell: Tell = lambda share, doing: None,
+    role: str = LEARNT,
+) -> LabelledImages | None:
+    """The labelled images of a ``role`` that a configuration names, checked; None if it names none.
 
     An image that is in both files has both kinds of labels. Markings are of the ``classes`` of the network.
 
@@ -46,7 +71,7 @@ def read_labels(config: DataConfig, classes: Sequence[str] = PAINT_CLASSES) -> L
     found: list[LabelledImage] = []
     if config.coco is not None:
         folder = _folder(config.coco, config.coco_images)
-        found += read_coco(Path(config.coco), folder, config.coco_classes, classes)
+        found += read_coco(Path(config.coco), folder, config, classes)
     if config.tusimple is not None:
         found += read_tusimple(Path(config.tusimple), _folder(config.tusimple, config.tusimple_images))
     for image in found:
@@ -54,7 +79,33 @@ def read_labels(config: DataConfig, classes: Sequence[str] = PAINT_CLASSES) -> L
         images[key] = images[key].merged(image) if key in images else image
     for image in images.values():
         _check(image, config)
-    return LabelledImages(list(images.values()), config, classes)
+    chosen = list(images.values())
+    if config.coco_held_out:
+        roles = held_out([image.path.stem for image in chosen])
+        chosen = [image for image, its in zip(chosen, roles, strict=True) if its == role]
+    elif role != LEARNT:
+        return None
+    if config.coco_complete is not None or any(_is_open(image) for image in chosen):
+        chosen = with_hints(
+            chosen, config, lambda share: tell(share, "asking the shipped network about labels")
+        )
+    return LabelledImages(chosen, config, classes) if chosen else None
+
+
+def held_out(stems: Sequence[str]) -> list[str]:
+    """The role of each image by its file name: learnt from, for validation, or kept for judging.
+
+    Names that differ in trailing letters show the same place, neighbouring numbers the same road; so names
+    are taken in order, in blocks of ten places, of each ten of which one is for validation and two are kept.
+    """
+    places = [stem.rstrip("abcdefghijklmnopqrstuvwxyz") or stem for stem in stems]
+    order = {place: number for number, place in enumerate(sorted(set(places)))}
+    return [_ROLES[order[place] // _BLOCK_PLACES % len(_ROLES)] for place in places]
+
+
+def _is_open(image: LabelledImage) -> bool:
+    """Whether some shape of an image may be of several classes."""
+    return any(len(shape.kinds) > 1 for shape in image.shapes or ())
 
 
 @dataclass(frozen=True)
@@ -73,6 +124,22 @@ class LabelledImages:
         """
         image = self.images[int(rng.integers(len(self.images)))]
         sample = random_crop(rng, self._window(rng, image), self.config.width, self.config.height)
+        answers = self._answers(image, sample)
+        return torch.from_numpy(random_photometry(rng, sample.image)), answers
+
+    def whole(self) -> Iterator[tuple[torch.Tensor, Targets]]:
+        """Every image in full, cut to a multiple of the network's, and its answers.
+
+        Raises:
+            DriveError: an image cannot be read.
+        """
+        for image in self.images:
+            pixels = image.pixels()
+            height, width = (side // MULTIPLE * MULTIPLE for side in pixels.shape[:2])
+            sample = self._part(image, pixels, (0, 0, width, height), 1.0)
+            yield torch.from_numpy(sample.image), self._answers(image, sample)
+
+    def _answers(self, image: LabelledImage, sample: TrainingSample) -> Targets:
         answers = targets(sample)
         if image.shapes is None:
             answers = answers._replace(
@@ -80,41 +147,107 @@ class LabelledImages:
             )
         if image.lanes_px is None:
             answers = answers._replace(lane_there=torch.full_like(answers.lane_there, IGNORE))
-        return torch.from_numpy(random_photometry(rng, sample.image)), answers
+        return answers
 
     def _window(self, rng: np.random.Generator, image: LabelledImage) -> TrainingSample:
-        """A part of the image of a render's size or, where it is smaller, all of it."""
-        pixels = read_bgr(image.path)
+        """A part of the image of a render's size, smaller or larger than it is, or all of it."""
+        pixels = image.pixels()
         rows, columns = pixels.shape[:2]
-        width, height = min(columns, self.config.render_width), min(rows, self.config.render_height)
+        config = self.config
+        least = max(config.width / columns, config.height / rows)
+        zoom = max(float(np.exp(rng.uniform(*np.log(_ZOOM)))), least) if image.shown_size else 1.0
+        width = min(columns, round(config.render_width / zoom))
+        height = min(rows, round(config.render_height / zoom))
         corner = rng.integers(0, (columns - width + 1, rows - height + 1))
-        points_px = image.points_px()
+        points_px = image.points_px
         if len(points_px) and rng.random() < _NEAR_A_LABEL:
             centre = points_px[int(rng.integers(len(points_px)))] + rng.normal(0, 0.15, 2) * (width, height)
             corner = np.clip(centre - (width / 2, height / 2), 0, (columns - width, rows - height))
         left, top = (int(c) for c in corner)
+        return self._part(image, pixels, (left, top, width, height), zoom)
+
+    def _part(
+        self, image: LabelledImage, pixels: np.ndarray, window: tuple[int, int, int, int], zoom: float
+    ) -> TrainingSample:
+        """A window (left, top, width, height) of an image, ``zoom`` times as large."""
+        left, top, width, height = window
         part = np.ascontiguousarray(pixels[top : top + height, left : left + width])
-        labels = paint_labels(image.shapes or (), left, top, width, height, self.classes)
-        hidden = np.zeros((height, width), dtype=np.bool_)
-        lanes_px = tuple(lane - (left, top) for lane in image.lanes_px or ())
-        return TrainingSample(part, labels, hidden, lanes_px)
+        if zoom != 1.0:
+            size = max(round(width * zoom), self.config.width), max(round(height * zoom), self.config.height)
+            way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
+            part = np.asarray(cv2.resize(part, size, interpolation=way), dtype=np.uint8)
+        rows, columns = part.shape[:2]
+        scale = np.array([columns / width, rows / height])
+        place = Place(np.array([left, top]), scale, columns, rows)
+        labels, unknown = paint_labels(image, place, self.classes)
+        hidden = np.zeros((rows, columns), dtype=np.bool_)
+        lanes_px = tuple(place.moved(lane) for lane in image.lanes_px or ())
+        return TrainingSample(part, labels, hidden, lanes_px, unknown)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A window of an image: its first pixel ``corner_px`` (2,), its ``scale`` (2,) and its size, px."""
+
+    corner_px: NDArray[np.int_]
+    scale: FloatArray
+    width: int
+    height: int
+
+    def moved(self, points_px: FloatArray) -> FloatArray:
+        """Points (N, 2) of the image in the window."""
+        return (points_px + 0.5 - self.corner_px) * self.scale - 0.5
+
+    def sampled(self, cells: np.ndarray) -> BoolArray:
+        """What a plane of cells of 4 px of the image says of the window's pixels (height, width)."""
+        u = (np.arange(self.width) + 0.5) / self.scale[0] + self.corner_px[0]
+        v = (np.arange(self.height) + 0.5) / self.scale[1] + self.corner_px[1]
+        column = np.minimum((u / CELL_PX).astype(np.intp), cells.shape[1] - 1)
+        row = np.minimum((v / CELL_PX).astype(np.intp), cells.shape[0] - 1)
+        return np.asarray(cells[row[:, None], column] > 0)
 
 
 def paint_labels(
-    shapes: Sequence[Shape],
-    left: int,
-    top: int,
-    width: int,
-    height: int,
-    classes: Sequence[str] = PAINT_CLASSES,
-) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
-    """Labels (height, width) of a window as the renderer makes them: 1 + class if half covered, or 0."""
-    labels = np.zeros((height, width), dtype=np.uint8)
-    for shape in shapes:
-        value = 1 + classes.index(shape.kind)
+    image: LabelledImage, place: Place, classes: Sequence[str] = PAINT_CLASSES
+) -> tuple[NDArray[np.uint8], BoolArray]:
+    """Labels (height, width) of a window as the renderer makes them, and where they are unknown.
+
+    A label is 1 + class where half of the pixel is covered, :data:`~train.labels_image.PAINT_ONLY` for paint
+    of an unknown class, or 0.
+    """
+    size = place.height, place.width
+    labels, unknown = np.zeros(size, dtype=np.uint8), np.zeros(size, dtype=np.bool_)
+    paint = None
+    if image.silence is not None:
+        unknown |= place.sampled(image.silence.plane(image.silence.unknown))
+        paint = place.sampled(image.silence.plane(image.silence.paint))
+    band = image.edge_px * float(place.scale.mean())
+    for shape in image.shapes or ():
+        kinds = [kind for kind in shape.kinds if kind != NOT_PAINT]
+        in_part = len(kinds) < len(shape.kinds)
+        known = len(kinds) == 1 and kinds[0] in classes
+        value = 1 + classes.index(kinds[0]) if known else PAINT_ONLY
         for ring_px in shape.rings_px:
-            labels[coverage(ring_px, left, top, width, height) > 0.5] = value
-    return labels
+            inside = coverage(place.moved(ring_px), 0, 0, place.width, place.height) > 0.5
+            if not inside.any():
+                continue
+            if in_part or kinds == [UNKNOWN]:
+                unknown |= inside
+                labels[inside if paint is None else inside & paint] = 0 if kinds == [UNKNOWN] else value
+                continue
+            labels[inside] = value
+            unknown[inside] = False
+            if band > 0:
+                unknown |= _edge(inside, band)
+    return labels, unknown
+
+
+def _edge(inside: BoolArray, band_px: float) -> BoolArray:
+    """Pixels nearer than a band to the outline of a piece, of which at least its middle is left."""
+    within = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 3)
+    beyond = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
+    inner = min(band_px, _LEAST_CORE * float(within.max()))
+    return np.asarray(np.where(inside, within <= inner, beyond <= band_px))
 
 
 def _folder(labels: str, images: str | None) -> Path:
@@ -134,6 +267,7 @@ def _check(image: LabelledImage, config: DataConfig) -> None:
             f"{image.where}: {image.path} is {size[0]}x{size[1]} but its labels are for "
             f"{image.size[0]}x{image.size[1]}; give the images that were labelled"
         )
+    size = image.shown_size or size
     if size[0] < config.width or size[1] < config.height:
         raise LabelError(
             f"{image.where}: {image.path} is {size[0]}x{size[1]}, smaller than a view of "

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from train.config import DataConfig
 from train.labels_image import LabelledImage, Shape
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import LabelError
@@ -15,20 +16,25 @@ from v2hdm.io.safe.texts import shown
 from v2hdm.records import FloatArray
 from v2hdm.store.files import load_json
 
+EITHER = "|"
+"""Stands between classes of which a category is one, nobody knows which."""
+
+UNKNOWN = "unknown"
+"""The category of ground of which nothing is known."""
+
 _HALF_PX = 0.5
 """COCO counts from the top-left pixel's corner, this project from its centre."""
 
 
 def read_coco(
-    path: Path, images: Path, classes: Mapping[str, str], known: Sequence[str] = PAINT_CLASSES
+    path: Path, images: Path, config: DataConfig, known: Sequence[str] = PAINT_CLASSES
 ) -> list[LabelledImage]:
     """Every image of a COCO file; those without annotations are images without markings.
 
     Args:
         path: the JSON file.
         images: the folder that its ``file_name`` entries start from.
-        classes: what categories mean, by name: a class or "none"; those that are called like a
-            class need not be in it.
+        config: what its categories mean, see ``coco_classes``, and at which size its images are shown.
         known: the classes.
 
     Raises:
@@ -44,7 +50,9 @@ def read_coco(
         if entry["id"] in shapes:
             raise LabelError(f"{path}: two images have the id {entry['id']}; give each its own")
         shapes[entry["id"]] = []
-    kinds = _kinds(names, classes, known, path)
+    kinds = _kinds(names, config.coco_classes, known, path)
+    shown_size = None if config.coco_size is None else (config.coco_size[0], config.coco_size[1])
+    scales = {entry["id"]: _scale(entry, shown_size, path) for entry in entries}
     for number, entry in enumerate(
         _entries(content, "annotations", ("image_id", "category_id", "segmentation"), path)
     ):
@@ -56,8 +64,9 @@ def read_coco(
         if entry["image_id"] not in shapes:
             raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
         kind = _kind(names[entry["category_id"]], kinds, known, where)
-        if kind != NOT_PAINT:
-            shapes[entry["image_id"]].append(Shape(kind, _rings(entry["segmentation"], where)))
+        if kind != (NOT_PAINT,):
+            rings = _rings(entry["segmentation"], where, scales[entry["image_id"]])
+            shapes[entry["image_id"]].append(Shape(kind, rings))
     if not entries:
         raise LabelError(f"{path}: has no images; give another file")
     return [
@@ -66,6 +75,8 @@ def read_coco(
             images / str(entry["file_name"]),
             _size(entry),
             shapes=tuple(shapes[entry["id"]]),
+            shown_size=shown_size,
+            edge_px=config.coco_edge_px,
         )
         for entry in entries
     ]
@@ -73,46 +84,64 @@ def read_coco(
 
 def _kinds(
     names: Mapping[Any, str], classes: Mapping[str, str], known: Sequence[str], path: Path
-) -> dict[str, str]:
-    """The class map, complete with the names that are classes."""
+) -> dict[str, tuple[str, ...]]:
+    """The classes that each category may be, complete with the names that are classes."""
     for name, kind in classes.items():
         if name not in names.values():
             raise LabelError(
                 f"data.coco_classes: {path} has no category {shown(name)}, only "
                 f"{', '.join(names.values())}; mend it"
             )
-        if kind not in (*known, NOT_PAINT):
-            raise LabelError(
-                f"data.coco_classes: {shown(name)} is to be {shown(kind)}; choose from: "
-                f"{', '.join(known)}, {NOT_PAINT}"
-            )
+        for one in kind.split(EITHER):
+            if one not in (*known, NOT_PAINT, UNKNOWN):
+                raise LabelError(
+                    f"data.coco_classes: {shown(name)} is to be {shown(one)}; choose from: "
+                    f"{', '.join(known)}, {NOT_PAINT}, {UNKNOWN}"
+                )
     alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names.values()}
-    by_name = {kind.lower(): kind for kind in known}
-    return {name: by_name[kind] for name, kind in alike.items() if kind in by_name} | dict(classes)
+    by_name = {kind.lower(): (kind,) for kind in known}
+    mapped = {name: tuple(kind.split(EITHER)) for name, kind in classes.items()}
+    return {name: by_name[kind] for name, kind in alike.items() if kind in by_name} | mapped
 
 
-def _kind(name: str, kinds: Mapping[str, str], known: Sequence[str], where: str) -> str:
+def _kind(
+    name: str, kinds: Mapping[str, tuple[str, ...]], known: Sequence[str], where: str
+) -> tuple[str, ...]:
     if name not in kinds:
         raise LabelError(
             f"{where}: category {shown(name)} is no class of the detector; say which it is with "
-            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(known)}, {NOT_PAINT}"
+            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(known)}, "
+            f"{NOT_PAINT}, {UNKNOWN}"
         )
     return kinds[name]
 
 
-def _rings(segmentation: object, where: str) -> tuple[FloatArray, ...]:
+def _rings(segmentation: object, where: str, scale: FloatArray) -> tuple[FloatArray, ...]:
     if not isinstance(segmentation, list) or not segmentation:
         raise LabelError(f"{where}: its segmentation is no list of polygons (masks are not); export polygons")
     rings = []
     for polygon in segmentation:
         try:
-            ring = np.array(polygon, dtype=np.float64).reshape(-1, 2) - _HALF_PX
+            ring = np.array(polygon, dtype=np.float64).reshape(-1, 2) * scale - _HALF_PX
         except (TypeError, ValueError):
             raise LabelError(f"{where}: a polygon is not x, y, x, y, ...; mend it") from None
         if len(ring) < 3 or not np.isfinite(ring).all():
             raise LabelError(f"{where}: a polygon has under three points, or one not finite; mend it")
         rings.append(ring)
     return tuple(rings)
+
+
+def _scale(entry: Mapping[str, Any], shown_size: tuple[int, int] | None, path: Path) -> FloatArray:
+    """By how much (2,) an image is stretched before it is shown."""
+    if shown_size is None:
+        return np.ones(2)
+    size = _size(entry)
+    if size is None or min(size) < 1:
+        raise LabelError(
+            f"{path}: image {entry['id']} states no width and height, so data.coco_size cannot undo its "
+            "aspect; add them"
+        )
+    return np.array(shown_size) / size
 
 
 def _size(entry: Mapping[str, Any]) -> tuple[int, int] | None:

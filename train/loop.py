@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,6 +27,7 @@ from train.checkpoint import (
 from train.config import TrainConfig, check_training
 from train.data import Pair, training_batches, validation_pairs
 from train.distributed import Team, choose_device, has_bfloat16
+from train.labels import VALIDATION, read_labels
 from train.losses import total_loss
 from train.metrics import Score, Tally
 from train.targets import Targets
@@ -72,9 +73,13 @@ class Trainer:
         config, state, team = self.config, self.state, self._team
         part = team.rank, team.size
         classes = state.catalogue.names
-        batches = training_batches(config.data, config.seed, config.batch, state.renders, part, classes)
+        labels = read_labels(config.data, classes, self.progress)
+        batches = training_batches(config.data, config.seed, config.batch, state.renders, part, labels)
         images = config.validation.images if team.leads else 0
-        validation = list(validation_pairs(config.data, config.seed, images))
+        validation = {"": list(validation_pairs(config.data, config.seed, images))}
+        kept = read_labels(config.data, classes, self.progress, VALIDATION) if images else None
+        if kept is not None:
+            validation["photographs_"] = list(kept.whole())
         begun = time.monotonic() - state.elapsed_s
         saved = validated = state.elapsed_s
         with SummaryWriter(str(self.output)) if team.leads else nullcontext() as board:
@@ -165,23 +170,29 @@ class Trainer:
         return image.to(self.device, non_blocking=True), Targets(*move)
 
     @torch.inference_mode()
-    def _validate(self, pairs: list[Pair], board: SummaryWriter | None) -> None:
-        """Score the averaged weights and keep them if they are the best yet."""
-        if not pairs or board is None:
+    def _validate(self, sets: Mapping[str, list[Pair]], board: SummaryWriter | None) -> None:
+        """Score the averaged weights on each set, and keep them if they are the best yet on all together."""
+        if not any(sets.values()) or board is None:
             return
         self.averaged.eval()
-        tally = Tally(self.state.catalogue.names)
-        for image, targets in pairs:
-            batch = image[None], Targets(*(target[None] for target in targets))
-            image, targets = self._to_device(batch)
-            tally.add(self.averaged(image), targets)
-        score = tally.score()
-        self.state.metrics = metrics(score)
+        means = []
+        self.state.metrics = {}
+        for prefix, pairs in sets.items():
+            tally = Tally(self.state.catalogue.names)
+            for image, targets in pairs:
+                batch = image[None], Targets(*(target[None] for target in targets))
+                image, targets = self._to_device(batch)
+                tally.add(self.averaged(image), targets)
+            score = tally.score()
+            means.append(score.mean_iou)
+            self.state.metrics |= {prefix + name: value for name, value in metrics(score).items()}
+            line = f"{prefix}{summary(score)}"
+            _LOG.info("step %d, %.1f min: %s", self.state.step, self.state.elapsed_s / 60, line)
         for name, value in self.state.metrics.items():
             board.add_scalar(f"validation/{name}", value, self.state.step)
-        _LOG.info("step %d, %.1f min: %s", self.state.step, self.state.elapsed_s / 60, summary(score))
-        if score.mean_iou >= self.state.best_iou:
-            self.state.best_iou = score.mean_iou
+        mean_iou = sum(means) / len(means)
+        if mean_iou >= self.state.best_iou:
+            self.state.best_iou = mean_iou
             self._save("best.pt")
 
     def _report(self, loss: float, board: SummaryWriter | None) -> None:

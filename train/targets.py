@@ -13,6 +13,7 @@ from skimage.measure import label
 from torch import Tensor
 
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, PAINT_STRIDE
+from train.labels_image import PAINT_ONLY
 from train.scenes.scenes import TrainingSample
 from v2hdm.records import FloatArray
 
@@ -62,7 +63,10 @@ def targets(sample: TrainingSample) -> Targets:
     there[_blocks(sample.hidden, LANE_STRIDE).any(axis=2) & (there == 1)] = IGNORE
     kinds = kind_target(sample.labels)
     size = piece_size(kinds)
-    paint = paint_target(sample.labels), paint_weight(size)
+    painted = paint_target(sample.labels)
+    if sample.unknown is not None:
+        painted[_blocks(sample.unknown, PAINT_STRIDE).any(axis=2)] = IGNORE
+    paint = painted, paint_weight(size)
     answers = *paint, kinds, kind_weight(size), there, offset
     return Targets(*(torch.from_numpy(answer) for answer in answers))
 
@@ -78,7 +82,8 @@ def paint_target(labels: Bytes) -> Bytes:
 
 
 def kind_target(labels: Bytes) -> Bytes:
-    """The commonest paint class (H/4, W/4) of each block, ignored where there is little paint."""
+    """The commonest paint class (H/4, W/4) of each block, ignored where there is little paint of any."""
+    labels = np.where(labels == PAINT_ONLY, 0, labels)
     blocks = _blocks(labels, KIND_STRIDE)
     classes = max(int(labels.max(initial=0)), 1)
     counts = np.stack([(blocks == 1 + c).sum(axis=2) for c in range(classes)], axis=2)

@@ -290,7 +290,7 @@ def test_labels_have_no_bias_in_either_direction():
         errors = []
         for left, right in np.stack(np.meshgrid(4 + offsets, 9 + offsets), axis=-1).reshape(-1, 2):
             ring = np.array([[left, -5], [right, -5], [right, 30], [left, 30]])
-            shape = Shape(DIAMOND, (ring[:, ::-1] if transposed else ring,))
+            shape = Shape((DIAMOND,), (ring[:, ::-1] if transposed else ring,))
             labels = paint_labels([shape], 0, 0, 16, 16)
             errors.append((labels > 0).sum() / 16 - (right - left))
         assert abs(np.mean(errors)) < 0.01
@@ -354,7 +354,7 @@ def test_an_image_in_both_files_has_both_labels(tmp_path):
 def test_a_category_is_mapped_by_the_configuration_or_left_out(tmp_path):
     path = coco(tmp_path, annotations=[ZEBRA])
     mapped = labelled(coco=str(path), coco_classes={"zebra": CROSSWALK_BAR})
-    assert [shape.kind for image in mapped.images for shape in image.shapes or ()] == [CROSSWALK_BAR]
+    assert [shape.kinds for image in mapped.images for shape in image.shapes or ()] == [(CROSSWALK_BAR,)]
     dropped = labelled(coco=str(path), coco_classes={"zebra": "none"})
     assert [image.shapes for image in dropped.images] == [(), ()]
 

@@ -58,13 +58,14 @@ class TrainingSample:
     ``image`` (H, W, 3) uint8 BGR, ``labels`` (H, W) uint8 and ``hidden`` (H, W) bool are those of
     :class:`v2hdm.simulate.render.renderer.Rendered`. ``lanes_px`` are the centre lines (N, 2) of the lanes'
     lines in recorded pixels, from near to far, whatever stands in front of them; parts may be outside the
-    image.
+    image. ``unknown`` (H, W) bool is where nobody knows of paint, None where all is known.
     """
 
     image: NDArray[np.uint8]
     labels: NDArray[np.uint8]
     hidden: NDArray[np.bool_]
     lanes_px: tuple[FloatArray, ...]
+    unknown: NDArray[np.bool_] | None = None
 
 
 def training_sample(

@@ -1,0 +1,134 @@
+"""What the shipped network sees in photographs whose labels leave something unsaid.
+
+A label set may leave far or worn paint out, may call all lines alike, and may draw one outline about a whole
+crosswalk. There the shipped network is asked: paint that it sees and that nobody labelled is unknown rather
+than bare, a line is of the class that network and size on the ground agree on, and only what it takes for
+paint is a bar of a crosswalk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from train.config import DataConfig
+from train.labels_image import ANY, LabelledImage, Shape, Silence
+from train.labels_raster import coverage
+from v2hdm.catalogue import NOT_PAINT, SHIPPED
+from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
+from v2hdm.detection.network import Network, as_probability
+from v2hdm.records import BoolArray, FloatArray
+
+CELL_PX = 4
+"""Planes of hints have a cell for so many px, as the network's classes do."""
+
+_HINT = 0.3
+"""Paint is hinted at from this probability on: half of the true paint that the network misses on photographs
+by a hard decision lies between this and a half."""
+
+_SURE = 0.8
+"""A class is taken from this posterior probability on, otherwise it stays unknown."""
+
+_LABELLED_M = 30.0
+"""Beyond this range nobody labels completely; a diamond of 2 m is 3 px tall there."""
+
+Tell = Callable[[float], None]
+
+
+def with_hints(images: Sequence[LabelledImage], config: DataConfig, tell: Tell) -> list[LabelledImage]:
+    """Images with their open classes resolved and their silence stated; ``tell`` hears the share done.
+
+    Raises:
+        DriveError: an image cannot be read.
+    """
+    hints = _Hints.of(config)
+    done = []
+    for number, image in enumerate(images):
+        done.append(hints.of_image(image) if image.shapes is not None else image)
+        tell((number + 1) / len(images))
+    return done
+
+
+@dataclass(frozen=True)
+class _Hints:
+    """The shipped network, over the camera of a label set."""
+
+    network: Network
+    config: DataConfig
+
+    @classmethod
+    def of(cls, config: DataConfig) -> _Hints:
+        return cls(Network(), config)
+
+    def of_image(self, image: LabelledImage) -> LabelledImage:
+        pixels = image.pixels()
+        raw = self.network.run(pixels)
+        paint = as_probability(cv2.resize(raw.paint, raw.kinds.shape[:0:-1], interpolation=cv2.INTER_AREA))
+        kinds = raw.kinds - raw.kinds.max(axis=0)
+        kinds -= np.log(np.exp(kinds).sum(axis=0))
+        camera = self._camera(pixels.shape[1], pixels.shape[0])
+        shapes = tuple(self._resolved(shape, kinds, camera) for shape in image.shapes or ())
+        seen = paint > _HINT
+        silence = Silence(
+            np.packbits(seen, axis=1),
+            np.packbits(seen & self._unsaid(kinds, camera), axis=1),
+            (seen.shape[0], seen.shape[1]),
+        )
+        return replace(image, shapes=shapes, silence=silence)
+
+    def _camera(self, width: int, height: int) -> RoadCamera | None:
+        if self.config.coco_camera is None:
+            return None
+        up_m, pitch_deg, fov_deg = self.config.coco_camera
+        return RoadCamera(
+            camera_from_calibration(rough_calibration("labels", width, height, up_m, pitch_deg, fov_deg))
+        )
+
+    def _unsaid(self, kinds: np.ndarray, camera: RoadCamera | None) -> BoolArray:
+        """Cells (h, w) where paint may be that nobody labelled, by log shares (K, h, w)."""
+        names = self.network.info.classes
+        complete = self.config.coco_complete
+        silent = np.array([complete is not None and name not in complete for name in names])
+        unsaid = silent[kinds.argmax(axis=0)]
+        if camera is None:
+            return np.asarray(unsaid)
+        rows, columns = unsaid.shape
+        middle_px = (np.mgrid[:rows, :columns].reshape(2, -1).T[:, ::-1] + 0.5) * CELL_PX - 0.5
+        ground = camera.ground(camera.undistort(middle_px)).reshape(rows, columns, 2)
+        range_m = np.linalg.norm(ground - camera.foot_vehicle, axis=2)
+        on_ground = np.isfinite(range_m)
+        return np.asarray(on_ground & (unsaid | (np.nan_to_num(range_m, nan=0.0) > _LABELLED_M)))
+
+    def _resolved(self, shape: Shape, kinds: np.ndarray, camera: RoadCamera | None) -> Shape:
+        """The shape with one class, :data:`~train.labels_image.ANY` where several may be true."""
+        if len(shape.kinds) == 1 or NOT_PAINT in shape.kinds:
+            return shape
+        names = self.network.info.classes
+        rows, columns = kinds.shape[1:]
+        inside = sum(coverage((r + 0.5) / CELL_PX - 0.5, 0, 0, columns, rows) for r in shape.rings_px) > 0.5
+        odds = np.zeros(len(shape.kinds))
+        for k, name in enumerate(shape.kinds):
+            if name in names and np.any(inside):
+                odds[k] += kinds[names.index(name)][inside].mean()
+            if camera is not None:
+                odds[k] += _size_odds(name, shape.rings_px, camera)
+        share = np.exp(odds - odds.max())
+        share /= share.sum()
+        best = int(share.argmax())
+        return replace(shape, kinds=(shape.kinds[best],) if share[best] >= _SURE else (ANY,))
+
+
+def _size_odds(name: str, rings_px: Sequence[FloatArray], camera: RoadCamera) -> float:
+    """Log likelihood of a class by the size of the piece on the ground; 0 where it reaches the horizon."""
+    entry = SHIPPED.classes.get(name)
+    ground = camera.ground(camera.undistort(np.concatenate(rings_px)))
+    if entry is None or not np.isfinite(ground).all():
+        return 0.0
+    _, sides, _ = cv2.minAreaRect(ground.astype(np.float32))
+    info = camera.info
+    points = np.concatenate(rings_px)
+    edge = (points < 1.0).any() or (points > (info.width - 2.0, info.height - 2.0)).any()
+    return float(entry.size_log_likelihood(max(sides), min(sides), whole=not edge))
