@@ -12,14 +12,19 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from train.config import DataConfig
+from train.labels import Place, paint_labels
+from train.labels_image import ANY, LabelledImage
 from train.scenes.scenes import image_line, image_points, random_scene
 from train.scenes.views import TrainingView, random_view
-from v2hdm.catalogue import CORNERED_CLASSES, LANE_CLASSES, OUTLINED_CLASSES, PAINT_CLASSES
+from v2hdm.catalogue import CORNERED_CLASSES, LANE_CLASSES, NOT_PAINT, OUTLINED_CLASSES, PAINT_CLASSES
+from v2hdm.detection.camera import camera_from_calibration, rough_calibration
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import clip_convex, clip_half, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import Camera, FloatArray
+from v2hdm.records import BoolArray, Camera, FloatArray
 from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Scene
 
@@ -47,6 +52,9 @@ cannot know of others. Those parts of such a line that are hidden or between its
 LANE_TOLERANCE_PX = 20.0
 """A point of a line is on a true line within this, across it."""
 
+_MOUNTING_SIGMA, _PITCH_SIGMA_DEG = 0.1, 0.7
+"""How well the mounting of a photograph's camera is taken to be known: share of its height, and pitch."""
+
 _STATION_M = 0.5
 _BESIDE_M = np.linspace(-0.5, 0.5, 21)
 """Paint this far beside a line's middle is its own: those of double lines are."""
@@ -69,13 +77,19 @@ class TrueMarking:
 
 @dataclass(frozen=True)
 class Example:
-    """An image with its camera and truth."""
+    """An image with its camera and truth.
+
+    Of a photograph not all is known: ``unknown`` (H, W) bool is where nobody knows of paint, and markings of
+    ``silent`` classes may be missing.
+    """
 
     image: np.ndarray
     camera: Camera
     markings: list[TrueMarking]
     lanes_px: list[FloatArray]
     lanes_shown: list[bool] = field(default_factory=list)
+    unknown: BoolArray | None = None
+    silent: tuple[str, ...] = ()
 
 
 def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
@@ -85,6 +99,34 @@ def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
     view = random_view(rng, WIDTH, HEIGHT)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
     return example_of(scene, lanes, view, rendered, _camera(view))
+
+
+def photograph(image: LabelledImage, config: DataConfig, rng: np.random.Generator) -> Example:
+    """The truth of a labelled photograph, over a camera mounted about as ``config.coco_camera`` says.
+
+    Raises:
+        DriveError: the image cannot be read.
+        ConfigError: nobody says how the camera is mounted.
+    """
+    if config.coco_camera is None:
+        raise ConfigError("data.coco_camera: say how the camera of the labelled images is mounted, about")
+    pixels = image.pixels()
+    height, width = pixels.shape[:2]
+    up_m, pitch_deg, fov_deg = config.coco_camera
+    up_m *= float(np.exp(rng.normal(0, _MOUNTING_SIGMA)))
+    pitch_deg += rng.normal(0, _PITCH_SIGMA_DEG)
+    camera = camera_from_calibration(rough_calibration("photo", width, height, up_m, pitch_deg, fov_deg))
+    labels, unknown = paint_labels(image, Place.whole(width, height))
+    names = (*CORNERED_CLASSES, *OUTLINED_CLASSES)
+    markings = []
+    for shape in image.shapes or ():
+        if NOT_PAINT in shape.kinds:
+            continue
+        kind = shape.kinds[0] if shape.kinds[0] in names else ANY
+        for ring_px in shape.rings_px:
+            markings.append(TrueMarking(kind, ring_px, np.nan, kind != ANY))
+    silent = [k for k in PAINT_CLASSES if config.coco_complete is not None and k not in config.coco_complete]
+    return Example(pixels, camera, markings, [], [], unknown & (labels == 0), tuple(silent))
 
 
 def example_of(

@@ -19,13 +19,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from export.judge_file import write_judge
 from models.judge import Judge
 from train.confident_spots import Spots, lit
-from train.examples import Example, TrueMarking, example, polygon_overlap
+from train.examples import Example, TrueMarking, example, photograph, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from train.labels import LabelledImages
 from v2hdm.catalogue import OUTLINED_CLASSES
 from v2hdm.detection.classifier import (
     AMONG,
@@ -50,6 +52,9 @@ FOLDS = 5
 CONFIG = JudgeConfig()
 LIT_EVERY, MIRRORED_EVERY = 2, 3
 """Which images are looked at once more, with spots of sun and as in the mapping."""
+
+_UNTOLD_SHARE = 0.05
+"""Of a quadrilateral with more unknown ground than this in it nobody knows whether it is a marking."""
 
 COUNTS = (10, 20, 40, 80)
 """Of false ones, at which those true are counted."""
@@ -94,7 +99,9 @@ class Gathered:
             self.ground.append(readings.ground[row])
             self.kind.append(kind)
             self.true.append(true)
-            self.side_error.append(side_errors(readings, m, corners_px[m], marking)[order])
+            # Hand labels lie pixels off: they tell what is a marking, not where its sides are.
+            measured = marking if shown.unknown is None else None
+            self.side_error.append(side_errors(readings, m, corners_px[m], measured)[order])
             self.side_variance.append(variance[m, order])
             self.image.append(index)
             self.look.append(look)
@@ -132,11 +139,20 @@ def is_true(shown: Example, kind: str, corners_px: FloatArray) -> tuple[bool | N
         return True, max(own, key=lambda pair: pair[0])[1]
     share, nearest = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
     if share <= 0.05 or nearest is None:
-        return False, None
+        return (None if _is_untold(shown, kind, corners_px) else False), None
     of_own = max((share for share, true in overlaps if true.kind == kind), default=0.0)
     if nearest.kind != kind and (nearest.fair or (nearest.kind in OUTLINED_CLASSES and of_own <= 0.05)):
         return False, None  # the head of an arrow is no diamond
     return None, None
+
+
+def _is_untold(shown: Example, kind: str, corners_px: FloatArray) -> bool:
+    """Whether a photograph's labels would not tell of such a quadrilateral."""
+    if shown.unknown is None:
+        return False
+    mask = np.zeros(shown.unknown.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(mask, np.round(cv2.convexHull(corners_px.astype(np.float32))).astype(np.int32), 1)
+    return kind in shown.silent or bool((shown.unknown & (mask > 0)).sum() > _UNTOLD_SHARE * mask.sum())
 
 
 def side_errors(readings: Readings, m: int, corners_px: FloatArray, true: TrueMarking | None) -> FloatArray:
@@ -180,12 +196,16 @@ def log_loss(odds: FloatArray, true: BoolArray) -> float:
 
 @dataclass(frozen=True)
 class Part:
-    """Scenes ``numbers`` of ``images``, seen with the network ``model``; their readings go to ``path``."""
+    """Scenes ``numbers`` of ``images``, seen with the network ``model``; their readings go to ``path``.
+
+    Or else labelled photographs, ``images`` of them being renders.
+    """
 
     numbers: range
     images: int
     model: Path
     path: Path
+    photographs: LabelledImages | None = None
 
 
 def gather(part: Part) -> Part:
@@ -194,7 +214,11 @@ def gather(part: Part) -> Part:
     with being_fitted():
         detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
-    for number in part.numbers:
+    for number, photo in enumerate(part.photographs.images if part.photographs else ()):
+        index = part.images + part.numbers[number]
+        shown = photograph(photo, part.photographs.config, np.random.default_rng([SEED, index]))
+        gathered.add(index, shown, detectors[index % MIRRORED_EVERY == 0])
+    for number in part.numbers if part.photographs is None else ():
         index, shown = render_to_fit(number, part.images, SEED)
         gathered.add(index, shown, detectors[0])
         if number % MIRRORED_EVERY == 0:

@@ -24,6 +24,7 @@ from train.targets import IGNORE, Targets, targets
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError, LabelError
 from v2hdm.io.safe.pixels import read_header
+from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, FloatArray
 
 LEARNT, VALIDATION, JUDGING = "learnt", "validation", "judging"
@@ -67,6 +68,9 @@ def read_labels(
             f"data.labelled_share is {config.labelled_share}: set more than 0 and at most 1, "
             "or name no data.coco and no data.tusimple"
         )
+    for name in config.coco_complete or ():
+        if name not in classes:
+            raise LabelError(f"data.coco_complete: no class {shown(name)}; choose from: {', '.join(classes)}")
     images: dict[Path, LabelledImage] = {}
     found: list[LabelledImage] = []
     if config.coco is not None:
@@ -193,6 +197,11 @@ class Place:
     scale: FloatArray
     width: int
     height: int
+
+    @classmethod
+    def whole(cls, width: int, height: int) -> Place:
+        """All of an image."""
+        return cls(np.zeros(2, dtype=np.int_), np.ones(2), width, height)
 
     def moved(self, points_px: FloatArray) -> FloatArray:
         """Points (N, 2) of the image in the window."""

@@ -51,6 +51,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--judge-images", type=int, default=1650, help="renders that the judge learns from")
     parser.add_argument("--lane-images", type=int, default=450, help="renders for the score of lanes")
+    parser.add_argument(
+        "--labels",
+        type=Path,
+        metavar="TRAINING",
+        help="a training from whose labelled photographs the judge learns, too (default: the source, where "
+        "it is one)",
+    )
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
     return parser
 

@@ -10,7 +10,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,8 +21,11 @@ from export.console import run as export
 from export.manifest import record
 from train import fit_judge, fit_lane_score
 from train.bar import Share, share_of_work
+from train.checkpoint import load_checkpoint
+from train.config import DataConfig
 from train.exported import read_exported
 from train.fit_judge import Gathered
+from train.labels import LabelledImages, read_labels
 from v2hdm.detection import weights
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import whole_file
@@ -56,6 +59,7 @@ class Order:
     judge_images: int = 1650
     lane_images: int = 450
     workers: int = 0
+    labels: Path | None = None
 
     @property
     def network(self) -> Path:
@@ -150,10 +154,22 @@ def _export(order: Order, folder: Path, tell: Share) -> None:
 
 
 def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
+    network = folder / weights.NETWORK_FILE.name
     parts = [
-        fit_judge.Part(numbers, order.judge_images, folder / weights.NETWORK_FILE.name, folder / f"{k}.npz")
+        fit_judge.Part(numbers, order.judge_images, network, folder / f"{k}.npz")
         for k, numbers in enumerate(_in_parts(order.judge_images))
     ]
+    if (labels := _labels(order, tell)) is not None:
+        parts += [
+            fit_judge.Part(
+                numbers,
+                order.judge_images,
+                network,
+                folder / f"photographs{k}.npz",
+                replace(labels, images=labels.images[numbers.start : numbers.stop]),
+            )
+            for k, numbers in enumerate(_in_parts(len(labels.images)))
+        ]
     left = [part for part in parts if not part.path.is_file()]
     done = len(parts) - len(left)
 
@@ -161,9 +177,9 @@ def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
         nonlocal done
         done += 1
         share = _EXPORTED + (_GATHERED - _EXPORTED) * done / len(parts)
-        tell(share, f"judge: {min(done * _PART_IMAGES, order.judge_images)} renders seen")
+        tell(share, f"judge: {done * _PART_IMAGES} images seen")
 
-    tell(_EXPORTED, "judge: looking at renders")
+    tell(_EXPORTED, "judge: looking at images")
     share_out(fit_judge.gather, left, _workers(order), cv2.setNumThreads, (1,), take)
 
     def learnt(share: float) -> None:
@@ -172,6 +188,17 @@ def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
     learnt(0.0)
     judge, confidence = fit_judge.fit_all(Gathered.load([part.path for part in parts]), learnt)
     fit_judge.write_both(judge, confidence, order.judge_images, folder)
+
+
+def _labels(order: Order, tell: Share) -> LabelledImages | None:
+    """The photographs that the training learnt from, if any."""
+    source = order.labels or order.network
+    if source.suffix == ".onnx":
+        return None
+    data = DataConfig(**load_checkpoint(source / "best.pt" if source.is_dir() else source).config["data"])
+    if data.coco is None or data.coco_camera is None:
+        return None
+    return read_labels(data, tell=lambda share, doing: tell(_EXPORTED, doing))
 
 
 def _fit_lane_score(order: Order, folder: Path, tell: Share) -> None:

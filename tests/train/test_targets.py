@@ -2,9 +2,12 @@
 
 import json
 import re
-from itertools import islice
+from collections import Counter
+from dataclasses import replace
+from itertools import islice, pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,8 +19,9 @@ from models import Prediction
 from tests.train.small import HEIGHT, WIDTH, coco
 from train.config import DataConfig, LossConfig, TrainConfig
 from train.data import RenderStream
-from train.labels import paint_labels, read_labels
-from train.labels_image import Shape
+from train.label_hints import with_hints
+from train.labels import JUDGING, LEARNT, VALIDATION, Place, held_out, paint_labels, read_labels
+from train.labels_image import ANY, PAINT_ONLY, LabelledImage, Shape
 from train.labels_raster import coverage
 from train.losses import dice_loss, kind_loss, lane_loss, paint_loss, total_loss
 from train.metrics import Tally
@@ -35,7 +39,9 @@ from train.targets import (
 )
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.cli.compose import register
+from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
 from v2hdm.errors import ConfigError, LabelError
+from v2hdm.geometry.ipm import apply_homography
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND
 
 
@@ -283,6 +289,15 @@ def test_the_area_of_any_star_shaped_polygon_is_kept_wherever_it_lies(seed, coun
     np.testing.assert_allclose(part, coverage(ring, 0, 0, 60, 60)[23:34, 17:37], atol=1e-5)
 
 
+def painted(shapes, width, height):
+    """Labels (height, width) of an image of which all is known."""
+    labels, unknown = paint_labels(
+        LabelledImage("", Path(), shapes=tuple(shapes)), Place.whole(width, height)
+    )
+    assert not unknown.any()
+    return labels
+
+
 def test_labels_have_no_bias_in_either_direction():
     """Edges at every offset: the labelled band is, on average, as wide as the polygon."""
     offsets = (np.arange(20) + 0.5) / 20
@@ -291,7 +306,7 @@ def test_labels_have_no_bias_in_either_direction():
         for left, right in np.stack(np.meshgrid(4 + offsets, 9 + offsets), axis=-1).reshape(-1, 2):
             ring = np.array([[left, -5], [right, -5], [right, 30], [left, 30]])
             shape = Shape((DIAMOND,), (ring[:, ::-1] if transposed else ring,))
-            labels = paint_labels([shape], 0, 0, 16, 16)
+            labels = painted([shape], 16, 16)
             errors.append((labels > 0).sum() / 16 - (right - left))
         assert abs(np.mean(errors)) < 0.01
 
@@ -302,7 +317,7 @@ def test_a_concave_polygon_and_one_with_two_parts_are_filled_as_drawn():
     assert covered[8, 5] == 0.0
     assert covered[2, 5] > 0.9
     parts = (np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]]), np.array([[6, 6], [9, 6], [9, 9], [6, 9.0]]))
-    labels = paint_labels([Shape(ARROW, parts)], 0, 0, 11, 11)
+    labels = painted([Shape((ARROW,), parts)], 11, 11)
     assert labels[1, 1] == labels[7, 7] == 1 + PAINT_CLASSES.index(ARROW)
     assert labels[4, 4] == 0
 
@@ -324,7 +339,7 @@ def test_views_of_coco_images_show_their_markings_where_they_are_bright(tmp_path
 
 def test_coco_counts_from_the_corner_of_the_first_pixel(tmp_path):
     (image, _) = labelled(coco=str(coco(tmp_path))).images
-    labels = paint_labels(image.shapes or (), 0, 0, WIDTH, HEIGHT)
+    labels = painted(image.shapes or (), WIDTH, HEIGHT)
     rows, columns = np.nonzero(labels)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 39, 30, 49)
 
@@ -384,6 +399,91 @@ def test_without_labels_there_is_nothing_to_mix_in():
     assert TrainConfig().data.coco is None
 
 
+def test_squeezed_images_are_stretched_together_with_their_labels(tmp_path):
+    labels = labelled(coco=str(coco(tmp_path)), coco_size=[2 * WIDTH, HEIGHT])
+    image = labels.images[0]
+    assert image.pixels().shape == (HEIGHT, 2 * WIDTH, 3)
+    rows, columns = np.nonzero(painted(image.shapes or (), 2 * WIDTH, HEIGHT))
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 39, 60, 99)
+    rng, grey = np.random.default_rng(4), []
+    for _ in range(40):
+        view, answers = labels.view(rng)
+        paint = np.kron(answers.paint.numpy(), np.ones((2, 2)))
+        grey.append((view.numpy()[paint == 1].mean() if (paint == 1).any() else 200.0) > 150)
+    assert np.mean(grey) > 0.9
+
+
+def test_near_an_outline_and_in_unknown_ground_nothing_is_known():
+    square, other = (np.array([[a, 20.0], [a + 20, 20], [a + 20, 40], [a, 40]]) for a in (10, 60))
+    shapes = (Shape((ARROW,), (square,)), Shape(("unknown",), (other,)))
+    labels, unknown = paint_labels(
+        LabelledImage("", Path(), shapes=shapes, edge_px=3.0), Place.whole(WIDTH, HEIGHT)
+    )
+    assert unknown[30, 11]
+    assert unknown[30, 8]
+    assert not unknown[30, 20]
+    assert not unknown[30, 2]
+    assert unknown[30, 70]
+    assert not labels[:, 50:].any()
+    answers = targets(TrainingSample(np.zeros((64, 96, 3), np.uint8), labels, unknown, (), unknown))
+    assert answers.paint[15, 10] == 1
+    assert answers.paint[15, 35] == IGNORE == answers.paint[15, 5]
+
+
+def test_an_outline_with_paint_somewhere_in_it_is_paint_where_the_network_sees_some(tmp_path):
+    image = np.full((128, 256, 3), 90, np.uint8)
+    image[60:100, 40:70] = image[60:100, 110:140] = 235
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    ring = np.array([[30.0, 50], [150, 50], [150, 110], [30, 110]])
+    shapes = (Shape((CROSSWALK_BAR, "none"), (ring,)),)
+    given = LabelledImage("", tmp_path / "a.png", shapes=shapes)
+    (hinted,) = with_hints([given], config(coco_complete=[DIAMOND]), lambda share: None)
+    labels, unknown = paint_labels(hinted, Place.whole(256, 128))
+    assert unknown[50:109, 31:149].all()
+    bar = 1 + PAINT_CLASSES.index(CROSSWALK_BAR)
+    assert set(np.unique(labels)) == {0, bar}
+    assert (labels[70:90, 48:64] == bar).mean() > 0.9
+    assert (labels[70:90, 80:100] == 0).mean() > 0.9
+    hidden = replace(given, shapes=())
+    (silent,) = with_hints([hidden], config(coco_complete=[DIAMOND]), lambda share: None)
+    _, unknown = paint_labels(silent, Place.whole(256, 128))
+    (complete,) = with_hints([hidden], config(coco_complete=list(PAINT_CLASSES)), lambda share: None)
+    assert unknown[70:90, 48:64].mean() > 0.9
+    assert not paint_labels(complete, Place.whole(256, 128))[1].any()
+
+
+def test_a_line_is_of_the_class_that_its_size_on_the_ground_tells(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((360, 640, 3), 90, np.uint8))
+    camera = [1.5, 10.0, 80.0]
+    road = RoadCamera(camera_from_calibration(rough_calibration("", 640, 360, *camera)))
+    either = ("lane_dash", "lane_line", DIAMOND)
+    for kind, far, left in (("lane_line", 40.0, 1.15), (DIAMOND, 5.5, 2.5)):
+        ground = np.array([[4.0, 1.0], [far, 1.0], [far, left], [4.0, left]])
+        ring = road.distort(apply_homography(road.pinhole_px_from_vehicle, ground))
+        given = LabelledImage("", tmp_path / "a.png", shapes=(Shape(either, (ring,)),))
+        (hinted,) = with_hints([given], config(coco_camera=camera), lambda share: None)
+        assert [shape.kinds for shape in hinted.shapes or ()] == [(kind,)]
+    unclear = replace(given, shapes=(Shape((ARROW, DIAMOND), (np.array([[0.0, 0], [9, 0], [9, 9]]),)),))
+    (hinted,) = with_hints([unclear], config(), lambda share: None)
+    assert [shape.kinds for shape in hinted.shapes or ()] in ([(ANY,)], [(ARROW,)], [(DIAMOND,)])
+    labels = painted([Shape((ANY,), (np.array([[0.0, 0], [9, 0], [9, 9], [0, 9]]),))], 16, 16)
+    assert labels[5, 5] == PAINT_ONLY
+    assert paint_target(labels)[2, 2] == 1
+    assert kind_target(labels)[1, 1] == IGNORE
+
+
+def test_photographs_of_one_place_have_one_role_and_neighbours_share_it():
+    stems = [f"{number:03d}{letter}" for number in range(1, 601) for letter in ("", "a", "b")]
+    roles = dict(zip(stems, held_out(stems), strict=True))
+    assert all(roles[stem[:3]] == role for stem, role in roles.items())
+    counts = Counter(roles.values())
+    assert counts[VALIDATION] == 180
+    assert counts[JUDGING] == 360
+    assert counts[LEARNT] == 1260
+    changes = sum(a != b for a, b in pairwise(roles[f"{number:03d}"] for number in range(1, 601)))
+    assert changes < 600 / 10
+
+
 ANNOTATION = {"id": 5, "image_id": 7, "category_id": 1, "segmentation": [[0, 0, 9, 0, 9, 9]]}
 
 
@@ -434,6 +534,7 @@ def test_damaged_and_missing_files_and_settings_that_cannot_be_are_named(tmp_pat
         ({"tusimple": str(bad)}, "line 1: has no 'lanes'"),
         ({"coco": path, "coco_classes": {"stripe": ARROW}}, "has no category 'stripe', only Arrow, zebra"),
         ({"coco": path, "coco_classes": {"zebra": "stripes"}}, "to be 'stripes'; choose from: diamond"),
+        ({"coco": path, "coco_complete": ["stripes"]}, "coco_complete: .*'stripes'"),
         ({"coco": path, "width": 128}, "smaller than a view of 128x32"),
     ):
         with pytest.raises(LabelError, match=words):

@@ -1,0 +1,171 @@
+"""How well the shipped detector sees on labelled photographs that no training ever showed.
+
+    python -m tests.benchmarks.photographs LABELS.json IMAGES [--mounting 1.3 -12 90] [--model FILE]
+
+The files are those of ROAD MARK, see ``docs/labels.md``; judged are the blocks of places that the recipe
+keeps apart for it (:func:`train.labels.held_out`). Printed, for diamonds and arrows by their height in px of
+1280 x 720: the share that is found (overlap above .3 with a detection of any class) and named. Then, an
+image, the symbols where no label is near; and how paint by the network alone agrees with all labels at
+256 x 256, where an outline of a whole crosswalk, of writing or of a box counts as filled, as in
+RoadMarkResUNet's published .628 / .747.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from train.examples import polygon_overlap
+from train.labels import JUDGING, held_out
+from v2hdm.catalogue import SHIPPED, SYMBOL
+from v2hdm.detection.network import Network
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.pipeline.detect_images import detect_images
+from v2hdm.records import FloatArray, MarkingDetection
+
+WIDTH, HEIGHT = 1280, 720
+FOUND_IOU = 0.3
+NEAR_PX = 12
+"""A symbol this near to a label may be part of what that is about."""
+
+TALL_PX = ((24.0, np.inf), (12.0, 24.0))
+SMALL = 256
+PUBLISHED = ".628 / .747"
+
+_SYMBOLS = ("diamond", *SHIPPED.of_family(SYMBOL))
+
+
+class Labels:
+    """The labels of one image: names and polygons (N, 2), px of 1280 x 720."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.polygons: list[FloatArray] = []
+
+    def near(self) -> np.ndarray:
+        """Pixels (H, W) uint8 that are labelled, or near to it."""
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        for polygon in self.polygons:
+            cv2.fillPoly(mask, [np.round(polygon).astype(np.int32)], 1)
+        return np.asarray(cv2.dilate(mask, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)))
+
+    def small(self) -> np.ndarray:
+        """What is labelled, (256, 256) bool."""
+        mask = np.zeros((SMALL, SMALL), np.uint8)
+        for polygon in self.polygons:
+            cv2.fillPoly(mask, [np.round(polygon * (SMALL / WIDTH, SMALL / HEIGHT)).astype(np.int32)], 1)
+        return mask > 0
+
+
+def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
+    """The labels of the images of some roles, by file name."""
+    content = json.loads(labels.read_text())
+    names = {category["id"]: category["name"] for category in content["categories"]}
+    files = {image["id"]: image["file_name"] for image in content["images"]}
+    its = dict(zip(files, held_out([Path(name).stem for name in files.values()]), strict=True))
+    out = {files[key]: Labels() for key, role in its.items() if role in roles}
+    for annotation in content["annotations"]:
+        if its[annotation["image_id"]] in roles:
+            one = out[files[annotation["image_id"]]]
+            for ring in annotation["segmentation"]:
+                one.names.append(names[annotation["category_id"]])
+                one.polygons.append(np.reshape(ring, (-1, 2)) * (WIDTH / 640, HEIGHT / 640) - 0.5)
+    return out
+
+
+class Tally:
+    """What has been counted so far."""
+
+    def __init__(self) -> None:
+        self.count: Counter[tuple[str, int]] = Counter()
+        self.found: Counter[tuple[str, int]] = Counter()
+        self.named: Counter[tuple[str, int]] = Counter()
+        self.taken_for: dict[str, Counter[str]] = defaultdict(Counter)
+        self.given: Counter[str] = Counter()
+        self.false: Counter[str] = Counter()
+        self.images = 0
+
+    def add(self, labels: Labels, given: tuple[MarkingDetection, ...]) -> None:
+        """Count one image."""
+        self.images += 1
+        outlines = [d.outline_px if len(d.outline_px) else d.corners_px for d in given]
+        near = labels.near()
+        for detection, outline in zip(given, outlines, strict=True):
+            self.given[detection.kind] += 1
+            mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+            cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 1)
+            alone = not (mask & near).any()
+            self.false[detection.kind] += alone and detection.kind in _SYMBOLS
+        for name, polygon in zip(labels.names, labels.polygons, strict=True):
+            kind = "diamond" if name == "diamond_outline" else name.split("_")[0]
+            if kind not in ("diamond", "arrow"):
+                continue
+            tall = float(np.ptp(polygon[:, 1]))
+            size = next((k for k, (low, high) in enumerate(TALL_PX) if low <= tall < high), None)
+            if size is None:
+                continue
+            self.count[kind, size] += 1
+            overlap = [polygon_overlap(outline, polygon) for outline in outlines]
+            over = [k for k, share in enumerate(overlap) if share > FOUND_IOU]
+            self.found[kind, size] += bool(over)
+            self.named[kind, size] += any(given[k].kind == kind for k in over)
+            if over and not any(given[k].kind == kind for k in over):
+                self.taken_for[kind][given[max(over, key=overlap.__getitem__)].kind] += 1
+
+    def print(self) -> None:
+        """Say it."""
+        for (kind, size), count in sorted(self.count.items()):
+            low, high = TALL_PX[size]
+            found, named = self.found[kind, size] / count, self.named[kind, size] / count
+            print(f"{kind:8s} {low:g} to {high:g} px: {count:4d}, found {found:.2f}, named {named:.2f}")
+        print(f"taken for: { {kind: dict(other) for kind, other in self.taken_for.items()} }")
+        print(
+            f"symbols where no label is near, an image: {self.false.total() / self.images:.3f} "
+            f"{dict(self.false)}; given in all: {dict(self.given)}"
+        )
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("labels", type=Path)
+    parser.add_argument("images", type=Path)
+    parser.add_argument("--mounting", type=float, nargs=3)
+    parser.add_argument("--model")
+    parser.add_argument("--role", nargs="+", default=[JUDGING])
+    parser.add_argument("--limit", type=int)
+    parsed = parser.parse_args()
+    cv2.setNumThreads(1)
+    labelled = dict(list(read(parsed.labels, tuple(parsed.role)).items())[: parsed.limit])
+    options = DetectorOptions(model=parsed.model)
+    network = Network(Path(parsed.model) if parsed.model else None)
+    tally, both, either, true, said = Tally(), 0, 0, 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        for name in labelled:
+            image = cv2.imread(str(parsed.images / name))
+            assert image is not None, name
+            image = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+            cv2.imwrite(f"{folder}/{Path(name).stem}.png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        for seen in detect_images(folder, mounting=parsed.mounting, detector=options):
+            labels = labelled[Path(seen.frame.name).stem + ".jpg"]
+            tally.add(labels, tuple(marking.image for marking in seen.road.markings))
+            paint = cv2.resize(
+                network.run(seen.frame.pixels).paint, (SMALL, SMALL), interpolation=cv2.INTER_AREA
+            )
+            truth = labels.small()
+            both += int((truth & (paint > 0)).sum())
+            either += int((truth | (paint > 0)).sum())
+            true, said = true + int(truth.sum()), said + int((paint > 0).sum())
+    print(f"{tally.images} images, mounting {parsed.mounting or 'not stated'}")
+    tally.print()
+    print(f"paint: IoU / F1 {both / either:.3f} / {2 * both / (true + said):.3f} (published {PUBLISHED})")
+
+
+if __name__ == "__main__":
+    main()
