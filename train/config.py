@@ -57,6 +57,19 @@ class DataConfig:
     kerbs: float = 0.2
     junctions: float = 0.12
     mountings: float = 0.15
+    facing: float = 0.5
+    hollow: float = 0.25
+    crossings: float = 0.12
+    words: float = 0.1
+    erased: float = 0.7
+    litter: float = 1.2
+    traffic: float = 0.5
+    own_vehicle: float = 0.2
+    rain: float = 0.08
+    low_sun: float = 0.1
+    dusk: float = 0.06
+    sun_flecks: float = 0.08
+    grounds: float = 0.4
     aside: float = 0.08
     workers: int | None = 1
     coco: str | None = None
@@ -184,6 +197,8 @@ _RANGES = {
         for name in (
             "shadows_on_paint", "things_beside", "faint", "seams", "side_seams", "pavements", "bleached",
             "overexposed", "blue_shade", "tight_bends", "kerbs", "junctions", "mountings", "aside",
+            "facing", "hollow", "crossings", "words", "erased", "litter", "traffic", "own_vehicle", "rain",
+            "low_sun", "dusk", "sun_flecks", "grounds",
         )
     },
     **{f"loss.{name}": NOT_NEGATIVE for name in ("paint_weight", "dice", "kinds", "lanes", "lane_weight")},

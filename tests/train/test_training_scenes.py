@@ -11,17 +11,32 @@ from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from train.scenes import scenes
 from train.scenes.hardships import Hardships, bleached, junction_approach, things_beside, tight_bend
-from train.scenes.paint import Bend, port_paint, random_brush, rectangle, rhombus, street_paint
+from train.scenes.letters import WORDS, word
+from train.scenes.paint import (
+    Bend,
+    Brush,
+    Facing,
+    port_paint,
+    random_brush,
+    rectangle,
+    rhombus,
+    street_paint,
+)
+from train.scenes.remains import with_erased
 from train.scenes.scenes import TrainingSample, image_line, image_points, random_scene, training_sample
+from train.scenes.symbols import hollow_diamond, lines_across, with_crossing
+from train.scenes.traffic import traffic
 from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
+from train.scenes.windscreen import before_lens
 from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
 from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.geometry.planar import clip_convex, inside_convex
+from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE, CameraInfo
-from v2hdm.simulate.render.renderer import Motion, Optics
-from v2hdm.simulate.render.scene import Ground, Paint, Scene, box_footprint
+from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
+from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
+from v2hdm.simulate.render.textures import GROUNDS, photo_tile
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 
@@ -187,7 +202,10 @@ def test_tight_bends_turn_the_lines_and_keep_the_way_clear():
     assert tight_bend(np.random.default_rng(0), 0.0) is None
 
 
-ELSEWHERE = ("things_beside", "tight_bends", "kerbs", "junctions", "mountings", "aside")
+ELSEWHERE = (
+    "things_beside", "tight_bends", "kerbs", "junctions", "mountings", "aside", "facing", "hollow",
+    "crossings", "words", "litter", "traffic", "own_vehicle",
+)  # fmt: skip
 
 
 def pairs(hard, count):
@@ -205,7 +223,16 @@ def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name):
     assert any((plain.image != hard.image).any() for plain, hard in seen)
 
 
-@pytest.mark.parametrize("hard", [Hardships(things_beside=4.0), Hardships(kerbs=1.0)])
+@pytest.mark.parametrize(
+    "hard",
+    [
+        Hardships(things_beside=4.0),
+        Hardships(kerbs=1.0),
+        Hardships(litter=8.0),
+        Hardships(traffic=4.0),
+        Hardships(own_vehicle=1.0),
+    ],
+)
 def test_things_beside_markings_hide_paint_and_add_none(hard):
     seen = pairs(hard, 12)
     for plain, crowded in seen:
@@ -213,6 +240,137 @@ def test_things_beside_markings_hide_paint_and_add_none(hard):
         assert (crowded.labels[changed] == 0).all()
         assert crowded.hidden[plain.hidden].all()
     assert any((plain.hidden != crowded.hidden).any() for plain, crowded in seen)
+
+
+def test_no_picture_without_the_later_hardships_has_changed():
+    """The first validation renders (seed 1): painted pixels, and the mean in blue, green, red."""
+    known = [
+        (0, [96.6, 102.6, 92.9]),
+        (0, [117.9, 65.9, 80.7]),
+        (82, [140.9, 146.9, 126.1]),
+        (0, [68.4, 76.4, 77.9]),
+    ]
+    for index, (painted, mean) in enumerate(known):
+        sample = training_sample(1_000_004, index, 96, 64)
+        assert int((sample.labels > 0).sum()) == pytest.approx(painted, abs=3)
+        np.testing.assert_allclose(sample.image.mean(axis=(0, 1)), mean, atol=0.3)
+
+
+def test_an_outline_of_a_diamond_is_a_diamond_and_its_middle_shows_the_ground():
+    rng = np.random.default_rng(0)
+    brush = Brush((0.7, 0.7, 0.7), 0.0, 0.0)
+    corners = rhombus(np.array([6.0, 0.0]), 2.0, 1.4)
+    info = CameraInfo("down", 120, 120, np.array([[100.0, 0, 60], [0, 100.0, 60], [0, 0, 1]]))
+    above = looking(np.array([6.0, 0.0, 3.0]), 0.0, np.pi / 2, 0.0)
+    ground = Ground(albedo_bgr=(0.1, 0.1, 0.1), contrast=0.0, stains=0.0)
+    seen = []
+    for paints in ([Paint(kind=DIAMOND, polygon_map=corners)], hollow_diamond(brush, rng, corners, 0.2)):
+        seen.append(Renderer(Scene(ground=ground, paints=tuple(paints))).render(info, above, rng))
+    filled, hollow = seen
+    assert (filled.labels == hollow.labels).mean() > 0.999
+    assert filled.image[60, 60, 1] > 2 * hollow.image[60, 60, 1]
+    ring = (hollow.labels > 0) & (hollow.image[..., 1] > 2 * hollow.image[60, 60, 1])
+    assert 0.3 < ring.sum() / (hollow.labels > 0).sum() < 0.6, "a stroke of 0.2 m is 46 % of the area"
+
+
+def test_half_of_the_arrows_face_the_camera_when_half_are_asked_to():
+    turned = []
+    for seed in range(60):
+        roads = [
+            street_paint(
+                np.random.default_rng(seed),
+                Brush((0.7, 0.7, 0.7), 0.0, 0.0),
+                Bend(0.0),
+                Facing(np.random.default_rng(seed), share),
+            )
+            for share in (0.0, 0.5)
+        ]
+        arrows = [[p.polygon_map for p in road.paints if p.kind == ARROW] for road in roads]
+        assert len(arrows[0]) == len(arrows[1])
+        turned += [not np.allclose(a, b) for a, b in zip(*arrows, strict=True)]
+    assert len(turned) > 60
+    assert 0.3 < np.mean(turned) < 0.7
+
+
+def test_a_stop_line_that_meets_lines_of_lanes_reaches_from_one_to_another():
+    met = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        brush, bend = random_brush(rng, 0.0), Bend(0.01 if seed % 2 else 0.0)
+        road = street_paint(rng, brush, bend)
+        crossed = with_crossing(rng, road, brush, bend, 1.0)
+        if crossed is road:
+            continue
+        bar = crossed.paints[-1].polygon_map
+        assert crossed.paints[-1].kind == STOP_LINE
+        along = bend.to_map(np.column_stack([np.linspace(0, 30, 3001), np.zeros(3001)]))
+        at = float(np.argmin(np.linalg.norm(along - bar.mean(axis=0), axis=1))) * 0.01
+        heading = float(bend.heading(at))
+        beside = (bar - bend.to_map(np.array([at, 0.0]))) @ np.array([-np.sin(heading), np.cos(heading)])
+        lines = lines_across(road.lanes, bend, at)
+        met += ((lines > beside.min() - 0.5) & (lines < beside.max() + 0.5)).sum() >= 2
+    assert met > 15
+
+
+def test_words_are_strokes_of_their_size_in_the_order_in_which_they_are_read():
+    near, far = (list(word(text, 2.0, 0.5, 0.1)) for text in ("BUS", "BUS LANE"))
+    assert all(signed_area(stroke) > 0 for stroke in far)
+    assert np.ptp(np.vstack(near)[:, 0]) == pytest.approx(2.1, abs=0.02)
+    assert np.vstack(far)[:, 0].max() == pytest.approx(4.85, abs=0.05)
+    left_i, right_l = (np.vstack(list(word(text, 2.0, 0.5, 0.1)))[:, 1] for text in ("I", "LI"))
+    assert right_l.max() > left_i.max()
+    assert all(list(word(text, 2.0, 0.5, 0.1)) for text in WORDS)
+
+
+def test_erased_markings_are_no_paint_and_vehicles_bear_pictures():
+    marks = with_erased(np.random.default_rng(0), None, 5.0)
+    assert marks is not None
+    assert (marks.factor != 128).any()
+    assert with_erased(np.random.default_rng(0), marks, 0.0) is marks
+    boxes = [box for seed in range(30) for box in traffic(np.random.default_rng(seed), 3.0)]
+    assert sum(bool(box.pictures) for box in boxes) > 30
+    for box in boxes:
+        assert not inside_convex(box_footprint(box), np.zeros((1, 2))).any(), "no camera stands in a vehicle"
+
+
+def test_a_picture_lies_on_its_face_from_the_upper_left_as_seen_from_outside():
+    picture = np.zeros((2, 2, 3), np.uint8)
+    picture[0, 0], picture[0, 1], picture[1, 0] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    box = Box(centre_map=(6.0, 0.0), size_m=(2.0, 2.0, 2.0), pictures=(None, picture))
+    info = CameraInfo("c", 120, 80, np.array([[100.0, 0, 60], [0, 100.0, 40], [0, 0, 1]]))
+    seen = Renderer(Scene(boxes=(box,))).render(
+        info, looking(np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0), np.random.default_rng(0)
+    )
+    assert [int(seen.image[v, u].argmax()) for v, u in ((28, 48), (28, 72), (52, 48))] == [0, 1, 2]
+    assert seen.image[52, 72].max() < 60
+
+
+def test_the_own_bonnet_hides_the_bottom_of_the_image():
+    plain, own = (
+        [training_sample(6, k, 96, 64, hardships=given) for k in range(12)]
+        for given in (Hardships(), Hardships(own_vehicle=1.0))
+    )
+    low = [b.hidden[-4:].mean() - a.hidden[-4:].mean() for a, b in zip(plain, own, strict=True)]
+    assert np.mean([share > 0.5 for share in low]) > 0.3
+
+
+def test_wet_ground_mirrors_what_stands_on_it_and_photographed_grounds_differ():
+    ground = Ground(wet_fraction=0.95, stains=0.0, contrast=0.0)
+    wall = Box(centre_map=(30.0, 0.0), size_m=(1.0, 80.0, 6.0), albedo_bgr=(0.9, 0.0, 0.0))
+    info = CameraInfo("c", 120, 80, np.array([[100.0, 0, 60], [0, 100.0, 30], [0, 0, 1]]))
+    view = looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.0, 0.0)
+    scene = Scene(ground=ground, boxes=(wall,))
+    draw = before_lens(np.random.default_rng(1), np.random.default_rng(1), scene, 0.0)
+    dry, wet = (
+        Renderer(scene).render(info, view, np.random.default_rng(0), before_lens=b).image
+        for b in (None, draw)
+    )
+    blueness = [image[45:60, :, 0].mean() / image[45:60, :, 2].mean() for image in (dry, wet)]
+    assert blueness[1] > 1.05 * blueness[0]
+    assert len(GROUNDS) == 13
+    tiles = [photo_tile(name, 3.0).values for name in GROUNDS]
+    assert all(abs(tile.mean()) < 1e-3 and abs(tile.std() - 1) < 1e-3 for tile in tiles)
+    assert len({tile.tobytes() for tile in tiles}) == 13
 
 
 def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera():

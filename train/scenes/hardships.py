@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from train.scenes.clutter import kerb_colours, plain_marks, thing_to_stand_beside
 from train.scenes.paint import Bend, Brush, RoadPaint, arrow, crosswalk, rectangle, stop_line
+from train.scenes.symbols import laid
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.records import ARROW, CROSSWALK_BAR, STOP_LINE, FloatArray
@@ -55,6 +56,21 @@ class Hardships:
         junctions: share of scenes with the whole approach to a junction: arrows, stop line, crosswalk.
         mountings: share of cameras that sit lower than in cars (0.5 to 1.1 m) or higher than on most trucks
             (3.6 to 5 m).
+        facing: share of the lanes whose arrows and writing face the camera.
+        hollow: share of ports whose diamonds are outlines, labelled as filled ones as photographs are; and
+            of streets with such diamonds in a lane.
+        crossings: share of scenes with a stop line that meets or crosses lines of lanes.
+        words: share of scenes with a word or a number in a lane.
+        erased: mean number of markings that were ground off, burnt off or painted over: no paint.
+        litter: mean number of sheets, boxes, bags and cans on the ground.
+        traffic: mean number of vehicles, boards and kerbs with stripes, windows, wheels, plates and writing.
+        own_vehicle: share of images with the own bonnet or dashboard, wipers, or drops and reflections on
+            the windscreen.
+        rain: share of scenes whose ground is wet all over and mirrors a bright sky.
+        low_sun: share of scenes with a sun at 3 to 11 degrees, half of them against it.
+        dusk: share of scenes after sunset, mostly in the light of the own headlights.
+        sun_flecks: share of scenes in deep shade with few spots of sun.
+        grounds: share of grounds of asphalt or concrete that are photographed ones.
         aside: share of cameras that look to the side of the vehicle. What they see is another scene's worth,
             and its dashes and stop lines have changed names: see
             :func:`~train.scenes.scenes.training_sample`.
@@ -73,6 +89,19 @@ class Hardships:
     kerbs: float = 0.0
     junctions: float = 0.0
     mountings: float = 0.0
+    facing: float = 0.0
+    hollow: float = 0.0
+    crossings: float = 0.0
+    words: float = 0.0
+    erased: float = 0.0
+    litter: float = 0.0
+    traffic: float = 0.0
+    own_vehicle: float = 0.0
+    rain: float = 0.0
+    low_sun: float = 0.0
+    dusk: float = 0.0
+    sun_flecks: float = 0.0
+    grounds: float = 0.0
     aside: float = 0.0
 
 
@@ -205,11 +234,7 @@ def with_junction(
     """This road, or in a ``share`` of cases with the approach to a junction instead of what was there."""
     if rng.random() >= share:
         return road
-    approach, ground = junction_approach(rng, brush, bend)
-    middles = np.array([paint.polygon_map.mean(axis=0) for paint in road.paints]).reshape(-1, 2)
-    there = inside_convex(ground, middles)
-    kept = [paint for paint, inside in zip(road.paints, there, strict=True) if not inside]
-    return RoadPaint([*kept, *approach], road.lanes)
+    return laid(road, *junction_approach(rng, brush, bend))
 
 
 def junction_approach(rng: np.random.Generator, brush: Brush, bend: Bend) -> tuple[list[Paint], FloatArray]:
@@ -224,7 +249,7 @@ def junction_approach(rng: np.random.Generator, brush: Brush, bend: Bend) -> tup
         (STOP_LINE, shape + np.array([stop_m, right])) for shape in stop_line(rng, lanes * lane_m, thick_m)
     ]
     for lane in range(lanes):
-        tip_m, head = stop_m - rng.uniform(1, 5), 1 if rng.random() < 0.8 else -1
+        tip_m, head = stop_m - rng.uniform(1, 5), 1 if rng.random() < 0.5 else -1
         while rng.random() < 0.8 and tip_m > 5:
             parts = list(arrow(rng, lane_m))
             long_m = max(part[:, 0].max() for part in parts)

@@ -146,7 +146,21 @@ class _LaneLine:
         return min(abs(a - b) for a in self.strands_m for b in other.strands_m)
 
 
-def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
+@dataclass(frozen=True)
+class Facing:
+    """Turns a ``share`` of the symbols to face the camera, drawn from a stream of its own."""
+
+    rng: np.random.Generator
+    share: float
+
+    def turn(self) -> int:
+        """-1 for a symbol that is to be turned, otherwise 1."""
+        return -1 if self.rng.random() < self.share else 1
+
+
+def street_paint(
+    rng: np.random.Generator, brush: Brush, bend: Bend, facing: Facing | None = None
+) -> RoadPaint:
     """Lane lines of all kinds about the camera, and now and then a junction's markings."""
     lane_m = rng.uniform(2.5, 3.9)
     first = rng.integers(-3, 0)
@@ -162,13 +176,13 @@ def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPain
         road.add(_lane_line(rng, brush, bend, int(style), float(left), width_m, dash))
     for lane in lines[:-1]:
         if rng.random() < 0.3:
-            road.paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m)
+            road.paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m, facing)
     if rng.random() < 0.45:
         road.paints += _junction(rng, brush, bend, lane_m)
     return road
 
 
-def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
+def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend, facing: Facing | None = None) -> RoadPaint:
     """Columns of diamonds along the way, with lane lines between some of them."""
     length_m = rng.uniform(0.45, 1.9)
     width_m = length_m / rng.uniform(0.9, 3.0)
@@ -189,7 +203,7 @@ def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
     if rng.random() < 0.4:
         road.paints += _junction(rng, brush, bend, 3.2)
     if rng.random() < 0.35:
-        road.paints += _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2)
+        road.paints += _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2, facing)
     lines: list[_LaneLine] = []
     for _ in range(int(rng.integers(0, 4))):
         style = int(rng.choice(4, p=[0.4, 0.5, 0.05, 0.05]))
@@ -294,14 +308,15 @@ def _strip(bend: Bend, start: float, end: float, left: float, width_m: float) ->
 
 
 def _lane_symbols(
-    rng: np.random.Generator, brush: Brush, bend: Bend, left: float, lane_m: float
+    rng: np.random.Generator, brush: Brush, bend: Bend, left: float, lane_m: float, facing: Facing | None
 ) -> list[Paint]:
     """An arrow or a line of writing in a lane, perhaps repeated."""
     draw, kind = (arrow, ARROW) if rng.random() < 0.6 else (_writing, OTHER_PAINT)
     out: list[Paint] = []
+    turn = facing.turn() if facing else 1
     for along in np.arange(rng.uniform(1, 12), 32, rng.uniform(9, 30)):
         for polygon in draw(rng, lane_m):
-            placed = bend.to_map(polygon + np.array([along, left]))
+            placed = bend.to_map(turn * polygon + np.array([along, left]))
             out.append(brush.paint(rng, kind, placed))
     return out
 

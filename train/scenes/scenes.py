@@ -29,8 +29,13 @@ from train.scenes.hardships import (
     with_seams,
     with_side_seams,
 )
-from train.scenes.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
+from train.scenes.paint import Bend, Facing, RoadPaint, port_paint, random_brush, rectangle, street_paint
+from train.scenes.remains import litter, with_erased
+from train.scenes.symbols import with_crossing, with_hollow, with_words
+from train.scenes.traffic import traffic
 from train.scenes.views import TrainingView, mounted_otherwise, random_view, turned_aside
+from train.scenes.weather import dusk, in_the_dark, low_sun, photographed, rain, sun_flecks
+from train.scenes.windscreen import before_lens
 from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
@@ -94,11 +99,16 @@ def training_sample(
     usual = random_view(rng, width, height)
     places = [paint.polygon_map.mean(axis=0) for paint in scene.paints if paint.kind in CORNERED_CLASSES]
     for_optics, for_view, for_mounting = rng.spawn(3)
+    for_dark, for_weather, for_vehicle = for_mounting.spawn(3)
     ahead = mounted_otherwise(for_mounting, usual, hardships.mountings)
     view = turned_aside(for_view, ahead, places, hardships.aside)
     scene = _without_hidden_boxes(scene, view)
     optics = overexposed(for_optics, view.optics, scene.ground, hardships.overexposed)
-    rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, optics, view.motion)
+    optics = in_the_dark(for_dark, optics, scene.light)
+    before = before_lens(for_weather, for_vehicle, scene, hardships.own_vehicle)
+    rendered = Renderer(scene).render(
+        view.info, view.cam_from_map, rng, optics, view.motion, before_lens=before
+    )
     seen = (image_line(view, lane) for lane in lanes)
     lanes_px = tuple(lane for lane in seen if len(lane) > 1)
     labels = rendered.labels if view is ahead else _TO_ONE_ASIDE[rendered.labels]
@@ -157,24 +167,38 @@ def random_scene(
     for_shadows, for_ground, for_light, for_things, for_paint, for_bend, for_kerbs, for_junction = rng.spawn(
         8
     )
+    # Streams of their own for what came later leave what was drawn before as it is.
+    for_facing, for_symbols, for_remains, for_traffic, for_weather, for_grounds = for_junction.spawn(6)
     tight = tight_bend(for_bend, hardships.tight_bends)
     bend = tight or bend
     brush = random_brush(rng, difficulty)
     road_half_m = float(rng.uniform(2, 9))
+    facing = Facing(for_facing, hardships.facing)
     if place == "port":
-        road, boxes = port_paint(rng, brush, bend), port_boxes(rng)
+        road, boxes = port_paint(rng, brush, bend, facing), port_boxes(rng)
     elif place == "street":
-        road, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
+        road, boxes = street_paint(rng, brush, bend, facing), street_boxes(rng, road_half_m)
     else:
         road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
     junction = with_junction(for_junction, road, brush, bend, hardships.junctions)
     boxes = clear_of(boxes, junction.paints) if tight or junction is not road else boxes
     road = junction
+    if place != "bare":
+        road = with_hollow(for_symbols, road, brush, bend, hardships.hollow)
+        road = with_words(for_symbols, road, brush, bend, hardships.words)
+        road = with_crossing(for_symbols, road, brush, bend, hardships.crossings)
     ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
     marks = with_pavements(for_ground, ground.marks, road.lanes, hardships.pavements)
     marks = with_seams(for_ground, marks, road.lanes, hardships.seams)
     marks = with_side_seams(for_ground, marks, road.paints, hardships.side_seams)
+    marks = with_erased(for_remains, marks, hardships.erased)
     ground = bleached(for_ground, ground, hardships.bleached)
+    ground = photographed(for_grounds, ground, hardships.grounds)
+    dapples = _dapples(rng, difficulty)
+    light = blue_shade(for_light, _light(rng), hardships.blue_shade)
+    light = low_sun(for_weather, light, hardships.low_sun)
+    ground, light = rain(for_weather, ground, light, hardships.rain)
+    light = dusk(for_weather, light, hardships.dusk)
     scene = Scene(
         ground=replace(ground, marks=marks),
         paints=faint(for_paint, road.paints, hardships.faint),
@@ -182,10 +206,12 @@ def random_scene(
             *boxes,
             *things_beside(for_things, road.paints, hardships.things_beside),
             *clear_of(kerbs(for_kerbs, road.lanes, hardships.kerbs), road.paints),
+            *litter(for_remains, hardships.litter),
+            *traffic(for_traffic, hardships.traffic),
         ),
         shadows=shadows + shadows_on_paint(for_shadows, road.paints, hardships.shadows_on_paint),
-        dapples=_dapples(rng, difficulty),
-        light=blue_shade(for_light, _light(rng), hardships.blue_shade),
+        dapples=dapples + sun_flecks(for_weather, hardships.sun_flecks),
+        light=light,
         backdrop=_backdrop(rng),
     )
     return scene, road.lanes

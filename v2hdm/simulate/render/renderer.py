@@ -9,6 +9,7 @@ From radiance to a recorded image: blur of lens and motion, exposure, noise, sRG
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Any
@@ -66,11 +67,13 @@ class Renderer:
         optics: Optics | None = None,
         motion: Motion | None = None,
         moving_boxes: tuple[Box, ...] = (),
+        before_lens: Callable[[View, Float32, NDArray[np.bool_]], None] | None = None,
     ) -> Rendered:
         """Render one image of a camera of any size, at ``cam_from_map`` in the middle of the exposure.
 
         The sensor noise is drawn from ``rng``: the picture is a function of its state. ``moving_boxes`` stand
-        in the scene for this image only.
+        in the scene for this image only. ``before_lens`` draws on the radiance (H, W, 3) what moves with the
+        camera, and sets ``hidden`` (H, W) where that is opaque.
         """
         view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64))
         labels = np.zeros((info.height, info.width), dtype=np.uint8)
@@ -79,8 +82,11 @@ class Renderer:
         shadows = self._shadows + tuple(box_shadow(box, self.scene.light) for box in moving_boxes)
         radiance = self._surroundings(view, shadows, labels)
         draw_boxes(boxes, self.scene.light, view, radiance, hidden)
+        radiance = _motion_blur(radiance, view, motion or Motion())
+        if before_lens is not None:
+            before_lens(view, radiance, hidden)
         labels[hidden] = 0
-        image = expose(radiance, view, optics or Optics(), motion or Motion(), rng)
+        image = expose(radiance, optics or Optics(), rng)
         return Rendered(image, labels, hidden)
 
     def _surroundings(self, view: View, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]) -> Float32:
@@ -175,11 +181,8 @@ class Motion:
     exposure_s: float = 0.0
 
 
-def expose(
-    radiance: Float32, view: View, optics: Optics, motion: Motion, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """The recorded image (H, W, 3) uint8 of a scene's radiance (H, W, 3)."""
-    image = _motion_blur(radiance, view, motion)
+def expose(image: Float32, optics: Optics, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The recorded image (H, W, 3) uint8 of the radiance (H, W, 3) that reaches the lens."""
     if optics.psf_sigma_px > 0:
         image = _float32(cv2.GaussianBlur(image, (0, 0), optics.psf_sigma_px))
     height, width = image.shape[:2]

@@ -79,7 +79,8 @@ class Box:
     """An upright cuboid that hides what lies behind it and casts a shadow: container, truck, wall, pole.
 
     ``centre_map`` is the centre of its footprint, ``size_m`` its length, width and height,
-    ``base_m`` the height of its lower side.
+    ``base_m`` the height of its lower side. ``pictures`` (h, w, 3) uint8 fill its left, rear, right and front
+    side and its top, as seen from outside: reflectance in 255ths, in place of the colour; None leaves that.
     """
 
     centre_map: tuple[float, float]
@@ -88,6 +89,7 @@ class Box:
     albedo_bgr: Bgr = (0.3, 0.3, 0.3)
     base_m: float = 0.0
     corrugated: bool = False
+    pictures: tuple[NDArray[np.uint8] | None, ...] = ()
     seed: int = 0
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,7 @@ class _Face:
     corners_map: FloatArray
     normal: FloatArray
     upright: bool
+    picture: NDArray[np.uint8] | None = None
 
 
 def draw_boxes(
@@ -53,15 +56,16 @@ def _faces(box: Box) -> list[_Face]:
     footprint = box_footprint(box)
     low, high = box.base_m, box.base_m + box.size_m[2]
     faces = []
+    pictures = (*box.pictures, *(None,) * 6)
     for k in range(4):
         a, b = footprint[k], footprint[(k + 1) % 4]
         along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
         corners = np.array([[*a, low], [*b, low], [*b, high], [*a, high]])
-        faces.append(_Face(corners, np.array([along[1], -along[0], 0.0]), True))
-    for level, up in ((high, 1.0), (low, -1.0)):
+        faces.append(_Face(corners, np.array([along[1], -along[0], 0.0]), True, pictures[k]))
+    for level, up, picture in ((high, 1.0, pictures[4]), (low, -1.0, None)):
         if level > 0:
             corners = np.column_stack([footprint, np.full(4, level)])
-            faces.append(_Face(corners, np.array([0.0, 0.0, up]), False))
+            faces.append(_Face(corners, np.array([0.0, 0.0, up]), False, picture))
     return faces
 
 
@@ -73,25 +77,44 @@ def _draw_face(
         return
     sun = max(float(face.normal @ np.array(light.sun_direction_map)), 0.0)
     sky = 0.55 + 0.45 * face.normal[2]
-    colour = [
-        a * (sun * s + (sky if face.normal[2] >= 0 else 0.35) * d)
-        for a, s, d in zip(box.albedo_bgr, light.sun_bgr, light.sky_bgr, strict=True)
+    lit = [
+        sun * s + (sky if face.normal[2] >= 0 else 0.35) * d
+        for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True)
     ]
     for window in windows(view, shape):
         covered = coverage(view, shape, window, grown_px=0.5)
         if not covered.any():
             continue
-        tone = _tone(box, face, view, window)
+        at = _face_coordinates(face, view, window)
+        tone, albedo = _tone(box, face, *at), _albedo(box, face, *at)
         hidden[window] |= covered > 0.5
         target = radiance[window]
         for channel in range(3):
             below = target[..., channel]
-            below += covered * (tone * np.float32(colour[channel]) - below)
+            colour = np.asarray(albedo[channel] * lit[channel], dtype=np.float32)
+            below += covered * (tone * colour - below)
 
 
-def _tone(box: Box, face: _Face, view: View, window: Window) -> Float32:
+def _albedo(
+    box: Box, face: _Face, along_m: Float32, up_m: Float32, footprint_m: Float32
+) -> Sequence[float] | Float32:
+    """Reflectance of a face in blue, green and red: its box's colour, or its picture's (3, h, w)."""
+    if face.picture is None:
+        return box.albedo_bgr
+    origin, first, _, last = face.corners_map
+    sides_m = np.array([np.linalg.norm(first - origin), np.linalg.norm(last - origin)])
+    # Fewer texels than pixels would shimmer: the picture is first averaged to the size it is seen at.
+    most = np.ceil(sides_m / max(float(np.median(footprint_m)), 1e-4)).astype(int)
+    columns, rows = (int(n) for n in np.clip(most, 1, face.picture.shape[1::-1]))
+    picture = cv2.resize(face.picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    u = along_m * np.float32(columns / sides_m[0]) - np.float32(0.5)
+    v = np.float32(rows - 0.5) - up_m * np.float32(rows / sides_m[1])
+    shown = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.moveaxis(shown.astype(np.float32) * np.float32(1 / 255), 2, 0)
+
+
+def _tone(box: Box, face: _Face, along_m: Float32, up_m: Float32, footprint: Float32) -> Float32:
     """Relative brightness (h, w): corrugation, door seams by its shade, streaks of dirt."""
-    along_m, up_m, footprint = _face_coordinates(face, view, window)
     offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
     tone = np.float32(1.0) + np.float32(0.1) * sample(_DIRT_TILE, along_m, up_m * np.float32(0.35), offset)
     if box.corrugated and face.upright:

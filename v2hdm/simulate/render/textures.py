@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 
 _TILE_PX = 512
+_GROUNDS = Path(__file__).parent / "grounds"
+GROUNDS = tuple(sorted(path.stem for path in _GROUNDS.glob("*.jpg")))
+"""Photographs of asphalt and concrete that come with the renderer; see their README."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +57,17 @@ def noise_tile(seed: int, side_m: float, slope: float, finest_px: float = 2.0, s
 
 @cache
 def photo_tile(name: str, side_m: float) -> Tile:
-    """A photographed surface of scikit-image (``gravel``, ``grass``, ``brick``), mirrored to be seamless."""
-    import skimage.data
+    """A photographed surface, mirrored to be seamless: of :data:`GROUNDS`, or scikit-image's.
 
-    photo = cv2.resize(
-        getattr(skimage.data, name)(), (_TILE_PX // 2, _TILE_PX // 2), interpolation=cv2.INTER_AREA
-    )
+    The latter are ``gravel``, ``grass`` and ``brick``.
+    """
+    if name in GROUNDS:
+        whole = cv2.imread(str(_GROUNDS / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    else:
+        import skimage.data
+
+        whole = getattr(skimage.data, name)()
+    photo = cv2.resize(whole, (_TILE_PX // 2, _TILE_PX // 2), interpolation=cv2.INTER_AREA)
     values = photo.astype(np.float32)
     values = (values - values.mean()) / values.std()
     mirrored = np.vstack([np.hstack([values, values[:, ::-1]]), np.hstack([values, values[:, ::-1]])[::-1]])
