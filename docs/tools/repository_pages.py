@@ -23,6 +23,7 @@ PAGES = {
     "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
     "train/README.md": "training.md",
+    "models/README.md": "model-card.md",
 }
 """Files of the repository, and which page of the site each is."""
 

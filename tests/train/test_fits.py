@@ -142,7 +142,8 @@ def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_no
     head = np.array([[100.0, 100], [130, 160], [160, 100]])
     hidden = np.array([[300.0, 100], [310, 100], [310, 200], [300, 200]])
     shown = SimpleNamespace(
-        markings=[TrueMarking(ARROW, head, 5.0, False), TrueMarking(LANE_DASH, hidden, 5.0, False)]
+        unknown=None,
+        markings=[TrueMarking(ARROW, head, 5.0, False), TrueMarking(LANE_DASH, hidden, 5.0, False)],
     )
     over_head = np.array([[130.0, 90], [105, 115], [130, 140], [155, 115]])
     assert is_true(shown, DIAMOND, over_head) == (False, None)
