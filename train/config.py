@@ -58,6 +58,7 @@ class DataConfig:
     junctions: float = 0.12
     mountings: float = 0.15
     facing: float = 0.5
+    stout: float = 0.4
     hollow: float = 0.25
     crossings: float = 0.12
     words: float = 0.1
@@ -197,8 +198,8 @@ _RANGES = {
         for name in (
             "shadows_on_paint", "things_beside", "faint", "seams", "side_seams", "pavements", "bleached",
             "overexposed", "blue_shade", "tight_bends", "kerbs", "junctions", "mountings", "aside",
-            "facing", "hollow", "crossings", "words", "erased", "litter", "traffic", "own_vehicle", "rain",
-            "low_sun", "dusk", "sun_flecks", "grounds",
+            "facing", "stout", "hollow", "crossings", "words", "erased", "litter", "traffic",
+            "own_vehicle", "rain", "low_sun", "dusk", "sun_flecks", "grounds",
         )
     },
     **{f"loss.{name}": NOT_NEGATIVE for name in ("paint_weight", "dice", "kinds", "lanes", "lane_weight")},

@@ -57,10 +57,11 @@ class Hardships:
         mountings: share of cameras that sit lower than in cars (0.5 to 1.1 m) or higher than on most trucks
             (3.6 to 5 m).
         facing: share of the lanes whose arrows and writing face the camera.
+        stout: share of the lanes with arrows whose shafts are thick and tapered, their heads short.
         hollow: share of ports whose diamonds are outlines, labelled as filled ones as photographs are; and
             of streets with such diamonds in a lane.
         crossings: share of scenes with a stop line that meets or crosses lines of lanes.
-        words: share of scenes with a word or a number in a lane.
+        words: share of scenes with a word, a number or a hatched box in a lane.
         erased: mean number of markings that were ground off, burnt off or painted over: no paint.
         litter: mean number of sheets, boxes, bags and cans on the ground.
         traffic: mean number of vehicles, boards and kerbs with stripes, windows, wheels, plates and writing.
@@ -90,6 +91,7 @@ class Hardships:
     junctions: float = 0.0
     mountings: float = 0.0
     facing: float = 0.0
+    stout: float = 0.0
     hollow: float = 0.0
     crossings: float = 0.0
     words: float = 0.0

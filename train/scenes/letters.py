@@ -37,9 +37,9 @@ def word(text: str, tall_m: float, wide_m: float, stroke_m: float) -> Iterator[F
         for place, letter in enumerate(letters):
             left_m = ((len(letters) - 1) / 2 - place) * 1.35 * wide_m
             for stroke in _STROKES[letter].split(","):
-                grid = np.array([[int(row), int(column)] for column, row in stroke.split()])
-                at = np.array([line * 1.4 * tall_m, left_m])
-                points = at + (grid - (0, 1)) * (tall_m / 4, -wide_m / 2)
+                grid = np.array([[int(at[1]), int(at[0])] for at in stroke.split()])
+                middle = np.array([line * 1.4 * tall_m, left_m])
+                points = middle + (grid - (0, 1)) * (tall_m / 4, -wide_m / 2)
                 for start, end in pairwise(points):
                     yield _stroke(start, end, stroke_m)
 

@@ -148,10 +148,14 @@ class _LaneLine:
 
 @dataclass(frozen=True)
 class Facing:
-    """Turns a ``share`` of the symbols to face the camera, drawn from a stream of its own."""
+    """Turns a ``share`` of the symbols to face the camera, drawn from a stream of its own.
+
+    A share ``stout`` of the lanes with arrows has stout ones.
+    """
 
     rng: np.random.Generator
     share: float
+    stout: float = 0.0
 
     def turn(self) -> int:
         """-1 for a symbol that is to be turned, otherwise 1."""
@@ -314,8 +318,9 @@ def _lane_symbols(
     draw, kind = (arrow, ARROW) if rng.random() < 0.6 else (_writing, OTHER_PAINT)
     out: list[Paint] = []
     turn = facing.turn() if facing else 1
+    stout = facing is not None and kind == ARROW and facing.rng.random() < facing.stout
     for along in np.arange(rng.uniform(1, 12), 32, rng.uniform(9, 30)):
-        for polygon in draw(rng, lane_m):
+        for polygon in stout_arrow(facing.rng) if facing and stout else draw(rng, lane_m):
             placed = bend.to_map(turn * polygon + np.array([along, left]))
             out.append(brush.paint(rng, kind, placed))
     return out
@@ -340,6 +345,30 @@ def arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
         bar = np.array([start - width / 2, start + width / 2, end + width / 2, end - width / 2])
         yield bar if turn < 0 else bar[::-1]
         yield end + np.array([[-0.6, 0.0], [0.0, turn * 0.7], [0.6, 0.0]])[::-turn]
+
+
+def stout_arrow(rng: np.random.Generator) -> Iterator[FloatArray]:
+    """Convex parts of an arrow with a thick, tapered shaft and a short head, its turns curved."""
+    length, tail_m = rng.uniform(2.5, 6.0), rng.uniform(0.22, 0.45)
+    neck, head, wide = rng.uniform(0.68, 0.82) * length, rng.uniform(1.7, 2.6) * tail_m, rng.uniform(0.7, 1.1)
+    side, ahead = int(rng.choice([-1, 0, 1])), rng.random() < 0.5
+    root = rng.uniform(0.25, 0.55) * length
+    end = neck if not side or ahead else root
+    half = tail_m / 2 * np.array([1.0, wide])
+    yield np.array([[0, -half[0]], [end, -half[1]], [end, half[1]], [0, half[0]]])
+    if not side or ahead:
+        yield np.array([[neck, -head / 2], [length, 0], [neck, head / 2]])
+    if side:
+        reach, rise, thick = rng.uniform(0.25, 0.6), rng.uniform(0.15, 0.35) * length, 0.08 * length
+        turn = np.linspace(0, np.pi / 2, 4)
+        middle = np.column_stack([root + rise * np.sin(turn), side * reach * (1 - np.cos(turn))])
+        off = np.column_stack([thick / 2 * np.sin(turn), -side * half[1] * np.cos(turn)])
+        outer, inner = middle + off, middle - off
+        for k in range(3):
+            part = np.array([inner[k], outer[k], outer[k + 1], inner[k + 1]])
+            yield part[::side]
+        tip = np.array([[-1.6 * thick, 0], [0, side * rng.uniform(0.4, 0.7)], [1.6 * thick, 0]])
+        yield (middle[-1] + tip)[::-side]
 
 
 def _writing(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:

@@ -72,7 +72,7 @@ def _ghost(rng: np.random.Generator, factor: NDArray[np.uint8], shapes_px: list[
     rough = rng.standard_normal(part.shape).astype(np.float32)
     tone = np.exp(rng.uniform(-0.7, -0.1) if rng.random() < 0.6 else rng.uniform(0.05, 0.28))
     if rng.random() < 0.5:
-        rough = cv2.GaussianBlur(rough, (0, 0), 3.0, sigmaY=0.7)
+        rough = np.asarray(cv2.GaussianBlur(rough, (0, 0), 3.0, sigmaY=0.7), dtype=np.float32)
         tone = tone * np.exp(rng.uniform(0.05, 0.2) * rough / rough.std())
     if rng.random() < 0.4:
         scraps = cv2.GaussianBlur(rough, (0, 0), float(rng.uniform(0.8, 2.0)))

@@ -173,7 +173,7 @@ def random_scene(
     bend = tight or bend
     brush = random_brush(rng, difficulty)
     road_half_m = float(rng.uniform(2, 9))
-    facing = Facing(for_facing, hardships.facing)
+    facing = Facing(for_facing, hardships.facing, hardships.stout)
     if place == "port":
         road, boxes = port_paint(rng, brush, bend, facing), port_boxes(rng)
     elif place == "street":

@@ -9,7 +9,7 @@ import numpy as np
 
 from train.scenes.letters import WORDS, word
 from train.scenes.paint import Bend, Brush, RoadPaint, rectangle, rhombus
-from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE, FloatArray
 from v2hdm.simulate.render.scene import Paint
 
@@ -59,9 +59,11 @@ def with_hollow(
 def with_words(
     rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Bend, share: float
 ) -> RoadPaint:
-    """This road, or in a ``share`` of cases with words or a number in lanes, half of them turned round."""
+    """This road, or in a ``share`` of cases with a hatched box or words, half of them turned round."""
     if rng.random() >= share:
         return road
+    if rng.random() < 0.25:
+        return _hatched_box(rng, road, brush, bend)
     text, turn = str(rng.choice(WORDS)), rng.choice([-1, 1])
     letters = max(len(part) for part in text.split())
     tall_m, along = rng.uniform(1.2, 4.5), float(np.exp(rng.uniform(np.log(3), np.log(18))))
@@ -74,6 +76,22 @@ def with_words(
         placed = (_placed(bend, along, middle, turn * (stroke - centre)) for stroke in strokes)
         road = laid(road, [brush.paint(rng, OTHER_PAINT, stroke) for stroke in placed], ground)
     return road
+
+
+def _hatched_box(rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Bend) -> RoadPaint:
+    """This road with a box to be kept clear: its frame, and lines across it one or both ways."""
+    along, left = float(np.exp(rng.uniform(np.log(4), np.log(20)))), float(rng.uniform(-3, 3))
+    long_m, wide_m, thick_m = rng.uniform(2, 9), rng.uniform(2, 7), rng.uniform(0.1, 0.22)
+    box = rectangle(np.zeros(2), long_m, wide_m)
+    shapes = [rectangle(np.array([end * long_m / 2, 0.0]), thick_m, wide_m + thick_m) for end in (-1, 1)]
+    shapes += [rectangle(np.array([0.0, side * wide_m / 2]), long_m + thick_m, thick_m) for side in (-1, 1)]
+    lean, pitch_m = rng.uniform(0.5, 1.1), rng.uniform(0.7, 2.0)
+    for yaw in (lean, -lean)[: int(rng.integers(1, 3))]:
+        for at in np.arange(-long_m, long_m, pitch_m):
+            bar = clip_convex(rectangle(np.array([at, 0.0]), 2 * (long_m + wide_m), thick_m, yaw), box)
+            shapes += [bar] if len(bar) > 2 else []
+    paints = [brush.paint(rng, OTHER_PAINT, _placed(bend, along, left, shape)) for shape in shapes]
+    return laid(road, paints, _placed(bend, along, left, box))
 
 
 def with_crossing(

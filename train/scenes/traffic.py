@@ -25,12 +25,11 @@ _GLASS = ((0.03, 0.03, 0.03), (0.12, 0.1, 0.08), (0.5, 0.42, 0.36))
 
 
 def traffic(rng: np.random.Generator, mean: float) -> tuple[Box, ...]:
-    """Vehicles, boards and striped kerbs ahead and beside, ``mean`` on average."""
+    """Vehicles, boards, fences and striped kerbs ahead and beside, ``mean`` on average."""
+    things = _lorry, _car, _bus, _board, _striped_kerb, _fence
     out: list[Box] = []
     for _ in range(int(rng.poisson(mean))):
-        thing = (_lorry, _car, _bus, _board, _striped_kerb)[
-            int(rng.choice(5, p=[0.4, 0.28, 0.12, 0.12, 0.08]))
-        ]
+        thing = things[int(rng.choice(6, p=[0.38, 0.26, 0.11, 0.11, 0.07, 0.07]))]
         ahead = rng.random() < 0.5
         x = float(np.exp(rng.uniform(np.log(3.5), np.log(25 if ahead else 14))))
         y = float(rng.normal(0, 0.8) if ahead else rng.choice([-1, 1]) * rng.uniform(2.3, 5.5))
@@ -315,6 +314,21 @@ def _board(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
             _box((float(at[0]), float(at[1])), yaw, (0.06, 0.25, 1.0), (None, face, None, face), _WHITE, 0.1)
         )
     return out
+
+
+def _fence(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
+    """A railing of upright bars or a crash barrier, before dark or bright ground."""
+    length, tall = float(rng.uniform(4, 25)), float(rng.uniform(0.7, 1.3))
+    bars, behind = (float(c) for c in rng.uniform(0.05, 0.75, 2))
+    face = _plain((length, tall), (behind, behind, behind))
+    if rng.random() < 0.6:
+        pitch = rng.uniform(0.1, 0.4)
+        for at in np.arange(0, length, pitch):
+            _rectangle(face, at, 0, rng.uniform(0.2, 0.4) * pitch, tall, (bars, bars, bars))
+    for low in (0.1, 0.5, 0.9):
+        _rectangle(face, 0, low * tall, length, rng.uniform(0.03, 0.12), (bars, bars, bars))
+    along = yaw if abs(yaw) < 0.3 else 0.0
+    return [_box((x + length / 2, y), along, (length, 0.06, tall), (face, None, face), (bars, bars, bars))]
 
 
 def _striped_kerb(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:

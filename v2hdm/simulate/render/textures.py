@@ -62,7 +62,7 @@ def photo_tile(name: str, side_m: float) -> Tile:
     The latter are ``gravel``, ``grass`` and ``brick``.
     """
     if name in GROUNDS:
-        whole = cv2.imread(str(_GROUNDS / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+        whole = np.asarray(cv2.imread(str(_GROUNDS / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
     else:
         import skimage.data
 
