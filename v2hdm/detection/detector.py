@@ -23,6 +23,8 @@ from v2hdm.errors import DetectorError
 from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 
+Markings = tuple[MarkingDetection, ...]
+
 _NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
 
 
@@ -73,7 +75,7 @@ class Detector:
             readings = self.read(image_bgr, found)
         with lap("judge"):
             markings = find_markings(readings, found.camera, self.options)
-        return (*markings, *self._symbols(found, markings)), lanes
+        return _likelier(markings, self._symbols(found)), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
         """Run the network on one image; what shows the vehicle itself is no paint.
@@ -139,23 +141,35 @@ class Detector:
             self._cameras[camera.info.name] = known, known.first_row_within(self.options.max_range_m)
         return known
 
-    def _symbols(self, found: Proposals, quads: Sequence[MarkingDetection]) -> list[MarkingDetection]:
-        """Markings within range with an outline but no four corners that are none of the quadrilaterals."""
-        centres = [quad.corners_px.mean(axis=0) for quad in quads]
+    def _symbols(self, found: Proposals) -> list[MarkingDetection]:
+        """Markings within range with an outline but no four corners; of a piece and its parts only one."""
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
-        symbols = []
+        names, symbols, parts_until = self.catalogue.of_family(SYMBOL), [], 0
         for piece in found.pieces:
-            score, ground = piece.score_of([piece.kind]), piece.outline_vehicle
-            is_symbol = self.catalogue.classes[piece.kind].family == SYMBOL and not piece.blob.parts
-            if not is_symbol or score < self.options.min_score or not np.isfinite(ground).all():
+            if not names or piece.index < parts_until:
                 continue
-            if found.camera.range_m(ground.mean(axis=0)) > self.options.max_range_m:
-                continue
-            symbol = MarkingDetection(piece.kind, score, *nothing, outline_polygon(piece.blob))
-            polygon = symbol.outline_px.astype(np.float32)
-            if not any(cv2.pointPolygonTest(polygon, centre.tolist(), False) > 0 for centre in centres):
-                symbols.append(symbol)
+            kind = max(names, key=lambda name: piece.share.get(name, 0.0))
+            score, ground = piece.symbol_score(kind), piece.outline_vehicle
+            within = np.isfinite(ground).all()
+            within &= found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m
+            if within and score >= self.options.min_score:
+                symbols.append(MarkingDetection(kind, score, *nothing, outline_polygon(piece.blob)))
+                parts_until = piece.index + 1 + piece.blob.parts
         return symbols
+
+
+def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetection]) -> Markings:
+    """Quadrilaterals and symbols of one image: where one lies in the other, the one of the higher score."""
+    centres = [quad.corners_px.mean(axis=0).tolist() for quad in quads]
+    left_out: set[int] = set()
+    kept = []
+    for symbol in symbols:
+        polygon = symbol.outline_px.astype(np.float32)
+        on = [k for k, centre in enumerate(centres) if cv2.pointPolygonTest(polygon, centre, False) > 0]
+        if all(quads[k].score < symbol.score for k in on):
+            left_out.update(on)
+            kept.append(symbol)
+    return (*(quad for k, quad in enumerate(quads) if k not in left_out), *kept)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

@@ -43,6 +43,14 @@ _CLASS_DOUBT = 0.05  # share of its certainty about classes that the network may
 _GROUP_DOUBT = 0.1
 """Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
 
+_VOTES = 3.0  # independent opinions that the network's classes all over a piece are worth
+_SYMBOL_ODDS = float(np.log(859 / 5548))  # arrows among other labelled markings of the photographs
+_NAMED_ODDS, _MISSED_ODDS = float(np.log(0.79 / 0.01)), float(np.log(0.99 / 0.21))
+"""Log odds by a vote for and against a symbol: of arrows .79 of the paint is named so, of lines .01.
+
+Shares of 39 arrows and 62 lines of 24 px and more, on photographs.
+"""
+
 _LEAST_FILL = 0.5  # least share of a quadrilateral that its piece of paint fills: a triangle fills half
 _BORDER_PX = 3.0
 """A side this near to the image's border is cut by it: the network's outline is coarser than this."""
@@ -104,6 +112,17 @@ class Proposal:
     def score_of(self, kinds: Iterable[str]) -> float:
         """Mean probability of some classes, by the network alone."""
         return sum(self.blob.class_score.get(kind, 0.0) for kind in kinds)
+
+    def symbol_score(self, kind: str) -> float:
+        """Probability of a symbol of a class.
+
+        A shaft is like a dash, so that the network names parts of an arrow wrongly, but hardly ever a dash an
+        arrow: a few independent votes are weighed by how often each is given where it is right and wrong.
+        What is hardly paint, or of another size, votes against it; a size by itself speaks for no symbol.
+        """
+        share = min(self.score_of([kind]), self.certainty * self.share.get(kind, 0.0))
+        odds = _SYMBOL_ODDS + _VOTES * (share * _NAMED_ODDS - (1 - share) * _MISSED_ODDS)
+        return float(self.certainty * as_probability(np.array(odds)))
 
     def kinds(self, catalogue: Catalogue) -> list[str]:
         """The classes with four corners that it may be of, the likeliest first."""
