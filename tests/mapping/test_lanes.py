@@ -15,6 +15,7 @@ from v2hdm.records import Marking
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
+from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.symbols import map_symbols
 
 OPTIONS = LaneOptions()
@@ -251,6 +252,11 @@ def seen(shapes, kinds, poses_x):
     return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds)), rig
 
 
+def mapped(symbols, rig, markings=()):
+    """The symbols of the map."""
+    return map_symbols(symbols, rig, JITTER_RAD, markings, 0.9)[0]
+
+
 def overlap(one, other):
     """Intersection over union, by cells of a centimetre."""
     low = np.minimum(one.min(axis=0), other.min(axis=0)) - 0.1
@@ -265,7 +271,7 @@ def overlap(one, other):
 
 def test_an_arrow_is_mapped_where_it_lies():
     symbols, rig = scene(9.0)
-    (arrow,) = map_symbols(symbols, rig, JITTER_RAD, ())
+    (arrow,) = mapped(symbols, rig)
     assert (arrow.kind, arrow.sightings) == ("arrow", 3)
     assert overlap(arrow.outline_map, ARROW + AT) > 0.97
     assert abs(signed_area(arrow.outline_map) - signed_area(ARROW)) < 0.01 * signed_area(ARROW)
@@ -277,7 +283,7 @@ def test_an_arrow_is_mapped_where_it_lies():
 def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma():
     true = ARROW + AT
     shapes = [true, true + OFF, true, true, true]
-    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), JITTER_RAD, ())
+    (arrow,) = mapped(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]))
     assert overlap(arrow.outline_map, true) > 0.95
     assert arrow.sigma_m is not None
     assert 0.005 < arrow.sigma_m < 0.05
@@ -286,13 +292,13 @@ def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma(
 def test_the_class_is_what_most_sightings_say():
     shapes = [ARROW + AT] * 4
     kinds = ["arrow", "parking_t", "parking_t", "parking_t"]
-    (symbol,) = map_symbols(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]), JITTER_RAD, ())
+    (symbol,) = mapped(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]))
     assert (symbol.kind, symbol.sightings) == ("parking_t", 4)
 
 
 def test_neighbours_are_symbols_of_their_own():
     bars = [np.array([[7.0, y], [9.0, y], [9.0, y + 0.4], [7.0, y + 0.4]]) for y in (-1.0, 0.0)]
-    found = map_symbols(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]), JITTER_RAD, ())
+    found = mapped(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]))
     assert len(found) == 2
 
 
@@ -301,19 +307,28 @@ def test_what_is_far_or_seen_seldom_is_left_out(x):
     symbols, rig = scene(x)
     if x == 9.0:
         seldom = replace(symbols, frame=np.array([0, 1, 1]))
-        assert map_symbols(seldom, rig, JITTER_RAD, ()) == ()
+        assert mapped(seldom, rig) == ()
     else:
-        assert map_symbols(symbols, rig, JITTER_RAD, ()) == ()
+        assert mapped(symbols, rig) == ()
 
 
 def test_paint_that_is_a_marking_is_no_symbol():
     symbols, rig = scene(9.0)
     square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
     on, beside = (Marking("pad", square + place, 9) for place in ([9.0, 1.0], [9.0, 3.0]))
-    assert map_symbols(symbols, rig, JITTER_RAD, (on,)) == ()
-    assert len(map_symbols(symbols, rig, JITTER_RAD, (beside,))) == 1
+    assert mapped(symbols, rig, (on,)) == ()
+    assert len(mapped(symbols, rig, (beside,))) == 1
 
 
 def test_without_sightings_there_are_no_symbols():
     _, rig = scene(9.0)
-    assert map_symbols(NO_SYMBOLS, rig, JITTER_RAD, ()) == ()
+    assert mapped(NO_SYMBOLS, rig) == ()
+
+
+@pytest.mark.parametrize(("step_m", "reason"), [(0.0, NOT_OBSERVED), (0.3, NOT_ON_GROUND)])
+def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m, reason):
+    way_m = step_m * np.arange(8)
+    shapes = [ARROW + AT + [x, 0.0] for x in way_m]
+    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), JITTER_RAD, (), 0.9)
+    assert not found
+    assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)

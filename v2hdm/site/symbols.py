@@ -18,12 +18,15 @@ from scipy.spatial import cKDTree
 from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
+from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import outlines_on_ground
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray, IntArray, Marking, Symbol
+from v2hdm.site.candidates import Exclusion
+from v2hdm.site.parallax import PointViews, measure_parallax
 
 _CELL_M = 0.01
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
@@ -33,19 +36,19 @@ _COMMON = 0.5  # outlines are of one symbol if they share this part of the small
 
 
 def map_symbols(
-    symbols: Symbols, rig: Rig, jitter_rad: float, markings: Sequence[Marking]
-) -> tuple[Symbol, ...]:
-    """The symbols that at least three images show.
+    symbols: Symbols, rig: Rig, jitter_rad: float, markings: Sequence[Marking], min_probability: float
+) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
+    """The symbols that at least three images show, and those that do not lie on the ground.
 
     Far outlines are less certain by ``jitter_rad``, the standard deviation of the viewing direction; paint
-    that is one of the map's ``markings`` is no symbol.
+    that is one of the map's ``markings`` is no symbol. A symbol lies on the ground with ``min_probability``.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
     }
     rows, shapes = list(grounds), list(grounds.values())
     if not shapes:
-        return ()
+        return (), ()
     centre = camera_centre(rig.cam_from_vehicle[symbols.camera[rows]])
     pose = rig.map_from_vehicle[symbols.frame[rows]]
     camera_map = np.einsum("nij,nj->ni", pose[:, :3, :3], centre) + pose[:, :3, 3]
@@ -53,7 +56,8 @@ def map_symbols(
     height_m = np.maximum(centre[:, 2], _COARSE_M)
     weight = (jitter_rad * (range_m**2 + height_m**2) / height_m + _CELL_M) ** -2
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    found = []
+    camera, ends = symbols.camera[rows], _far_ends(shapes, camera_map[:, :2])
+    found, left_out = [], []
     for own in _groups(shapes):
         images = {(int(symbols.camera[rows[n]]), int(symbols.frame[rows[n]])) for n in own}
         if len(images) < LEAST_SIGHTINGS:
@@ -62,8 +66,34 @@ def map_symbols(
         if outline is None or _holds_any(outline, places):
             continue
         kind = Counter(symbols.kinds[rows[n]] for n in own).most_common(1)[0][0]
-        found.append(Symbol(kind, outline, len(images), _sigma_m([shapes[n] for n in own], weight[own])))
-    return tuple(found)
+        views = _views(camera[own], ends[own], camera_map[own], jitter_rad)
+        objection = measure_parallax(views, 1).objections(min_probability)[0]
+        if objection is None:
+            found.append(Symbol(kind, outline, len(images), _sigma_m([shapes[n] for n in own], weight[own])))
+        else:
+            left_out.append(Exclusion(kind, outline.mean(axis=0), len(images), objection))
+    return tuple(found), tuple(left_out)
+
+
+def _far_ends(shapes: Sequence[FloatArray], camera_map: FloatArray) -> FloatArray:
+    """The point (N, 2) of each outline farthest from its camera (N, 2): the image's border cuts it last."""
+    away_m = [np.linalg.norm(shape - at, axis=1) for shape, at in zip(shapes, camera_map, strict=True)]
+    return np.array([shape[away.argmax()] for shape, away in zip(shapes, away_m, strict=True)])
+
+
+def _views(camera: IntArray, points_map: FloatArray, camera_map: FloatArray, jitter_rad: float) -> PointViews:
+    """Points (N, 2) as the cameras at (N, 3) see them, by whose scatter their errors are known."""
+    sigma = PoseSigma(_CELL_M, jitter_rad, jitter_rad, _CELL_M).by_state()
+    return PointViews(
+        group=np.zeros(len(camera), dtype=np.int64),
+        camera=camera,
+        points_map=points_map[:, None],
+        ray_map=(points_map - camera_map[:, :2])[:, None],
+        covariance_m2=np.tile(_CELL_M**2 * np.eye(2), (len(camera), 1, 1, 1)),
+        used=np.ones((len(camera), 1), dtype=np.bool_),
+        height_m=np.maximum(camera_map[:, 2], _COARSE_M),
+        pose_sigma=np.tile(sigma, (len(camera), 1)),
+    )
 
 
 def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
