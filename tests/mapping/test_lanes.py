@@ -332,3 +332,19 @@ def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m
     found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), JITTER_RAD, (), 0.9)
     assert not found
     assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)
+
+
+def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
+    way_m = np.array([0.0, 2.0, 4.0, 14.0, 16.0, 18.0])
+    symbols, rig = seen([ARROW + AT] * 6, ["arrow"] * 6, way_m)
+    back = mounted([0.0, 0.0, 2.0], yaw_deg=180.0)
+    both = replace(rig, cam_from_vehicle=np.stack([rig.cam_from_vehicle[0], back]))
+    both = replace(both, intrinsic=np.stack([INTRINSIC, INTRINSIC]))
+    behind = []
+    for pose in rig.map_from_vehicle[3:]:
+        ground = np.column_stack([ARROW + AT, np.zeros(len(ARROW)), np.ones(len(ARROW))])
+        cam = ground @ (back @ np.linalg.inv(pose)).T
+        behind.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
+    outlines = (*symbols.outlines_pinhole_px[:3], *behind)
+    symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]), outlines_pinhole_px=outlines)
+    assert len(mapped(symbols, both)) == 1

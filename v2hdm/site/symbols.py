@@ -56,42 +56,48 @@ def map_symbols(
     height_m = np.maximum(centre[:, 2], _COARSE_M)
     weight = (jitter_rad * (range_m**2 + height_m**2) / height_m + _CELL_M) ** -2
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    camera, ends = symbols.camera[rows], _far_ends(shapes, camera_map[:, :2])
     found, left_out = [], []
     for own in _groups(shapes):
-        images = {(int(symbols.camera[rows[n]]), int(symbols.frame[rows[n]])) for n in own}
-        if len(images) < LEAST_SIGHTINGS:
+        at = np.stack([symbols.camera, symbols.frame])[:, np.array(rows)[own]]
+        images, first, image = np.unique(at, axis=1, return_index=True, return_inverse=True)
+        if len(first) < LEAST_SIGHTINGS:
             continue
         outline = _shared_outline([shapes[n] for n in own], weight[own])
         if outline is None or _holds_any(outline, places):
             continue
         kind = Counter(symbols.kinds[rows[n]] for n in own).most_common(1)[0][0]
-        views = _views(camera[own], ends[own], camera_map[own], jitter_rad)
+        centre_map, pieces = camera_map[own][first], [shapes[n] for n in own]
+        views = _far_ends(pieces, image.ravel(), images[0], centre_map, jitter_rad)
         objection = measure_parallax(views, 1).objections(min_probability)[0]
         if objection is None:
-            found.append(Symbol(kind, outline, len(images), _sigma_m([shapes[n] for n in own], weight[own])))
+            found.append(Symbol(kind, outline, len(first), _sigma_m([shapes[n] for n in own], weight[own])))
         else:
-            left_out.append(Exclusion(kind, outline.mean(axis=0), len(images), objection))
+            left_out.append(Exclusion(kind, outline.mean(axis=0), len(first), objection))
     return tuple(found), tuple(left_out)
 
 
-def _far_ends(shapes: Sequence[FloatArray], camera_map: FloatArray) -> FloatArray:
-    """The point (N, 2) of each outline farthest from its camera (N, 2): the image's border cuts it last."""
-    away_m = [np.linalg.norm(shape - at, axis=1) for shape, at in zip(shapes, camera_map, strict=True)]
-    return np.array([shape[away.argmax()] for shape, away in zip(shapes, away_m, strict=True)])
+def _far_ends(
+    shapes: Sequence[FloatArray], image: IntArray, camera: IntArray, centre_map: FloatArray, jitter_rad: float
+) -> PointViews:
+    """The farthest point of what each of I images, ``image`` (S,) of the shapes, shows of a symbol.
 
-
-def _views(camera: IntArray, points_map: FloatArray, camera_map: FloatArray, jitter_rad: float) -> PointViews:
-    """Points (N, 2) as the cameras at (N, 3) see them, by whose scatter their errors are known."""
+    The image's border cuts it last. From the other side it is another point. Images are taken by ``camera``
+    (I,) from ``centre_map`` (I, 3); the points' scatter says how uncertain they are beside ``jitter_rad``.
+    """
+    ends = np.zeros((len(camera), 2))
+    for number, at in enumerate(centre_map[:, :2]):
+        points = np.concatenate([one for one, own in zip(shapes, image, strict=True) if own == number])
+        ends[number] = points[np.linalg.norm(points - at, axis=1).argmax()]
+    ray_map = ends - centre_map[:, :2]
     sigma = PoseSigma(_CELL_M, jitter_rad, jitter_rad, _CELL_M).by_state()
     return PointViews(
         group=np.zeros(len(camera), dtype=np.int64),
         camera=camera,
-        points_map=points_map[:, None],
-        ray_map=(points_map - camera_map[:, :2])[:, None],
-        covariance_m2=np.tile(_CELL_M**2 * np.eye(2), (len(camera), 1, 1, 1)),
-        used=np.ones((len(camera), 1), dtype=np.bool_),
-        height_m=np.maximum(camera_map[:, 2], _COARSE_M),
+        points_map=np.repeat(ends[:, None], 2, axis=1),
+        ray_map=np.repeat(ray_map[:, None], 2, axis=1),
+        covariance_m2=np.tile(_CELL_M**2 * np.eye(2), (len(camera), 2, 1, 1)),
+        used=np.eye(2, dtype=np.bool_)[(ray_map @ ray_map[0] < 0).astype(np.int64)],
+        height_m=np.maximum(centre_map[:, 2], _COARSE_M),
         pose_sigma=np.tile(sigma, (len(camera), 1)),
     )
 
