@@ -8,6 +8,7 @@ import pytest
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import Recipe, draw
 from tests.benchmarks.made.faults import SPOILS
+from tests.benchmarks.made.queue import make_queue, rear_map
 from tests.benchmarks.made.world import drive_of, make, smooth_noise
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
@@ -52,3 +53,14 @@ def test_every_fault_changes_the_drive_and_leaves_the_map_alone(name: str) -> No
     assert spoilt is not world
     assert spoilt.port.hd_map is world.port.hd_map
     assert len(drive_of(spoilt).images) > 0
+
+
+def test_the_lorry_stays_ahead_of_the_vehicle_which_stands_behind_it_for_seconds() -> None:
+    world = make_queue(draw(3, "straight"))
+    route, station = world.port.route, world.station_m
+    rear = np.array([rear_map(world, frame)[0, 0, :2] for frame in range(len(station))])
+    ahead_m = np.linalg.norm(rear - route.points_at(station), axis=1)
+    assert 4.0 < ahead_m.min() < 14.0
+    assert np.count_nonzero(np.diff(station) == 0) >= 10
+    assert (np.diff(station) >= 0).all()
+    assert (np.diff(world.stamp_s["front"]) > 0).all()

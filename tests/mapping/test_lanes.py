@@ -15,6 +15,7 @@ from v2hdm.records import CameraInfo, Marking
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
+from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.symbols import map_symbols
 
 OPTIONS = LaneOptions()
@@ -252,6 +253,11 @@ def seen(shapes, kinds, poses_x):
     return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds)), rig
 
 
+def mapped(symbols, rig, markings=()):
+    """The symbols of the map."""
+    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, 0.9)[0]
+
+
 def overlap(one, other):
     """Intersection over union, by cells of a centimetre."""
     low = np.minimum(one.min(axis=0), other.min(axis=0)) - 0.1
@@ -266,7 +272,7 @@ def overlap(one, other):
 
 def test_an_arrow_is_mapped_where_it_lies():
     symbols, rig = scene(9.0)
-    (arrow,) = map_symbols(symbols, rig, INFOS, JITTER_RAD, ())
+    (arrow,) = mapped(symbols, rig)
     assert (arrow.kind, arrow.sightings) == ("arrow", 3)
     assert overlap(arrow.outline_map, ARROW + AT) > 0.97
     assert abs(signed_area(arrow.outline_map) - signed_area(ARROW)) < 0.01 * signed_area(ARROW)
@@ -279,7 +285,7 @@ def test_an_arrow_whose_near_end_the_border_cuts_from_near_by_is_mapped_whole():
     true, poses_x = ARROW + AT, [0.0, 1.0, 2.0, 6.6, 6.7, 6.8]
     head = true[(true[:, 0] > 9.4)]
     shapes = [true] * 3 + [head] * 3
-    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 6, poses_x), INFOS, JITTER_RAD, ())
+    (arrow,) = mapped(*seen(shapes, ["arrow"] * 6, poses_x))
     assert overlap(arrow.outline_map, true) > 0.9
 
 
@@ -287,14 +293,14 @@ def test_a_sighting_that_misses_a_part_does_not_deny_it():
     true = ARROW + AT
     shaft = np.array([[7.5, 0.92], [9.3, 0.92], [9.3, 1.08], [7.5, 1.08]])
     shapes = [true, true, true, shaft, shaft]
-    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 0.5, 1.0, 2.0, 2.5]), INFOS, JITTER_RAD, ())
+    (arrow,) = mapped(*seen(shapes, ["arrow"] * 5, [0.0, 0.5, 1.0, 2.0, 2.5]))
     assert overlap(arrow.outline_map, true) > 0.9
 
 
 def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma():
     true = ARROW + AT
     shapes = [true, true + OFF, true, true, true]
-    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), INFOS, JITTER_RAD, ())
+    (arrow,) = mapped(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]))
     assert overlap(arrow.outline_map, true) > 0.95
     assert arrow.sigma_m is not None
     assert 0.005 < arrow.sigma_m < 0.05
@@ -303,13 +309,13 @@ def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma(
 def test_the_class_is_what_most_sightings_say():
     shapes = [ARROW + AT] * 4
     kinds = ["arrow", "parking_t", "parking_t", "parking_t"]
-    (symbol,) = map_symbols(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]), INFOS, JITTER_RAD, ())
+    (symbol,) = mapped(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]))
     assert (symbol.kind, symbol.sightings) == ("parking_t", 4)
 
 
 def test_neighbours_are_symbols_of_their_own():
     bars = [np.array([[7.0, y], [9.0, y], [9.0, y + 0.4], [7.0, y + 0.4]]) for y in (-1.0, 0.0)]
-    found = map_symbols(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]), INFOS, JITTER_RAD, ())
+    found = mapped(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]))
     assert len(found) == 2
 
 
@@ -318,19 +324,44 @@ def test_what_is_far_or_seen_seldom_is_left_out(x):
     symbols, rig = scene(x)
     if x == 9.0:
         seldom = replace(symbols, frame=np.array([0, 1, 1]))
-        assert map_symbols(seldom, rig, INFOS, JITTER_RAD, ()) == ()
+        assert mapped(seldom, rig) == ()
     else:
-        assert map_symbols(symbols, rig, INFOS, JITTER_RAD, ()) == ()
+        assert mapped(symbols, rig) == ()
 
 
 def test_paint_that_is_a_marking_is_no_symbol():
     symbols, rig = scene(9.0)
     square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
     on, beside = (Marking("pad", square + place, 9) for place in ([9.0, 1.0], [9.0, 3.0]))
-    assert map_symbols(symbols, rig, INFOS, JITTER_RAD, (on,)) == ()
-    assert len(map_symbols(symbols, rig, INFOS, JITTER_RAD, (beside,))) == 1
+    assert mapped(symbols, rig, (on,)) == ()
+    assert len(mapped(symbols, rig, (beside,))) == 1
 
 
 def test_without_sightings_there_are_no_symbols():
     _, rig = scene(9.0)
-    assert map_symbols(NO_SYMBOLS, rig, INFOS, JITTER_RAD, ()) == ()
+    assert mapped(NO_SYMBOLS, rig) == ()
+
+
+@pytest.mark.parametrize(("step_m", "reason"), [(0.0, NOT_OBSERVED), (0.3, NOT_ON_GROUND)])
+def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m, reason):
+    way_m = step_m * np.arange(8)
+    shapes = [ARROW + AT + [x, 0.0] for x in way_m]
+    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), 0.9)
+    assert not found
+    assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)
+
+
+def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
+    way_m = np.array([0.0, 2.0, 4.0, 14.0, 16.0, 18.0])
+    symbols, rig = seen([ARROW + AT] * 6, ["arrow"] * 6, way_m)
+    back = mounted([0.0, 0.0, 2.0], yaw_deg=180.0)
+    both = replace(rig, cam_from_vehicle=np.stack([rig.cam_from_vehicle[0], back]))
+    both = replace(both, intrinsic=np.stack([INTRINSIC, INTRINSIC]))
+    behind = []
+    for pose in rig.map_from_vehicle[3:]:
+        ground = np.column_stack([ARROW + AT, np.zeros(len(ARROW)), np.ones(len(ARROW))])
+        cam = ground @ (back @ np.linalg.inv(pose)).T
+        behind.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
+    outlines = (*symbols.outlines_pinhole_px[:3], *behind)
+    symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]), outlines_pinhole_px=outlines)
+    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1

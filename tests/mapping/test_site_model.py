@@ -9,6 +9,7 @@ from v2hdm.association.groups import FusedGroups
 from v2hdm.site.candidates import Candidates, Counts, Dissent, with_dissent
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, PIECE, posterior
 from v2hdm.site.shapes import learn_shapes
 
@@ -241,7 +242,8 @@ class Told:
 
 def verdict(candidates, counts=None):
     told = Told(np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates)))
-    return classify(candidates, told, AcceptanceOptions())
+    on_ground = Parallax(np.ones((len(candidates), 1)), np.full((len(candidates), 1, 1), 1e-4))
+    return classify(candidates, told, on_ground, AcceptanceOptions())
 
 
 def test_reasons_name_what_has_won():

@@ -16,6 +16,7 @@ from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, 
 from v2hdm.site.candidates import Candidates, Dissent, Exclusion, with_dissent, with_shared_errors
 from v2hdm.site.markings import Support, classify, with_relative_sigma
 from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.suspicion import Suspicion, most_suspicious
 
 
@@ -81,7 +82,10 @@ def conclude(
     fused = fuse_groups(final.association, located, jitter_rad=0.0)
     solved = _solved_candidates(final, ungated)
     solved = with_dissent(with_shared_errors(solved, fused), fused, _dissent(evidence, located))
-    classified = classify(solved, seen, options)
+    noise = final.model.variance_factor, final.model.pose_sigma
+    corners = PointViews.of_corners(final.association, evidence.sightings, located, *noise)
+    parallax = measure_parallax(corners, final.association.count)
+    classified = classify(solved, seen, parallax, options)
     scale = max(1.0, final.solution.chi2_per_dof)
     covariance = final.solution.extrinsic_covariance * scale
     index, names = final.camera_index, evidence.sightings.cameras

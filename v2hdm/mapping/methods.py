@@ -312,15 +312,15 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
     known = observability(bundle.problem, solution)
     lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
-    symbols = map_symbols(
-        inputs.sightings.symbols, bundle.rig, infos, noise.roll_pitch_rad, optimised.markings
-    )
+    odds = options.acceptance.min_probability
+    seen, jitter_rad = inputs.sightings.symbols, noise.roll_pitch_rad
+    symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
         hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m),
         calibrations=optimised.calibrations,
-        excluded=optimised.excluded,
+        excluded=(*optimised.excluded, *no_symbols),
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
         growth=(*growth, optimised.markings) if growth else (),

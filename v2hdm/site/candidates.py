@@ -13,7 +13,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 _UNSEEN_M2 = 1e4
 """Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
 
-_CORRELATION = 0.2
+CORRELATION = 0.2
 """Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
 small."""
 
@@ -153,7 +153,7 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates
     """
     single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
     unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]
-    shared = np.where(unseen, 0.0, _CORRELATION * single)
+    shared = np.where(unseen, 0.0, CORRELATION * single)
     # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
     no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
     shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)

@@ -18,6 +18,7 @@ from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import Candidates, Counts, Exclusion
 from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
 
 OF_SYMBOL = "part of a symbol, such as an arrow"
@@ -131,8 +132,11 @@ class Classified:
         )
 
 
-def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> Classified:
-    """Decide which of the ``solved`` candidates are markings of the map, and where their corners are."""
+def classify(solved: Candidates, seen: Support, parallax: Parallax, options: AcceptanceOptions) -> Classified:
+    """Decide which of the ``solved`` candidates are markings of the map, and where their corners are.
+
+    ``parallax`` says which of them lie on the ground.
+    """
     counts = seen.counts(np.where(solved.known[..., None], solved.corners_map, np.nan))
     first = posterior(solved, seen.kind, counts)
     # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
@@ -149,6 +153,8 @@ def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> C
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
     for group in np.flatnonzero(uncertain):
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
+    objections = parallax.objections(options.min_probability)
+    verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
     return Classified(seen.names(), found.candidates, counts, found.misfit, verdict)

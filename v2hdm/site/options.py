@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class AcceptanceOptions:
     """The conditions for a candidate to enter the map.
 
-    ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not; and
-    a worst corner less certain than the best one of the map by at most ``max_sigma_m``.
+    ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not, and
+    of lying on the ground, given how it moves in the images; and a worst corner less certain than the best
+    one of the map by at most ``max_sigma_m``.
     """
 
     min_probability: float = 0.9

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.spatial import cKDTree
 from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
+from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Symbols
@@ -27,6 +29,8 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
+from v2hdm.site.candidates import Exclusion
+from v2hdm.site.parallax import PointViews, measure_parallax
 
 _CELL_M = 0.01
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
@@ -47,20 +51,22 @@ def map_symbols(
     infos: Sequence[CameraInfo],
     jitter_rad: float,
     markings: Sequence[Marking],
-) -> tuple[Symbol, ...]:
-    """The symbols that at least three images show.
+    min_probability: float,
+) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
+    """The symbols that at least three images show, and those that do not lie on the ground.
 
     ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
-    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol.
+    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. A symbol
+    lies on the ground with ``min_probability``.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
     }
     rows, shapes = np.array(list(grounds), dtype=np.int64), list(grounds.values())
     if not shapes:
-        return ()
+        return (), ()
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    found = []
+    found, left_out = [], []
     for own in _groups(shapes):
         at = np.stack([symbols.camera[rows[own]], symbols.frame[rows[own]]])
         (camera, frame), image = np.unique(at, axis=1, return_inverse=True)
@@ -72,9 +78,15 @@ def map_symbols(
             continue
         weight = eyes.sigma_m(outline.mean(axis=0))[image.ravel()] ** -2
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
-        sigma_m = _sigma_m([shapes[n] for n in own], weight)
-        found.append(Symbol(kind, outline, len(camera), sigma_m))
-    return tuple(found)
+        # The border may cut one end in some images, and a shadow hide it: then the other tells.
+        views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
+        objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
+        if None in objections:
+            sigma_m = _sigma_m([shapes[n] for n in own], weight)
+            found.append(Symbol(kind, outline, len(camera), sigma_m))
+        else:
+            left_out.append(Exclusion(kind, outline.mean(axis=0), len(camera), objections[0] or ""))
+    return tuple(found), tuple(left_out)
 
 
 @dataclass(frozen=True)
@@ -87,12 +99,16 @@ class _Eyes:
     infos: Sequence[CameraInfo]
     jitter_rad: float
 
+    @cached_property
+    def centre_map(self) -> FloatArray:
+        """Where the cameras were (I, 3)."""
+        extrinsic, pose = self.rig.cam_from_vehicle[self.camera], self.rig.map_from_vehicle[self.frame]
+        return np.asarray(np.einsum("nij,nj->ni", pose[:, :3, :3], camera_centre(extrinsic)) + pose[:, :3, 3])
+
     def sigma_m(self, points_map: FloatArray) -> FloatArray:
         """Standard deviation (I, ...), m, along the ray, of an outline's place at points (..., 2)."""
-        extrinsic, pose = self.rig.cam_from_vehicle[self.camera], self.rig.map_from_vehicle[self.frame]
-        centre = np.einsum("nij,nj->ni", pose[:, :3, :3], camera_centre(extrinsic)) + pose[:, :3, 3]
         many = (slice(None), *(None,) * (points_map.ndim - 1))
-        range_m = np.linalg.norm(points_map - centre[(*many, slice(2))], axis=-1)
+        range_m = np.linalg.norm(points_map - self.centre_map[(*many, slice(2))], axis=-1)
         height_m = self.rig.height_m[self.camera][many]
         direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
         return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
@@ -103,6 +119,30 @@ class _Eyes:
         pixel, depth_m = project_ground(self.rig.intrinsic[self.camera], cam_from_map, points_map[None])
         limit = np.array([[info.width, info.height] for info in self.infos])[self.camera, None] - BORDER_PX
         return np.asarray(((pixel > BORDER_PX) & (pixel < limit)).all(axis=2) & (depth_m > 0))
+
+
+def _ends(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes, sign: int) -> PointViews:
+    """One end of what each of I images, ``image`` (S,) of the shapes, shows of a symbol.
+
+    It is the far end for a ``sign`` of 1, the near one for -1; from the other side it is another point. The
+    points' scatter says how uncertain they are beside the jitter.
+    """
+    ends = np.zeros((len(eyes.camera), 2))
+    for number, at in enumerate(eyes.centre_map[:, :2]):
+        points = np.concatenate([one for one, own in zip(shapes, image, strict=True) if own == number])
+        ends[number] = points[(sign * np.linalg.norm(points - at, axis=1)).argmax()]
+    ray_map = ends - eyes.centre_map[:, :2]
+    sigma = PoseSigma(_CELL_M, eyes.jitter_rad, eyes.jitter_rad, _CELL_M).by_state()
+    return PointViews(
+        group=np.zeros(len(ends), dtype=np.int64),
+        camera=eyes.camera,
+        points_map=np.repeat(ends[:, None], 2, axis=1),
+        ray_map=np.repeat(ray_map[:, None], 2, axis=1),
+        covariance_m2=np.tile(_CELL_M**2 * np.eye(2), (len(ends), 2, 1, 1)),
+        used=np.eye(2, dtype=np.bool_)[(ray_map @ ray_map[0] < 0).astype(np.int64)],
+        height_m=np.maximum(eyes.centre_map[:, 2], _COARSE_M),
+        pose_sigma=np.tile(sigma, (len(ends), 1)),
+    )
 
 
 def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:

@@ -26,6 +26,7 @@ from v2hdm.mapping.recovery import (
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
@@ -294,15 +295,16 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
 
 
 def _excluded(best: MethodResult) -> Finding:
-    # a merely uncertain candidate was too far off, or too briefly in view: it contradicts nothing.
-    left_out = sum(one.reason != TOO_UNCERTAIN for one in best.excluded)
+    # What was too far off, too briefly in view, or no paint contradicts nothing.
+    innocent = (TOO_UNCERTAIN, NOT_OBSERVED, NOT_ON_GROUND)
+    left_out = sum(one.reason not in innocent for one in best.excluded)
     count = left_out + len(best.hd_map.markings)
     share = left_out / max(count, 1)
     surely = share - 2 * float(np.sqrt(share * (1 - share) / max(count, 1)))
     says = f"{left_out} of {count} candidates were left out"
     return judge(
         "excluded", "map", surely, _EXCLUDED_LIMIT, "",
-        fine=f"{says}, those aside that are merely uncertain",
+        fine=f"{says}, those aside that are merely uncertain or not on the ground",
         wrong=f"{says}: markings are seen, but not where others put them; see excluded.geojson",
         status=Status.WARN,
     )  # fmt: skip

@@ -1,0 +1,215 @@
+"""Whether candidates lie on the ground: how much nearer they come as the vehicle goes on.
+
+Laid on the ground, a point of the ground comes nearer by as much as the vehicle moves. A point half as high
+as the camera (one metre up, for a camera two metres up) seems to come twice as much nearer, one that moves
+along with the vehicle, or belongs to it, not at all. With the camera at c, the ray from below it to where a
+point is seen on the ground is r = a - s c, and s = 1 on the ground. Images tell s as far as the vehicle has
+moved between them: a standing one tells nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.adjust import PoseSigma
+from v2hdm.association.ground import Located
+from v2hdm.association.groups import Association
+from v2hdm.association.sightings import Sightings
+from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.site.candidates import CORRELATION
+
+NOT_OBSERVED = "not observed to be on the ground"
+NOT_ON_GROUND = "stands above the ground, or moves"
+
+_ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
+"""Mean and sigma of s of what is no marking: half as high as the camera, or moving along with the vehicle."""
+
+_ONE_VIEW_M = 0.1
+"""Way, m, within which images show one view, so that they err alike: the same texture lies along an edge."""
+
+_POSE_SIGMAS = 4.0  # how far apart, in sigmas, the recorded positions of one place may be
+
+_LEVEL_RAD = 1e-5  # sigma, rad, of the attitude where it is taken for exact
+_LEAST_SIGMA_M = 1e-3  # of a point, m, however certain an image states it to be
+_ANYWHERE_M = 1e3  # sigma, m, of where a point lies about its mean
+_ANY_SLOPE = 10.0  # sigma of s before any image: nothing comes nearer much faster than the vehicle moves
+
+
+@dataclass(frozen=True)
+class PointViews:
+    """N sightings of P points each, by sighting: which of G candidates, by which camera, and from where.
+
+    ``points_map`` (N, P, 2), m, on the ground have the covariances ``covariance_m2`` (N, P, 2, 2) beside what
+    the errors ``pose_sigma`` (N, 6) of the poses do to them; ``ray_map`` (N, P, 2) leads there from below the
+    camera, which is ``height_m`` (N,) up. Of points that are not ``used`` (N, P) nothing counts.
+    """
+
+    group: IntArray
+    camera: IntArray
+    points_map: FloatArray
+    ray_map: FloatArray
+    covariance_m2: FloatArray
+    used: BoolArray
+    height_m: FloatArray
+    pose_sigma: FloatArray
+
+    @classmethod
+    def of_corners(
+        cls,
+        association: Association,
+        sightings: Sightings,
+        located: Located,
+        variance_factor: float,
+        pose_sigma: Sequence[PoseSigma],
+    ) -> PointViews:
+        """The corners that ``located`` says are informative; ``pose_sigma`` is of each visit.
+
+        Their covariances are ``variance_factor`` times as stated.
+        """
+        used = association.in_group_order(located.informs)
+        rows = np.flatnonzero((association.group >= 0) & used.any(axis=1))
+        corners, rays, covariance = (
+            association.in_group_order(one)[rows]
+            for one in (located.corners_map, located.ray_map, variance_factor * located.covariance_m2)
+        )
+        by_visit = np.array([one.by_state() for one in pose_sigma])
+        return cls(
+            group=association.group[rows],
+            camera=sightings.camera[rows],
+            points_map=corners,
+            ray_map=rays,
+            covariance_m2=covariance,
+            used=used[rows],
+            height_m=located.height_m[rows],
+            pose_sigma=by_visit[sightings.visit[sightings.frame[rows]]],
+        )
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """How G candidates seem to move: ``slope`` (G, P) is s of each point, 1 on the ground.
+
+    Its covariance is ``covariance`` (G, P, P).
+    """
+
+    slope: FloatArray
+    covariance: FloatArray
+
+    @property
+    def log_odds(self) -> FloatArray:
+        """Log odds (G,) that a candidate lies on the ground, which are even before any image is seen."""
+        count = self.slope.shape[1]
+        # What stands upright is not as high everywhere: half of the variance is that of each point.
+        apart = (np.ones((count, count)) + np.eye(count)) / 2
+        elsewhere = [_log_normal(self.slope - at, self.covariance + own**2 * apart) for at, own in _ELSEWHERE]
+        ground = _log_normal(self.slope - 1, self.covariance)
+        return np.asarray(ground - np.logaddexp(*elsewhere) + np.log(len(_ELSEWHERE)))
+
+    def objections(self, min_probability: float) -> list[str | None]:
+        """Why each candidate may not enter the map; None if it lies on the ground at this probability."""
+        least = np.log(min_probability / (1 - min_probability))
+        return [
+            None if odds >= least else NOT_ON_GROUND if odds < -least else NOT_OBSERVED
+            for odds in self.log_odds
+        ]
+
+
+def measure_parallax(views: PointViews, count: int) -> Parallax:
+    """Estimate s of the points of each of ``count`` candidates by weighted least squares.
+
+    Beside it, where they lie and a roll and pitch that is wrong in all images alike are unknown.
+    Residuals larger than stated make s less certain.
+    """
+    group, used, each = views.group, views.used, views.used.shape[1]
+    total, slopes = 2 * each, slice(2 * each, 3 * each)
+    points, ray = (np.where(used[..., None], one, 0.0) for one in (views.points_map, views.ray_map))
+    centre = (points - ray).sum(axis=1) / used.sum(axis=1)[:, None]
+    seen = _sum(used, group, count)
+    middle = _sum(points, group, count) / np.maximum(seen, 1)[..., None]
+    view, images = _views(views, centre)
+    # A standing vehicle's recorded positions wander; its images are one view, from the mean of them.
+    centre = (_sum(centre, view, len(images)) / images[:, None])[view]
+    about = _sum(centre, group, count) / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
+
+    # At the mean place: derivatives at the ray itself would hang together with its own error.
+    by_pose = _by_pose(middle[group] - centre[:, None], views.height_m) * used[..., None, None]
+    by_pose = by_pose.reshape(len(group), total, 6)
+    shown = np.repeat(used, 2, axis=1)
+    spread = by_pose * views.pose_sigma[:, None]
+    covariance = spread @ np.swapaxes(spread, 1, 2)
+    for k in range(each):
+        own = np.where(used[:, k, None, None], views.covariance_m2[:, k], np.eye(2))
+        own += _LEAST_SIGMA_M**2 * np.eye(2)
+        covariance[:, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += own
+    effective = 1 / (1 + CORRELATION * (images[view] - 1))
+    weight = np.linalg.inv(covariance) * effective[:, None, None]
+
+    moved = np.einsum("ij,nk->nikj", np.eye(each), centre - about[group]).reshape(-1, total, each)
+    places = np.broadcast_to(np.eye(total), (len(group), total, total))
+    design = np.concatenate([places, moved, by_pose[..., 3:5]], axis=2) * shown[..., None]
+    off = np.where(shown, (points - middle[group]).reshape(-1, total), 0.0)[..., None]
+    weighted = np.swapaxes(design, 1, 2) @ weight
+    tilt_rad = np.max(views.pose_sigma[:, 3:5], initial=_LEVEL_RAD)
+    sigma = np.repeat([_ANYWHERE_M, _ANY_SLOPE, tilt_rad], [total, each, 2])
+    information = _sum(weighted @ design, group, count) + np.diag(sigma**-2.0)
+    gradient = _sum(weighted @ off, group, count)
+    inverse = np.linalg.inv(information)
+    found = (inverse @ gradient)[..., 0]
+
+    squared = _sum(np.swapaxes(off, 1, 2) @ weight @ off, group, count)[:, 0, 0]
+    squared -= np.sum(found * gradient[..., 0], axis=1)
+    freedom = _sum(2 * effective * used.sum(axis=1), group, count) - 3 * (seen > 0).sum(axis=1)
+    scale = np.maximum(1.0, squared / np.maximum(freedom, 1.0))
+    return Parallax(1 - found[:, slopes], scale[:, None, None] * inverse[:, slopes, slopes])
+
+
+def _log_normal(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Log density (G,) of deviations (G, P), but for a constant."""
+    squared = np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1)
+    return np.asarray(-0.5 * (squared + np.linalg.slogdet(covariance)[1]))
+
+
+def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatArray:
+    """Sums (G, ...) of values (N, ...) by group (N,)."""
+    out = np.zeros((count, *values.shape[1:]))
+    np.add.at(out, group, values)
+    return out
+
+
+def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
+    """Derivative (N, P, 2, 6) of ground points at the ends of rays (N, P, 2) by the states of a pose.
+
+    The order is that of :data:`v2hdm.adjust.POSE_STATES`; rotations are about the camera and the map's axes.
+    """
+    x, y = ray[..., 0], ray[..., 1]
+    one, none, h = np.ones_like(x), np.zeros_like(x), np.broadcast_to(height_m[:, None], x.shape)
+    columns = (
+        (one, none),
+        (none, one),
+        (x / h, y / h),
+        (x * y / h, h + y * y / h),
+        (-h - x * x / h, -x * y / h),
+        (-y, x),
+    )
+    return np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+
+
+def _views(views: PointViews, centre: FloatArray) -> tuple[IntArray, IntArray]:
+    """The view (N,) of each sighting, by number, and how many images each view has.
+
+    A camera's images of a candidate are one view until the camera, at ``centre`` (N, 2), has moved on by more
+    than :data:`_ONE_VIEW_M` and what the poses may be off.
+    """
+    reach_m = _ONE_VIEW_M + _POSE_SIGMAS * views.pose_sigma[:, 0]
+    begun: dict[tuple[int, int], int] = {}
+    first: list[int] = []
+    view = np.zeros(len(centre), dtype=np.int64)
+    for n, key in enumerate(zip(views.group.tolist(), views.camera.tolist(), strict=True)):
+        if key not in begun or np.hypot(*(centre[n] - centre[first[begun[key]]])) > reach_m[n]:
+            begun[key] = len(first)
+            first.append(n)
+        view[n] = begun[key]
+    return view, np.bincount(view, minlength=len(first))
