@@ -198,7 +198,10 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
     agreed = _share(painted, weight) > _PART
     for own, sigma, mask in zip(weight, sigma_m, painted, strict=True):
         away_m = cell_m * cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3)
-        own[agreed & (away_m > _MISSED_SIGMAS * sigma)] = 0.0
+        lacking = agreed & ~mask
+        part = cv2.connectedComponents(lacking.view(np.uint8))[1]
+        missed = np.unique(part[lacking & (away_m > _MISSED_SIGMAS * sigma)])
+        own[lacking & np.isin(part, missed)] = 0.0
     contours = find_contours(_share(painted, weight), 0.5)  # type: ignore[no-untyped-call]
     if not contours:
         return None
