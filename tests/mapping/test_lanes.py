@@ -11,7 +11,7 @@ from tests.cameras import mounted
 from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
-from v2hdm.records import Marking
+from v2hdm.records import CameraInfo, Marking
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
@@ -183,6 +183,7 @@ def test_a_short_piece_must_be_seen_more_often_than_a_long_one():
 
 
 INTRINSIC = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
+INFOS = [CameraInfo("front", 1280, 720, INTRINSIC)]
 ARROW = np.array(
     [[-1.5, -0.08], [0.5, -0.08], [0.5, -0.35], [1.5, 0.0], [0.5, 0.35], [0.5, 0.08], [-1.5, 0.08]]
 )
@@ -265,7 +266,7 @@ def overlap(one, other):
 
 def test_an_arrow_is_mapped_where_it_lies():
     symbols, rig = scene(9.0)
-    (arrow,) = map_symbols(symbols, rig, JITTER_RAD, ())
+    (arrow,) = map_symbols(symbols, rig, INFOS, JITTER_RAD, ())
     assert (arrow.kind, arrow.sightings) == ("arrow", 3)
     assert overlap(arrow.outline_map, ARROW + AT) > 0.97
     assert abs(signed_area(arrow.outline_map) - signed_area(ARROW)) < 0.01 * signed_area(ARROW)
@@ -274,10 +275,26 @@ def test_an_arrow_is_mapped_where_it_lies():
     assert arrow.sigma_m < 0.001
 
 
+def test_an_arrow_whose_near_end_the_border_cuts_from_near_by_is_mapped_whole():
+    true, poses_x = ARROW + AT, [0.0, 1.0, 2.0, 6.6, 6.7, 6.8]
+    head = true[(true[:, 0] > 9.4)]
+    shapes = [true] * 3 + [head] * 3
+    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 6, poses_x), INFOS, JITTER_RAD, ())
+    assert overlap(arrow.outline_map, true) > 0.9
+
+
+def test_a_sighting_that_misses_a_part_does_not_deny_it():
+    true = ARROW + AT
+    shaft = np.array([[7.5, 0.92], [9.3, 0.92], [9.3, 1.08], [7.5, 1.08]])
+    shapes = [true, true, true, shaft, shaft]
+    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 0.5, 1.0, 2.0, 2.5]), INFOS, JITTER_RAD, ())
+    assert overlap(arrow.outline_map, true) > 0.9
+
+
 def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma():
     true = ARROW + AT
     shapes = [true, true + OFF, true, true, true]
-    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), JITTER_RAD, ())
+    (arrow,) = map_symbols(*seen(shapes, ["arrow"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), INFOS, JITTER_RAD, ())
     assert overlap(arrow.outline_map, true) > 0.95
     assert arrow.sigma_m is not None
     assert 0.005 < arrow.sigma_m < 0.05
@@ -286,13 +303,13 @@ def test_a_sighting_that_is_off_moves_the_outline_little_and_shows_in_its_sigma(
 def test_the_class_is_what_most_sightings_say():
     shapes = [ARROW + AT] * 4
     kinds = ["arrow", "parking_t", "parking_t", "parking_t"]
-    (symbol,) = map_symbols(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]), JITTER_RAD, ())
+    (symbol,) = map_symbols(*seen(shapes, kinds, [0.0, 1.0, 2.0, 3.0]), INFOS, JITTER_RAD, ())
     assert (symbol.kind, symbol.sightings) == ("parking_t", 4)
 
 
 def test_neighbours_are_symbols_of_their_own():
     bars = [np.array([[7.0, y], [9.0, y], [9.0, y + 0.4], [7.0, y + 0.4]]) for y in (-1.0, 0.0)]
-    found = map_symbols(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]), JITTER_RAD, ())
+    found = map_symbols(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]), INFOS, JITTER_RAD, ())
     assert len(found) == 2
 
 
@@ -301,19 +318,19 @@ def test_what_is_far_or_seen_seldom_is_left_out(x):
     symbols, rig = scene(x)
     if x == 9.0:
         seldom = replace(symbols, frame=np.array([0, 1, 1]))
-        assert map_symbols(seldom, rig, JITTER_RAD, ()) == ()
+        assert map_symbols(seldom, rig, INFOS, JITTER_RAD, ()) == ()
     else:
-        assert map_symbols(symbols, rig, JITTER_RAD, ()) == ()
+        assert map_symbols(symbols, rig, INFOS, JITTER_RAD, ()) == ()
 
 
 def test_paint_that_is_a_marking_is_no_symbol():
     symbols, rig = scene(9.0)
     square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
     on, beside = (Marking("pad", square + place, 9) for place in ([9.0, 1.0], [9.0, 3.0]))
-    assert map_symbols(symbols, rig, JITTER_RAD, (on,)) == ()
-    assert len(map_symbols(symbols, rig, JITTER_RAD, (beside,))) == 1
+    assert map_symbols(symbols, rig, INFOS, JITTER_RAD, (on,)) == ()
+    assert len(map_symbols(symbols, rig, INFOS, JITTER_RAD, (beside,))) == 1
 
 
 def test_without_sightings_there_are_no_symbols():
     _, rig = scene(9.0)
-    assert map_symbols(NO_SYMBOLS, rig, JITTER_RAD, ()) == ()
+    assert map_symbols(NO_SYMBOLS, rig, INFOS, JITTER_RAD, ()) == ()

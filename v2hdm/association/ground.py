@@ -27,10 +27,10 @@ from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
 _HORIZON_M2 = 1e4
 """Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2."""
 
-_SYMBOL_RANGE_M = 16.0
-"""Distance from the vehicle, m, beyond which a symbol's place is too vague to speak against a neighbour."""
+OUTLINE_SIGMA_PX = 2.5
+"""How far the network's outline is from the edge of paint, px: measured on renders, where it is 1 to 3."""
 
-_BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
+BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 
 @dataclass(frozen=True)
@@ -134,18 +134,23 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
-    """The outline (K, 2) of each symbol in the map, None of those too far away."""
+    """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length.
+
+    The place is known in the image up to :data:`OUTLINE_SIGMA_PX`; towards the horizon that is any length.
+    """
     if not len(symbols.camera):
         return []
     length = [len(outline) for outline in symbols.outlines_pinhole_px]
     of_point = np.repeat(np.arange(len(length)), length)
     points_px = np.concatenate(symbols.outlines_pinhole_px)
-    ground = ground_points(_ipms(rig, symbols.camera, symbols.frame)[of_point], points_px[:, None])[:, 0]
-    position = rig.map_from_vehicle[symbols.frame, :2, 3]
-    within = np.linalg.norm(ground - position[of_point], axis=1) <= _SYMBOL_RANGE_M
-    outlines = np.split(ground, np.cumsum(length)[:-1])
-    near = [bool(own.all()) for own in np.split(within, np.cumsum(length)[:-1])]
-    return [outline if one else None for outline, one in zip(outlines, near, strict=True)]
+    ipms = _ipms(rig, symbols.camera, symbols.frame)[of_point]
+    ground, by_px = (one[:, 0] for one in ground_points_with_jacobian(ipms, points_px[:, None]))
+    sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px, axis=(1, 2))
+    ends = np.cumsum(length)[:-1]
+    return [
+        outline if np.isfinite(outline).all() and 2 * own.max() < np.ptp(outline, axis=0).max() else None
+        for outline, own in zip(np.split(ground, ends), np.split(sigma_m, ends), strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -210,7 +215,7 @@ def _sees(
     away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
     near = inside_convex(camera.roi_vehicle, corners_vehicle) if within_m is None else away_m <= within_m
     pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
-    limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
+    limit = np.array([camera.info.width, camera.info.height]) - BORDER_PX
     with np.errstate(invalid="ignore"):
-        on_image = ((pixel > _BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
+        on_image = ((pixel > BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
     return np.asarray(near.all(axis=1) & on_image)

@@ -311,7 +311,10 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         )  # fmt: skip
     known = observability(bundle.problem, solution)
     lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig))
-    symbols = map_symbols(inputs.sightings.symbols, bundle.rig, noise.roll_pitch_rad, optimised.markings)
+    infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
+    symbols = map_symbols(
+        inputs.sightings.symbols, bundle.rig, infos, noise.roll_pitch_rad, optimised.markings
+    )
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),

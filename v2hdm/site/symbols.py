@@ -2,13 +2,15 @@
 
 A symbol has no corners to adjust. Once the cameras and poses are known, the outline of every sighting is laid
 on the ground. Outlines that cover each other are sightings of one symbol. Its outline encloses what at least
-half of them cover, near ones weighing more.
+half of the images cover that show a place, near ones weighing more. What the border cuts off, or a shadow, an
+image does not deny.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,52 +20,89 @@ from scipy.spatial import cKDTree
 from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
-from v2hdm.association.ground import outlines_on_ground
+from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Symbols
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import FloatArray, IntArray, Marking, Symbol
+from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
 
 _CELL_M = 0.01
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
+
+_MOST_CELLS = 500  # cells along the longer side of the average, beyond which they grow
+_PART = 0.25
+"""Share of the images' weight from which paint that the others lack is a part that they have missed."""
+
+_MISSED_SIGMAS = 2.0  # paint is missed, not just elsewhere, this many sigmas beside what an image has
 
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
 
 
 def map_symbols(
-    symbols: Symbols, rig: Rig, jitter_rad: float, markings: Sequence[Marking]
+    symbols: Symbols,
+    rig: Rig,
+    infos: Sequence[CameraInfo],
+    jitter_rad: float,
+    markings: Sequence[Marking],
 ) -> tuple[Symbol, ...]:
     """The symbols that at least three images show.
 
-    Far outlines are less certain by ``jitter_rad``, the standard deviation of the viewing direction; paint
-    that is one of the map's ``markings`` is no symbol.
+    ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
+    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
     }
-    rows, shapes = list(grounds), list(grounds.values())
+    rows, shapes = np.array(list(grounds), dtype=np.int64), list(grounds.values())
     if not shapes:
         return ()
-    centre = camera_centre(rig.cam_from_vehicle[symbols.camera[rows]])
-    pose = rig.map_from_vehicle[symbols.frame[rows]]
-    camera_map = np.einsum("nij,nj->ni", pose[:, :3, :3], centre) + pose[:, :3, 3]
-    range_m = np.linalg.norm(np.array([shape.mean(axis=0) for shape in shapes]) - camera_map[:, :2], axis=1)
-    height_m = np.maximum(centre[:, 2], _COARSE_M)
-    weight = (jitter_rad * (range_m**2 + height_m**2) / height_m + _CELL_M) ** -2
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
     found = []
     for own in _groups(shapes):
-        images = {(int(symbols.camera[rows[n]]), int(symbols.frame[rows[n]])) for n in own}
-        if len(images) < LEAST_SIGHTINGS:
+        at = np.stack([symbols.camera[rows[own]], symbols.frame[rows[own]]])
+        (camera, frame), image = np.unique(at, axis=1, return_inverse=True)
+        if len(camera) < LEAST_SIGHTINGS:
             continue
-        outline = _shared_outline([shapes[n] for n in own], weight[own])
+        eyes = _Eyes(camera, frame, rig, infos, jitter_rad)
+        outline = _fused_outline([shapes[n] for n in own], image.ravel(), eyes)
         if outline is None or _holds_any(outline, places):
             continue
-        kind = Counter(symbols.kinds[rows[n]] for n in own).most_common(1)[0][0]
-        found.append(Symbol(kind, outline, len(images), _sigma_m([shapes[n] for n in own], weight[own])))
+        weight = eyes.sigma_m(outline.mean(axis=0))[image.ravel()] ** -2
+        kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
+        sigma_m = _sigma_m([shapes[n] for n in own], weight)
+        found.append(Symbol(kind, outline, len(camera), sigma_m))
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Eyes:
+    """I images, each of a ``camera`` (I,) at a ``frame`` (I,) of a rig, and what they see of the ground."""
+
+    camera: IntArray
+    frame: IntArray
+    rig: Rig
+    infos: Sequence[CameraInfo]
+    jitter_rad: float
+
+    def sigma_m(self, points_map: FloatArray) -> FloatArray:
+        """Standard deviation (I, ...), m, along the ray, of an outline's place at points (..., 2)."""
+        extrinsic, pose = self.rig.cam_from_vehicle[self.camera], self.rig.map_from_vehicle[self.frame]
+        centre = np.einsum("nij,nj->ni", pose[:, :3, :3], camera_centre(extrinsic)) + pose[:, :3, 3]
+        many = (slice(None), *(None,) * (points_map.ndim - 1))
+        range_m = np.linalg.norm(points_map - centre[(*many, slice(2))], axis=-1)
+        height_m = self.rig.height_m[self.camera][many]
+        direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
+        return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
+
+    def shows(self, points_map: FloatArray) -> BoolArray:
+        """Which points (N, 2) lie inside which images (I, N), away from the border."""
+        cam_from_map = self.rig.cam_from_map(self.camera, self.frame)
+        pixel, depth_m = project_ground(self.rig.intrinsic[self.camera], cam_from_map, points_map[None])
+        limit = np.array([[info.width, info.height] for info in self.infos])[self.camera, None] - BORDER_PX
+        return np.asarray(((pixel > BORDER_PX) & (pixel < limit)).all(axis=2) & (depth_m > 0))
 
 
 def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
@@ -99,21 +138,44 @@ def _covered(shapes: Sequence[FloatArray], cell_m: float) -> tuple[list[np.ndarr
     return masks, first
 
 
-def _shared_outline(shapes: Sequence[FloatArray], weight: FloatArray) -> FloatArray | None:
-    """The outline (N, 2), counter-clockwise, of what half of the weight covers; None if that is nothing."""
-    masks, first = _covered(shapes, _CELL_M)
-    cover = np.zeros(masks[0].shape)
-    for mask, share in zip(masks, weight / weight.sum(), strict=True):
-        cover += share * mask
-    contours = find_contours(cover, 0.5)  # type: ignore[no-untyped-call]
+def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -> FloatArray | None:
+    """The outline (N, 2), counter-clockwise, of what the images take for paint; None if that is nothing.
+
+    Each of I images, ``image`` (S,) of the shapes, speaks of the ground that it shows, and weighs what it
+    knows of it. It may have missed a part of the symbol: where it has no paint near, but others agree on
+    some, it says nothing.
+    """
+    extent_m = float(np.ptp(np.concatenate(shapes), axis=0).max())
+    cell_m = max(_CELL_M, extent_m / _MOST_CELLS)
+    masks, first = _covered(shapes, cell_m)
+    size = masks[0].shape
+    painted = np.zeros((len(eyes.camera), *size), dtype=np.bool_)
+    for mask, number in zip(masks, image, strict=True):
+        painted[number] |= mask
+    cells = first + cell_m * np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1)
+    sigma_m = np.hypot(eyes.sigma_m(cells), cell_m)
+    weight = eyes.shows(cells.reshape(-1, 2)).reshape(painted.shape) / sigma_m**2
+    agreed = _share(painted, weight) > _PART
+    for own, sigma, mask in zip(weight, sigma_m, painted, strict=True):
+        away_m = cell_m * cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3)
+        lacking = agreed & ~mask
+        part = cv2.connectedComponents(lacking.view(np.uint8))[1]
+        missed = np.unique(part[lacking & (away_m > _MISSED_SIGMAS * sigma)])
+        own[lacking & np.isin(part, missed)] = 0.0
+    contours = find_contours(_share(painted, weight), 0.5)  # type: ignore[no-untyped-call]
     if not contours:
         return None
     largest = max(contours, key=lambda contour: abs(float(signed_area(contour))))
     simple = approximate_polygon(largest, 0.5)  # type: ignore[no-untyped-call]
-    outline = simple[:-1, ::-1] * _CELL_M + first
+    outline = simple[:-1, ::-1] * cell_m + first
     if len(outline) < 3:
         return None
     return np.asarray(outline if signed_area(outline) > 0 else outline[::-1])
+
+
+def _share(painted: BoolArray, weight: FloatArray) -> FloatArray:
+    """The share (h, w) of the weight of images (I, h, w) that has paint; 0 where none sees anything."""
+    return np.asarray((weight * painted).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12))
 
 
 def _holds_any(outline: FloatArray, places: FloatArray) -> bool:
