@@ -150,8 +150,7 @@ class Detector:
                 continue
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
             score, ground = piece.symbol_score(kind), piece.outline_vehicle
-            within = np.isfinite(ground).all()
-            within &= found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m
+            within = found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
             if within and score >= self.options.min_score:
                 symbols.append(MarkingDetection(kind, score, *nothing, outline_polygon(piece.blob)))
                 parts_until = piece.index + 1 + piece.blob.parts
