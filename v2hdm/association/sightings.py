@@ -74,12 +74,6 @@ def collect_symbols(
     )
 
 
-_SIDE_SIGMA_PX = 3.0
-"""Largest sigma across, px, of a corner that is known to lie on a line; a vaguer one says next to nothing."""
-
-_POINT_SIGMA_PX = 10.0  # largest sigma, px, that a detector states for a corner that it takes for a point
-
-
 @dataclass(frozen=True)
 class Sightings:
     """S quadrilateral detections of a drive, in the order of its images.
@@ -111,16 +105,9 @@ class Sightings:
 
     @property
     def informs(self) -> BoolArray:
-        """Which corners (S, 4) the adjustment may use: points, and corners that lie on a known line.
-
-        The end of a dash that the image's border cuts is such a corner: its sigma is small across the dash
-        and large along it. A corner that is no point, but claims to be small in every direction, is neither.
-        """
-        finite = np.asarray(np.isfinite(self.covariance_px).all(axis=(2, 3)))
-        finite &= np.isfinite(self.corners_pinhole_px).all(axis=2)
-        variance = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance_px, np.eye(2)))
-        line = (variance[..., 0] <= _SIDE_SIGMA_PX**2) & (variance[..., 1] > _POINT_SIGMA_PX**2)
-        return np.asarray(finite & (self.valid | line))
+        """Which corners (S, 4) have a place and a covariance: each weighs what that says, points or not."""
+        finite = np.isfinite(self.covariance_px).all(axis=(2, 3))
+        return np.asarray(finite & np.isfinite(self.corners_pinhole_px).all(axis=2))
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""

@@ -32,7 +32,7 @@ from v2hdm.detection.patch import ImageQuads, Patches
 from v2hdm.detection.propose import Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.quadrilateral import Quad
-from v2hdm.records import DIAMOND, LANE_DASH, FloatArray, MarkingDetection
+from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
 JUDGE_INPUTS = ("views", "evidence", "shape")
 JUDGE_OUTPUTS = ("odds", "log_side_sigma")
@@ -65,6 +65,10 @@ _LONGEST_GAP_M = 15.0
 _BESIDE_M = 0.3
 _BESIDE_SHARE = 0.02
 """A line's dashes are so far at most beside an arc between them, and so much of their distance."""
+
+_POINT_SHARE = 0.125
+"""Largest standard deviation of a point, in parts of its marking's longer diagonal: two of these are a
+deviation at which sightings are no longer taken for one shape (`association.shape_tolerance`)."""
 
 _TURNED_RAD = 0.15
 _SHARPEST_RADIUS_M = 12.0
@@ -136,8 +140,7 @@ def find_markings(
     turned = (np.arange(4) - readings.first_side[best, None]) % 4
     corners_px = readings.fit.corners_px
     covariance = readings.fit.covariance_px(np.take_along_axis(side_sigma_px[best], turned, axis=1))
-    valid = largest_sigma(covariance) <= options.max_corner_sigma_px
-    valid &= camera.inside(corners_px, options.border_px)
+    valid = _are_points(covariance, corners_px, camera) & camera.inside(corners_px, options.border_px)
     left_out: set[int] = set()
     for whole, parts in readings.parts.items():
         if whole in left_out:
@@ -151,11 +154,21 @@ def find_markings(
     ]
 
 
-def largest_sigma(covariance: FloatArray) -> FloatArray:
-    """Standard deviation (M, 4) of each corner in its least certain direction, from (M, 8, 8)."""
-    u = np.arange(0, 8, 2)
-    first, second, both = covariance[:, u, u], covariance[:, u + 1, u + 1], covariance[:, u, u + 1]
-    return np.asarray(np.sqrt((first + second) / 2 + np.hypot((first - second) / 2, both)))
+def _are_points(covariance_px: FloatArray, corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
+    """Which corners (M, 4, 2) of covariances (M, 8, 8), px^2, lie at a place and not just on a line.
+
+    The ground counts, and the marking's own size: a pixel is a millimetre here and half a metre there.
+    """
+    pinhole_px = camera.undistort(corners_px.reshape(-1, 2))
+    ground = camera.ground(pinhole_px).reshape(corners_px.shape)
+    # What the lens does to a pixel's size is little beside the share.
+    by_px = camera.ground_jacobian(pinhole_px).reshape(-1, 4, 2, 2)
+    corner = np.arange(4)
+    own = covariance_px.reshape(-1, 4, 2, 4, 2)[:, corner, :, corner].swapaxes(0, 1)
+    variance_m2 = np.trace(by_px @ own @ by_px.swapaxes(2, 3), axis1=2, axis2=3)
+    largest_m2 = ((ground[:, :2] - ground[:, 2:]) ** 2).sum(axis=2).max(axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(variance_m2 <= _POINT_SHARE**2 * largest_m2[:, None])
 
 
 def classify_alone(

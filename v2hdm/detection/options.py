@@ -11,7 +11,7 @@ from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
 DEVICES = ("cpu", "cuda")
 
 _RANGES = (
-    dict.fromkeys(("max_range_m", "max_corner_sigma_px", "lane_step_m"), POSITIVE)
+    dict.fromkeys(("max_range_m", "lane_step_m"), POSITIVE)
     | dict.fromkeys(("min_score", "min_confidence"), Within(0, 1 - 1e-9))
     # More threads take the machine's memory before they do any work.
     | {"border_px": NOT_NEGATIVE, "blur_px": Within(0.2, 3), "threads": Within(1, 256)}
@@ -32,8 +32,6 @@ class DetectorOptions:
         max_range_m: markings and lane points farther from the camera on the ground are dropped.
         min_score: least mean class probability of a blob.
         min_confidence: least probability, by all evidence, that a quadrilateral is a whole marking.
-        max_corner_sigma_px: corners with a larger standard deviation in any direction are no points; their
-            covariance says what is known of them all the same.
         mirrored: ask the network of the mirror image, too, and take the mean: fewer errors for more time.
         border_px: corners nearer to the image border are no points.
         lane_step_m: spacing of lane points on the ground.
@@ -46,7 +44,6 @@ class DetectorOptions:
     max_range_m: float = 22.0
     min_score: float = 0.5
     min_confidence: float = 0.7
-    max_corner_sigma_px: float = 0.5
     mirrored: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
@@ -54,7 +51,7 @@ class DetectorOptions:
     @classmethod
     def for_mapping(cls) -> DetectorOptions:
         """Defaults of the mapping, which weighs corners by their covariance and sees each many times."""
-        return cls(min_confidence=0.3, max_corner_sigma_px=1.5, mirrored=True)
+        return cls(min_confidence=0.3, mirrored=True)
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.

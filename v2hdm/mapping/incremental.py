@@ -264,7 +264,7 @@ class IncrementalMapper:
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
         tolerance_m = max(self._options.association.shape_tolerance * size_m, LEAST_TOLERANCE_M)
-        best: tuple[float, int | None, int] = (self._gate_m(track.rows), None, 0)
+        best: tuple[float, int | None, int] = (self._gate_m(track), None, 0)
         near = np.linalg.norm(self._centres - np.nanmean(corners, axis=0), axis=1) < best[0] + size_m
         for marking in np.flatnonzero(near).tolist():
             place = self._places[marking]
@@ -278,10 +278,12 @@ class IncrementalMapper:
                 best = (off_m, marking, int(there.shift))
         return best[1], best[2]
 
-    def _gate_m(self, rows: IntArray) -> float:
+    def _gate_m(self, track: _Track) -> float:
         """How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic."""
-        options, range_m = self._options.association, 0.5 * self._options.max_range_m
-        height_m = float(np.median(self._rig.height_m[self._sightings.camera[rows]]))
+        options, frame = self._options.association, self._sightings.frame[track.rows]
+        away = np.nanmean(track.corners_map, axis=0) - self._rig.map_from_vehicle[frame, :2, 3]
+        range_m = float(np.median(np.linalg.norm(away, axis=1)))
+        height_m = float(np.median(self._rig.height_m[self._sightings.camera[track.rows]]))
         floor_m = np.hypot(self._floor_m, options.refined_sigma_rad * range_m**2 / height_m)
         return float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
 

@@ -25,6 +25,9 @@ _log = logging.getLogger(__name__)
 _NAMED = 5
 """Points that a line of the log names."""
 
+_NEAR_M = 22.0
+"""How far from the route, m, images may show a point: as far as the detector looks by default."""
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -64,7 +67,7 @@ def take_survey(drive: Drive, options: MappingOptions) -> Survey:
         return Survey(options)
     points = in_map(table, drive.origin)
     elsewhere = misreadings(table, drive.origin)
-    _check_near(table, points, elsewhere, drive, options.max_range_m)
+    _check_near(table, points, elsewhere, drive, min(_NEAR_M, options.max_range_m))
     control = [
         ControlOptions(id=one.id, position_map=one.position_map.tolist(), sigma_m=one.sigma_m.tolist())
         for one in points
