@@ -59,19 +59,23 @@ class MarkingClass:
         """Whether it is mapped by four corners."""
         return self.family in (QUADRILATERAL, STRIPE)
 
-    def size_log_likelihood(self, length_m: float, width_m: float, *, whole: bool) -> float:
+    def size_log_likelihood(
+        self, length_m: float, width_m: float, *, whole: bool, log_sigma: float = 0.0
+    ) -> float:
         """Log likelihood of a size, 0 within the ranges; of a piece that the border cuts only the upper ends.
 
+        ``log_sigma`` is the standard deviation of the logarithm of what is measured.
         Sizes are not a number where a piece shows no ground; then they say nothing.
         """
         if not (math.isfinite(length_m) and math.isfinite(width_m)):
             return 0.0
         sizes = ((max(length_m, _TINY_M), self.length_m), (max(width_m, _TINY_M), self.width_m))
-        off = [math.log(size / high) / self.softness for size, (_, high) in sizes if high < math.inf]
+        softness, aspect = (math.hypot(one, log_sigma) for one in (self.softness, _ASPECT_SOFTNESS))
+        off = [math.log(size / high) / softness for size, (_, high) in sizes if high < math.inf]
         if whole:
-            off += [math.log(max(low, _TINY_M) / size) / self.softness for size, (low, _) in sizes]
+            off += [math.log(max(low, _TINY_M) / size) / softness for size, (low, _) in sizes]
             if self.family in (STRIPE, LINE):
-                off.append(math.log(_STRIPE_ASPECT * sizes[1][0] / sizes[0][0]) / _ASPECT_SOFTNESS)
+                off.append(math.log(_STRIPE_ASPECT * sizes[1][0] / sizes[0][0]) / aspect)
         return -0.5 * sum(max(one, 0.0) ** 2 for one in off)
 
 

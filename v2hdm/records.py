@@ -78,6 +78,8 @@ class Camera:
     ``initial_ipm``. ``roi_vehicle`` (N x 2, m) is the convex polygon on the ground within which the IPM is
     trusted. ``linear_response``: grey values are proportional to radiance; otherwise sRGB coding is assumed.
     ``own_vehicle`` (height, width) says which pixels show the vehicle itself, None if unknown.
+    ``mounting_sigma`` are the standard deviations of its horizon, rad, and of the logarithm of its focal
+    length where these are guessed from its images.
     """
 
     info: CameraInfo
@@ -87,6 +89,7 @@ class Camera:
     centre_prior: CentrePrior | None = None
     linear_response: bool = False
     own_vehicle: BoolArray | None = None
+    mounting_sigma: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _FIRST = b'{"source": '
 """The beginning of every line of detections."""
 
-_STAGES = ("read", "net", "propose", "lanes", "fit", "judge")
+_STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -47,7 +47,8 @@ def run(arguments: Sequence[str]) -> None:
         nargs=3,
         metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
         help="without a calibration: about how high the camera is, how far it looks down, its horizontal "
-        "field of view (default: 1.6 5 60); intrinsics of --camera overrule the last",
+        "field of view (default: 1.6 5 60, of which the images correct the second); intrinsics of --camera "
+        "overrule the last",
     )
     parser.add_argument(
         "--linear", action="store_true", help="grey values are proportional to light, not sRGB"

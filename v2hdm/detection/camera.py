@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -76,7 +76,8 @@ class RoadCamera:
         cam_from_vehicle = extrinsic_from_ipm(self.info, self.vehicle_from_pinhole_px)
         ahead, left, _ = cam_from_vehicle[2, :3]
         self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
-        self.foot_vehicle = camera_centre(cam_from_vehicle)[:2]
+        centre = camera_centre(cam_from_vehicle)
+        self.foot_vehicle, self._height_m = centre[:2], float(centre[2])
         on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
         height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
         self.top = self.info.height - min(-(-height // multiple) * multiple, self.info.height)
@@ -133,6 +134,15 @@ class RoadCamera:
     def range_m(self, points_vehicle: FloatArray) -> FloatArray:
         """Distance on the ground from below the camera; NaN stays NaN."""
         return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
+
+    def log_size_sigma(self, range_m: float) -> float:
+        """Standard deviation of the logarithm of a length on the ground at a distance, m.
+
+        It is that of lengths along the view, h f / v^2 per px at v px below the horizon; across it half of
+        the horizon's part is left, and none of the focal length's.
+        """
+        horizon_rad, log_focal = self.camera.mounting_sigma
+        return float(np.hypot(2 * horizon_rad * range_m / self._height_m, log_focal))
 
     def coarse(self, rows_px: FloatArray) -> BoolArray:
         """Which rows (N,) lie so near that they are looked at in half the resolution."""
@@ -300,8 +310,12 @@ class Horizon:
         return np.asarray(along[:, None] * self._along + (below - self._shift)[:, None] * self._down)
 
 
-def camera_from_calibration(calibration: Calibration, linear_response: bool = False) -> Camera:
-    """A camera whose IPM is the one of a finished calibration.
+def camera_from_calibration(
+    calibration: Calibration,
+    linear_response: bool = False,
+    mounting_sigma: tuple[float, float] = (0.0, 0.0),
+) -> Camera:
+    """A camera whose IPM is the one of a finished calibration; ``mounting_sigma`` is that of a guessed one.
 
     Raises:
         MapFileError: the calibration cannot be that of a camera that looks at the ground.
@@ -317,22 +331,32 @@ def camera_from_calibration(calibration: Calibration, linear_response: bool = Fa
         raise MapFileError(f"calibration of camera '{info.name}': {problem}")
     ipm = ipm_from_extrinsic(info, cam_from_vehicle)
     roi_vehicle = lowest + _BELOW_M * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return Camera(info, {"calibrated": ipm}, "calibrated", roi_vehicle, linear_response=linear_response)
+    camera = Camera(info, {"calibrated": ipm}, "calibrated", roi_vehicle)
+    return replace(camera, linear_response=linear_response, mounting_sigma=mounting_sigma)
 
 
 def rough_calibration(
-    name: str, width: int, height: int, height_m: float, pitch_deg: float, fov_deg: float
+    name: str,
+    width: int,
+    height: int,
+    height_m: float,
+    pitch_deg: float,
+    fov_deg: float,
+    roll_deg: float = 0.0,
 ) -> Calibration:
     """A pinhole camera that looks straight ahead, for images of which nothing better is known.
 
     Good enough to classify markings by rough size, not to measure with. ``height_m`` is above the ground,
-    ``pitch_deg`` below the horizon, ``fov_deg`` the horizontal field of view, ``width`` and ``height`` px.
+    ``pitch_deg`` below the horizon, ``fov_deg`` the horizontal field of view, ``width`` and ``height`` px;
+    ``roll_deg`` turns the image's right side down, on which the horizon then rises.
     """
     focal_px = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
     intrinsic = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
     c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
     cam_from_vehicle = np.eye(4)
     cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
+    c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
+    cam_from_vehicle[:3, :3] = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ cam_from_vehicle[:3, :3]
     cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [0, 0, height_m]
     return Calibration(CameraInfo(name, width, height, intrinsic), cam_from_vehicle)
 

@@ -211,14 +211,14 @@ def run_on_road(
     seam = _seam_row(network, camera)
     if seam is None:
         output = run(band)
-        paint, kinds, anchors = output.paint, output.kinds, _anchor_rows(output.lanes, network, top, 1)
+        paint, kinds, anchors = output.paint, output.kinds, anchor_rows(output.lanes, network, top, 1)
     else:
         far = run(band[: seam + _OVERLAP_PX])
         near_top = seam - _OVERLAP_PX
         half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         near = run(half)
-        anchors = [r for r in _anchor_rows(near.lanes, network, top + near_top, 2) if r.v_px >= top + seam]
-        anchors += [r for r in _anchor_rows(far.lanes, network, top, 1) if r.v_px < top + seam]
+        anchors = [r for r in anchor_rows(near.lanes, network, top + near_top, 2) if r.v_px >= top + seam]
+        anchors += [r for r in anchor_rows(far.lanes, network, top, 1) if r.v_px < top + seam]
         paint = _joined(far.paint[None], near.paint[None], seam, near_top, info.paint_stride)[0]
         kinds = _joined(far.kinds, near.kinds, seam, near_top, info.kind_stride)
     # Seen from the side a dash lies across the view, as a stop line does seen from the front, and the other
@@ -268,7 +268,7 @@ def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int, stride:
     return joined
 
 
-def _anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) -> list[AnchorRow]:
+def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) -> list[AnchorRow]:
     """Peaks along each row of ``lanes`` (2, h, w), near to far, of an image reduced by ``scale``."""
     odds, offset = lanes
     peak = odds > _LEAST_LOG_ODDS

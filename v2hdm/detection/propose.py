@@ -162,7 +162,8 @@ def propose(
             continue
         ground = on_ground[begin:end]
         whole = bool(camera.inside(blob.outline_px, _BORDER_PX).all())
-        share = _shares(blob, *rectangle_size(ground), catalogue, whole=whole)
+        log_sigma = camera.log_size_sigma(float(camera.range_m(ground.mean(axis=0))))
+        share = _shares(blob, *rectangle_size(ground), catalogue, whole=whole, log_sigma=log_sigma)
         start = _tightest(outlines[begin:end], camera, max_range_m)
         found.append(Proposal(blob, index, share, ground, *start))
     return found
@@ -174,7 +175,7 @@ def open_sides(corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
 
 
 def _shares(
-    blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *, whole: bool
+    blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *, whole: bool, log_sigma: float
 ) -> dict[str, float]:
     """Share of each class of the catalogue, by network and size."""
     certainty = max(sum(blob.class_score.values()), 1e-9)
@@ -188,7 +189,8 @@ def _shares(
         described = catalogue.classes[name]
         odds = score / certainty + _CLASS_DOUBT / len(known)
         odds += _GROUP_DOUBT * groups[described.group] / certainty
-        likely[name] = odds * float(np.exp(described.size_log_likelihood(length_m, width_m, whole=whole)))
+        size = described.size_log_likelihood(length_m, width_m, whole=whole, log_sigma=log_sigma)
+        likely[name] = odds * float(np.exp(size))
     total = max(sum(likely.values()), 1e-12)
     return {name: value / total for name, value in likely.items()}
 

@@ -309,10 +309,10 @@ class _Chain:
         return self.u_px[-1] + self.slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
 
 
-def find_chains(points: LinePoints) -> list[IntArray]:
-    """Likely crossings, in order from near to far, linked from row to row."""
-    likely = np.flatnonzero(points.odds > _CHAIN_ODDS)
-    u_px, v_px = points.points_px[likely].T
+def find_chains(points_px: FloatArray, odds: FloatArray) -> list[IntArray]:
+    """Likely crossings (N, 2), in order from near to far, linked from row to row; ``odds`` (N,) are log."""
+    likely = np.flatnonzero(odds > _CHAIN_ODDS)
+    u_px, v_px = points_px[likely].T
     if not len(likely):
         return []
     begins = np.flatnonzero(np.diff(v_px, prepend=np.nan)).tolist()  # nan differs from any row

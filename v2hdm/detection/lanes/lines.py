@@ -159,7 +159,7 @@ def propose(image: LaneImage, least_log_odds: float | None = None) -> tuple[Line
     points = _crossings(image)
     # At, above and just below the horizon lines meet; a comparison with nan is false.
     points = points.where(image.camera.range_m(points.ground) <= FARTHEST_M)
-    groups = find_chains(points)
+    groups = find_chains(points.points_px, points.odds)
     points, on_paint = _with_paint(points, image)
     lines = find_lines(points, groups + on_paint, image)
     lines = _surest(lines, log_odds_alone(lines, points, image), least_log_odds - _DOUBTFUL)
@@ -180,8 +180,12 @@ def _crossings(image: LaneImage) -> LinePoints:
     v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
     odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
     scale = np.where(image.camera.coarse(v), 2.0, 1.0)
-    sigma_px = scale * (_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
-    return LinePoints.of(image, np.column_stack([u, v]), odds, sigma_px, paint=False)
+    return LinePoints.of(image, np.column_stack([u, v]), odds, scale * crossing_sigma_px(odds), paint=False)
+
+
+def crossing_sigma_px(odds: FloatArray) -> FloatArray:
+    """Standard deviation (N,) of crossings of such log odds, px of the resolution looked at."""
+    return np.asarray(_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
 
 
 def _with_paint(points: LinePoints, image: LaneImage) -> tuple[LinePoints, list[IntArray]]:

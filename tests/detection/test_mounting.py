@@ -1,0 +1,107 @@
+"""The mounting of a camera of which nothing is known, from the lines of its images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.benchmarks.detector_mounting import SEED, rendered
+from v2hdm.catalogue import SHIPPED
+from v2hdm.cli.main import run
+from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
+from v2hdm.detection.mounting import BODY_SIGMA_RAD, Lines, Mounting, MountingEstimate, image_lines
+from v2hdm.detection.network import Network
+
+FOV_DEG = 60.0
+LEFT_M = (-5.0, -1.7, 1.8, 5.0)
+PRIOR = Mounting(1.6, np.deg2rad(5.0), 0.0, np.deg2rad(FOV_DEG), (np.deg2rad(8.0), np.deg2rad(1.5)), 0.3)
+
+
+def lines_of(pitch_deg, left_m=LEFT_M, turned_deg=0.0, roll_deg=0.0):
+    """The lines of a road that leads to the left, so far left of a camera, as they are seen."""
+    calibration = rough_calibration("c", 1280, 720, 1.5, pitch_deg, FOV_DEG, roll_deg)
+    view = RoadCamera(camera_from_calibration(calibration))
+    turned = np.tan(np.deg2rad(turned_deg))
+    ends = np.array([[[x, left + turned * x] for x in (6.0, 30.0)] for left in left_m])
+    near, far = view.project(ends.reshape(-1, 2)).reshape(-1, 2, 2).swapaxes(0, 1)
+    along = (near - far) / np.linalg.norm(near - far, axis=1, keepdims=True)
+    count = np.ones(len(left_m))
+    return Lines((near + far) / 2, along, 0.5 * count, 0.002 * count, count)
+
+
+def estimate(*images):
+    found = MountingEstimate(rough_calibration("c", 1280, 720, 1.6, 5.0, FOV_DEG).info, PRIOR)
+    for lines in images:
+        found.add(lines)
+    return found.mounting
+
+
+@pytest.mark.parametrize("pitch_deg", [-10.0, 5.0, 20.0])
+@pytest.mark.parametrize("turned_deg", [0.0, 6.0])
+def test_images_of_a_road_show_the_pitch_whatever_the_prior(pitch_deg, turned_deg):
+    found = estimate(*[lines_of(pitch_deg, turned_deg=turned_deg)] * 4)
+    assert np.rad2deg(found.pitch_rad) == pytest.approx(pitch_deg, abs=0.5)
+    assert found.sigma_rad[0] < BODY_SIGMA_RAD
+
+
+def test_one_image_may_show_something_else():
+    """Its lines may be those of a wall: some of the prior stays."""
+    found = estimate(lines_of(-10.0))
+    assert np.rad2deg(found.sigma_rad[0]) > 1.0
+    assert np.rad2deg(found.pitch_rad) == pytest.approx(-10.0, abs=3.0)
+
+
+@pytest.mark.parametrize("left_m", [(), (1.8,), (1.8, 1.8)])
+def test_lines_that_do_not_cross_leave_the_prior(left_m):
+    lines = lines_of(-10.0, LEFT_M)
+    kept = [LEFT_M.index(1.8)] * len(left_m)
+    found = estimate(Lines(*(part[kept] for part in vars(lines).values())))
+    assert np.rad2deg(found.sigma_rad[0]) > 3.0
+
+
+def test_lines_that_run_another_way_do_not_move_the_horizon():
+    lines, stray = lines_of(10.0), lines_of(10.0, (3.0, -4.0), turned_deg=-20.0)
+    both = Lines(
+        *(np.concatenate(pair) for pair in zip(vars(lines).values(), vars(stray).values(), strict=False))
+    )
+    assert np.rad2deg(estimate(*[both] * 4).pitch_rad) == pytest.approx(10.0, abs=0.6)
+
+
+@pytest.mark.parametrize("roll_deg", [-2.0, 2.0])
+def test_roads_that_lead_aside_show_the_roll(roll_deg):
+    images = [lines_of(6.0, turned_deg=turned, roll_deg=roll_deg) for turned in (-16.0, 0.0, 16.0)]
+    found = estimate(*images * 2)
+    assert np.rad2deg(found.roll_rad) == pytest.approx(roll_deg, abs=0.8)
+    assert found.sigma_rad[1] < 0.6 * PRIOR.sigma_rad[1]
+    ahead = estimate(*[lines_of(6.0, roll_deg=roll_deg)] * 6)
+    assert ahead.sigma_rad[1] > 0.8 * PRIOR.sigma_rad[1], "one vanishing point does not show it"
+
+
+def test_sizes_are_as_uncertain_as_the_mounting():
+    calibration = rough_calibration("c", 1280, 720, 1.5, 5.0, FOV_DEG)
+    known, guessed = (
+        RoadCamera(camera_from_calibration(calibration, mounting_sigma=sigma))
+        for sigma in ((0.0, 0.0), (0.01, 0.3))
+    )
+    assert known.log_size_sigma(15.0) == 0.0
+    assert guessed.log_size_sigma(15.0) == pytest.approx(np.hypot(2 * 0.01 * 15 / 1.5, 0.3))
+    # The same pixels of a camera that looks down by 0.01 rad more, 15 m away and along the view.
+    other = RoadCamera(camera_from_calibration(rough_calibration("c", 1280, 720, 1.5, 5.0 - 0.573, FOV_DEG)))
+    ends = known.project(np.array([[15.0, 0.0], [15.1, 0.0]]))
+    assert abs(np.log(np.ptp(other.ground(ends)[:, 0]) / 0.1)) == pytest.approx(0.2, abs=0.05)
+    dash = SHIPPED.classes["lane_dash"]
+    sizes = {"length_m": 14.0, "width_m": 0.15, "whole": True}
+    assert dash.size_log_likelihood(**sizes, log_sigma=0.3) > 0.2 * dash.size_log_likelihood(**sizes)
+
+
+def test_a_folder_without_a_mounting_is_seen_from_where_its_lines_meet(tmp_path, capsys):
+    """Said once, with a standard deviation that holds."""
+    folder = rendered(tmp_path, camera=1, images=4, seed=SEED + 1)
+    pitch_deg, info = folder.mounting[1], rough_calibration("c", 1280, 720, 1.6, 5.0, folder.mounting[2]).info
+    arguments = ["--mounting", "1.6", f"{pitch_deg + 4:.2f}", f"{folder.mounting[2]:.2f}"]
+    assert run(["detect", str(folder.path), *arguments, "--output", str(tmp_path / "out.jsonl")]) == 0
+    said = [text for text in capsys.readouterr().err.splitlines() if "by the lines of" in text]
+    assert len(said) == 1
+    found, sigma = (float(word) for word in said[0].split("looks ")[1].split(" deg")[0].split(" +- "))
+    assert abs(found - pitch_deg) < 3 * np.hypot(sigma, np.rad2deg(BODY_SIGMA_RAD) / 2)
+    lines = image_lines(Network(), cv2.imread(str(folder.path / "000.png")), info)
+    assert np.allclose(np.linalg.norm(lines.direction, axis=1), 1)

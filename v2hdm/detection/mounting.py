@@ -1,0 +1,200 @@
+"""How a camera of which little is known is mounted, from the lines that its images show.
+
+Lines along a road are parallel on the ground and meet in one point of the horizon, wherever the road bends:
+points of several images, beside each other, also show the roll. A first network run on half the resolution
+finds crossings of lanes' lines and the edges of paint. Each of these lines is either one of the road's or any
+other; the horizon has a posterior on a grid of pitch and roll, whose prior is the stated or a usual mounting.
+An image's own horizon moves about the camera's with the vehicle's body. One vanishing point does not show the
+focal length: that stays as uncertain as its prior, and so does the height.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.lanes.curves import NEIGHBOURS, find_chains
+from v2hdm.detection.lanes.lines import crossing_sigma_px
+from v2hdm.detection.network import Network, anchor_rows, as_probability
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.records import CameraInfo, FloatArray
+
+BODY_SIGMA_RAD = np.deg2rad(0.35)
+"""Standard deviation of a body's pitch on its suspension: .3 to .4 degrees in 106 photographs of one camera,
+and .1 to .4 in `docs/kitti.md`."""
+
+_SCALE = 2  # an image is looked at in half its resolution: a sixth of the time, and a third less certain
+_LEAST_CROSSINGS = 4
+_LEAST_EDGE_PX, _EDGE_SIGMA_PX = 6.0, 0.45
+"""Least length of a paint's edge, and the standard deviation of its ends, in elements of the paint."""
+
+_FLAT = 0.12  # edges that rise less than this are of stop lines and of shadows across the road
+_PARALLEL_SIGMA_RAD = 0.015
+"""Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is
+known."""
+
+_SHARE = 0.4  # share of the lines that keep to the road: kerbs, arrows, letters and façades need not
+_POINT_SIGMA_PX = 1.5  # a vanishing point is a point to no more than this
+_EDGE_WEIGHT = 0.3  # a marking has two edges in several pieces each, which err together
+_SILENT = 0.05  # share of images whose lines are of something else
+_AHEAD_RAD, _AHEAD_SHARE, _ASIDE_RAD = np.deg2rad(6.0), 0.85, np.deg2rad(30.0)
+"""Roads lead so far off a camera's axis, in so many images, and as far in the others."""
+
+_PITCH_STEP_RAD, _ROLL_STEP_RAD, _COLUMN_STEP_RAD = np.deg2rad([0.4, 0.75, 1.25])
+_SIGMAS, _REACH_RAD = 4.0, np.deg2rad(40.0)
+_STEEPEST_RAD = np.deg2rad(80.0)  # nearer to straight down or up lines look parallel
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How a camera sits: its height, m; pitch, down from the horizon; roll; horizontal field of view.
+
+    ``sigma_rad`` (2,) are the standard deviations of pitch and roll, ``log_focal_sigma`` that of the
+    logarithm of the focal length.
+    """
+
+    height_m: float
+    pitch_rad: float
+    roll_rad: float
+    fov_rad: float
+    sigma_rad: tuple[float, float]
+    log_focal_sigma: float = 0.0
+
+
+@dataclass(frozen=True)
+class Lines:
+    """N lines of an image: a point (N, 2) and the unit direction (N, 2) of each, pinhole px.
+
+    ``sigma_px`` and ``sigma_rad`` (N,) are their standard deviations across, ``weight`` (N,) how much each
+    counts.
+    """
+
+    point_px: FloatArray
+    direction: FloatArray
+    sigma_px: FloatArray
+    sigma_rad: FloatArray
+    weight: FloatArray
+
+
+def image_lines(network: Network, image_bgr: np.ndarray, info: CameraInfo) -> Lines:
+    """The lines that the network's output on the whole of an image (H, W, 3) uint8 shows.
+
+    Raises DetectorError where the network cannot be run on it.
+    """
+    half = cv2.resize(image_bgr, None, fx=1 / _SCALE, fy=1 / _SCALE, interpolation=cv2.INTER_AREA)
+    output = network.run(half)
+    rows = anchor_rows(output.lanes, network, 0, _SCALE)
+    u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
+    v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
+    odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
+    crossings_px = undistort_points(info, np.column_stack([u, v]))
+    chains = [c for c in find_chains(np.column_stack([u, v]), odds) if len(c) >= _LEAST_CROSSINGS]
+    fitted = [_fitted(crossings_px[c], _SCALE * crossing_sigma_px(odds[c])) for c in chains]
+    level = np.round(255 * as_probability(output.paint)).astype(np.uint8)
+    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE).detect(level)[0]
+    ends = np.zeros((0, 2, 2)) if found is None else found.reshape(-1, 2, 2).astype(np.float64)
+    long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _LEAST_EDGE_PX
+    unit_px = _SCALE * network.info.paint_stride
+    ends_px = undistort_points(info, (unit_px * (ends[long] + 0.5) - 0.5).reshape(-1, 2)).reshape(-1, 2, 2)
+    along = ends_px[:, 1] - ends_px[:, 0]
+    length = np.maximum(np.linalg.norm(along, axis=1), 1.0)
+    sigma_px = np.full(len(length), _EDGE_SIGMA_PX * unit_px)
+    edges = (ends_px.mean(axis=1), along / length[:, None], sigma_px, 2 * sigma_px / length)
+    chained = tuple(np.array(part) for part in zip(*fitted, strict=True)) if fitted else ()
+    parts = [np.concatenate(pair) for pair in zip(chained, edges, strict=True)] if fitted else list(edges)
+    weight = np.append(np.ones(len(fitted)), np.full(len(length), _EDGE_WEIGHT))
+    upright = np.abs(parts[1][:, 1]) > _FLAT
+    return Lines(*(part[upright] for part in (*parts, weight)))
+
+
+def _fitted(points_px: FloatArray, sigma_px: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+    """The line through a chain of crossings (N, 2), px along their rows, as :class:`Lines` has them."""
+    information = sigma_px**-2.0
+    middle = information @ points_px / information.sum()
+    across, down = (points_px - middle).T
+    spread = max(float(information @ down**2), 1e-9)
+    slope = float((information * down) @ across) / spread
+    scatter = float(information @ (across - slope * down) ** 2) / len(points_px)
+    upright = 1 / np.hypot(1, slope)  # neighbours err together, and across the line less than along its row
+    variance = NEIGHBOURS * max(scatter, 1.0) * upright**2
+    sigma = np.sqrt(variance / information.sum()), upright * np.sqrt(variance / spread)
+    return middle, np.array([slope, 1.0]) * upright, float(sigma[0]), float(sigma[1])
+
+
+class MountingEstimate:
+    """The posterior of a camera's pitch and roll, from image to image."""
+
+    def __init__(self, info: CameraInfo, prior: Mounting):
+        self.info = info
+        self._prior = prior
+        self._centre_px = info.intrinsic[:2, 2]
+        self._focal_px = float(info.intrinsic[1, 1])
+        (pitch, roll), steps = prior.sigma_rad, (_PITCH_STEP_RAD, _ROLL_STEP_RAD)
+        self._pitch, self._roll = (
+            mean + step * np.arange(-(reach := int(np.ceil(_SIGMAS * sigma / step))), reach + 1)
+            for mean, sigma, step in zip((prior.pitch_rad, prior.roll_rad), (pitch, roll), steps, strict=True)
+        )
+        off = (self._pitch - prior.pitch_rad)[:, None] / pitch, (self._roll - prior.roll_rad) / roll
+        self._log_belief: FloatArray = -0.5 * (off[0] ** 2 + off[1] ** 2)
+
+    @property
+    def mounting(self) -> Mounting:
+        """What is known by now; the standard deviations leave out an image's own pitch."""
+        belief = np.exp(self._log_belief - self._log_belief.max())
+        belief /= belief.sum()
+        moments = [
+            (float(share @ at), float(share @ at**2))
+            for share, at in ((belief.sum(axis=1), self._pitch), (belief.sum(axis=0), self._roll))
+        ]
+        steps = _PITCH_STEP_RAD, _ROLL_STEP_RAD
+        sigmas = [
+            float(np.sqrt(max(square - mean**2, 0) + step**2 / 12))
+            for (mean, square), step in zip(moments, steps, strict=True)
+        ]
+        (pitch, _), (roll, _) = moments
+        return replace(self._prior, pitch_rad=pitch, roll_rad=roll, sigma_rad=(sigmas[0], sigmas[1]))
+
+    def add(self, lines: Lines) -> None:
+        """Take in an image's lines."""
+        if not len(lines.weight):
+            return
+        bearing = np.arange(-_REACH_RAD, _REACH_RAD + _COLUMN_STEP_RAD / 2, _COLUMN_STEP_RAD)
+        columns = self._focal_px * np.tan(bearing)
+        ahead, aside = (np.exp(-0.5 * (bearing / sigma) ** 2) / sigma for sigma in (_AHEAD_RAD, _ASIDE_RAD))
+        prior = _AHEAD_SHARE * ahead + (1 - _AHEAD_SHARE) * aside
+        rise = np.abs(np.tan(self._roll)).max() * columns.max() / self._focal_px
+        spare = int(np.ceil(rise / _PITCH_STEP_RAD))
+        at = self._pitch[0] + _PITCH_STEP_RAD * np.arange(-spare, len(self._pitch) + spare)
+        rows = -self._focal_px * np.tan(np.clip(at, -_STEEPEST_RAD, _STEEPEST_RAD))
+        points = self._log_likelihood(lines, columns, rows) + np.log(prior)
+        # The horizon of each pitch and roll, through the columns.
+        level = np.tan(np.clip(self._pitch, -_STEEPEST_RAD, _STEEPEST_RAD))
+        up = level[:, None, None] + np.tan(self._roll)[:, None] * columns / self._focal_px
+        place = (np.arctan(up) - at[0]) / _PITCH_STEP_RAD
+        first = np.clip(np.floor(place).astype(np.intp), 0, len(at) - 2)
+        share, column = np.clip(place - first, 0, 1), np.arange(len(columns))
+        on_it = (1 - share) * points[first, column] + share * points[first + 1, column]
+        likelihood = np.exp(on_it - on_it.max()).sum(axis=2)
+        body = np.exp(-0.5 * ((self._pitch[:, None] - self._pitch) / BODY_SIGMA_RAD) ** 2)
+        moved = (body / body.sum(axis=1, keepdims=True)) @ likelihood
+        self._log_belief = self._log_belief + np.log((1 - _SILENT) * moved / moved.mean() + _SILENT)
+
+    def _log_likelihood(self, lines: Lines, columns: FloatArray, rows: FloatArray) -> FloatArray:
+        """Log likelihood (R, C) of vanishing points, px from the principal point, over that of none."""
+        total = np.zeros((len(rows), len(columns)), dtype=np.float32)
+        point = (lines.point_px - self._centre_px).astype(np.float32)
+        parallel_px = _PARALLEL_SIGMA_RAD * self._focal_px * lines.direction[:, 1]
+        variance_px2 = (lines.sigma_px**2 + _POINT_SIGMA_PX**2 + parallel_px**2).astype(np.float32)
+        direction, turned = lines.direction.astype(np.float32), (lines.sigma_rad**2).astype(np.float32)
+        u, v = columns.astype(np.float32), rows.astype(np.float32)[:, None]
+        for k, weight in enumerate(lines.weight.tolist()):
+            across, down = u - point[k, 0], v - point[k, 1]
+            nearer = 1 / np.maximum(across**2 + down**2, np.float32(1))
+            variance = turned[k] + variance_px2[k] * nearer
+            sine2 = (across * direction[k, 1] - down * direction[k, 0]) ** 2 * nearer
+            # Over directions that are all alike likely: pi / sqrt(2 pi).
+            kept = np.exp(-0.5 * sine2 / variance) * np.float32(np.sqrt(np.pi / 2)) / np.sqrt(variance)
+            total += np.float32(weight) * np.log(np.float32(_SHARE) * kept + np.float32(1 - _SHARE))
+        return total.astype(np.float64)
