@@ -214,7 +214,7 @@ def _off_neighbours(motion: Motion, values: FloatArray) -> FloatArray:
 
 
 def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
-    """That stamps scatter, where positions that are ``off`` (P - 2, D) do so along the way and none stands out.
+    """That stamps scatter, where positions are ``off`` (P - 2, D) along the way alone, and none stands out.
 
     A lost fix moves a few records, and any way; a late stamp moves each, and only along the way.
     """
@@ -230,8 +230,8 @@ def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
     # What lies between two neighbours that err as much is off by sqrt(1 + 1/4 + 1/4) sigmas.
     jitter_s = float(np.sqrt((along_m**2 - across_m**2) / 1.5) / np.median(motion.speed_mps))
     says = (
-        f"the stamps of the poses jitter by {1e3 * jitter_s:.0f} ms: positions scatter {along_m / across_m:.0f} "
-        "times as much along the way as across it; stamp poses when they are measured, not when they arrive"
+        f"the stamps of the poses jitter by {1e3 * jitter_s:.0f} ms: positions scatter {along_m / across_m:.0f}"
+        " times as much along the way as across it; stamp poses when they are measured, not when they arrive"
     )
     return Finding("pose stamps", Status.FAIL, 1e3 * jitter_s, None, "ms", says, "poses")
 
@@ -294,7 +294,7 @@ def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
 
 
 def _is_course(motion: Motion, scatter_rad: float) -> bool:
-    """Whether the heading's scatter from pose to pose is mostly that of the course, so made from positions."""
+    """Whether the heading's scatter from pose to pose is mostly that of the course, so of positions."""
     ahead, at = motion.rotation[1:-1, :2, 0], motion.position[:, :2]
     courses = (at[1:-1] - at[:-2], at[2:] - at[1:-1], at[2:] - at[:-2])
     return min(_robust_sigma(_fourth(angle_between(ahead, one))) for one in courses) < scatter_rad / 2
@@ -302,8 +302,8 @@ def _is_course(motion: Motion, scatter_rad: float) -> bool:
 
 def _course(scatter_rad: float) -> Finding:
     says = (
-        f"the heading is the course from position to position, with their scatter of {scatter_rad:.2g} rad, and "
-        "not the vehicle's; record the heading of the vehicle, as two antennas or an INS measure it"
+        f"the heading is the course from position to position, with their scatter of {scatter_rad:.2g} rad,"
+        " and not the vehicle's; record the heading of the vehicle, as two antennas or an INS measure it"
     )
     return Finding("heading", Status.FAIL, scatter_rad, None, "rad", says, "poses")
 
