@@ -228,12 +228,12 @@ def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
     if not 0 < _UNDERSTATED * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
         return None
     # What lies between two neighbours that err as much is off by sqrt(1 + 1/4 + 1/4) sigmas.
-    jitter_s = float(np.sqrt((along_m**2 - across_m**2) / 1.5) / np.median(motion.speed_mps))
+    jitter_ms = 1e3 * float(np.sqrt((along_m**2 - across_m**2) / 1.5) / np.median(motion.speed_mps))
     says = (
-        f"the stamps of the poses jitter by {1e3 * jitter_s:.0f} ms: positions scatter {along_m / across_m:.0f}"
-        " times as much along the way as across it; stamp poses when they are measured, not when they arrive"
+        f"the stamps of the poses jitter by {jitter_ms:.0f} ms: positions scatter {along_m / across_m:.0f} "
+        "times as much along the way as across it; stamp poses when they are measured, not when they arrive"
     )
-    return Finding("pose stamps", Status.FAIL, 1e3 * jitter_s, None, "ms", says, "poses")
+    return Finding("pose stamps", Status.FAIL, jitter_ms, None, "ms", says, "poses")
 
 
 def check_attitude(motion: Motion) -> Iterator[Finding]:
