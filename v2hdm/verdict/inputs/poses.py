@@ -31,6 +31,7 @@ _HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the 
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
 _TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
 _GRADE_CHANGE_RAD = 0.02  # grades must spread over this (2 %) before the sign of the pitch is observable
+_PITCH_SIGMAS = 4.0  # that the pitch must go against the grade by: heights err, and grades with them
 _RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a float solution
 # Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
 _HEADING_RAD = 0.035
@@ -265,8 +266,11 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
     if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
         return
     slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
+    # Chords overlap: those of the way that do not are so many.
+    apart = max(float(motion.step_m[motion.moving].sum()) / _CHORD_M, 1.0)
+    sigma = float(np.std(middle + slope * grade_rad) / np.std(grade_rad) / np.sqrt(apart))
     yield judge(
-        "pitch sign", "poses", 1 - slope, 1.0, "",
+        "pitch sign", "poses", 1 - slope - _PITCH_SIGMAS * sigma, 1.0, "",
         fine="the pitch follows the grade",
         wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
         "down (a rotation about y, which points left)",
