@@ -126,10 +126,13 @@ class PoseNoise:
     def as_far_as_stated(cls, **stated: float) -> PoseNoise:
         """The noise of a drive whose description may leave out some of it.
 
-        A drift that is not stated takes half of its variance: an error that repeats from image to image does
-        not average out, and a map that reckons with none is less certain than it says.
+        What is not stated is not known to be the usual, and enters by its mean square. A drift that is not
+        stated takes half of its variance: an error that repeats from image to image does not average out, and
+        a map that reckons with none is less certain than it says.
         """
         noise = cls(**stated)
+        unstated = {total: _UNSTATED * getattr(noise, total) for total in DRIFTS if total not in stated}
+        noise = replace(noise, **unstated)
         drifts = {
             drift: math.sqrt(_USUAL_DRIFT_SHARE) * getattr(noise, total)
             for total, drift in DRIFTS.items()
@@ -150,6 +153,10 @@ DRIFTS: Mapping[str, str] = {
     "roll_pitch_rad": "roll_pitch_drift_rad",
 }
 """The drift that belongs to each standard deviation of :class:`PoseNoise`."""
+
+_UNSTATED = math.sqrt((3.0**2 - 3.0**-2) / (2 * math.log(3.0**2)))
+"""Root of the mean square of a sigma, over the usual one, whose logarithm is even from a third to three times
+it: among receivers and vehicles it lies anywhere there."""
 
 _USUAL_DRIFT_SHARE = 0.5
 """Share of a variance that drifts where nobody says otherwise: RTK's errors are about half multipath and

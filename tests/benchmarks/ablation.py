@@ -1,11 +1,15 @@
 """What each part of the detector of markings earns: switched off one at a time on scenes of unseen seeds.
 
-    python -m tests.benchmarks.ablation [--images 60] [--only PATTERN]
+    python -m tests.benchmarks.ablation [--images 60] [--only PATTERN] [--verdict FIRST LAST]
 
 Printed, for the detector as it is and without each part: recall within 20 m of markings that must be found,
 false ones, the share of markings with four corners known well, the corners' error, px, and whether the stated
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
+
+With ``--verdict`` instead what each column of the table of the sizes of faults (mapping/recovery.py) earns,
+on made drives of these seeds, as they are and with every fault: right drives failed, wrong maps without a
+word, and of those with one how many are named rightly, first.
 """
 
 from __future__ import annotations
@@ -13,7 +17,9 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -21,11 +27,14 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Tally
+from tests.benchmarks.made.faults import SPOILS
+from tests.benchmarks.right_drives import CLEAN, Job, judge, map_one
 from train.examples import Example, example
 from v2hdm.detection import classifier as find
 from v2hdm.detection import fit, lattice, propose
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.mapping import recovery
 from v2hdm.records import FloatArray
 
 SEED = 5_318_008
@@ -137,13 +146,41 @@ def row(name: str, shown: Sequence[Example]) -> str:
     )
 
 
+def sizes() -> Iterator[Part]:
+    """Each column of the table of sizes, and within which context it says nothing."""
+    yield "nothing off", nullcontext
+    for column, nothing in (("least", 0.0), ("sigma", np.inf), ("usual", np.inf), ("most", np.inf)):
+        flat = {fault: replace(size, **{column: nothing}) for fault, size in recovery._SIZES.items()}
+        yield f"{column} size of each fault", partial(patch.object, recovery, "_SIZES", flat)
+
+
+def row_of_verdict(name: str, seeds: Sequence[int]) -> str:
+    """One line of the table of the verdict."""
+    failed, judged = 0, []
+    for seed in seeds:
+        clean = map_one(Job(seed))
+        failed += clean.status == "FAIL"
+        judged += [judge(map_one(Job(seed, spoil=spoil)), clean) for spoil in SPOILS if spoil != CLEAN]
+    silent = sum(wrong and not told for wrong, told, _ in judged)
+    told = [when for _, told, when in judged if told]
+    return f"{name:38s} {failed:7d} {silent:7d} {len(told):7d} {told.count('first'):7d}"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--only", default="")
+    parser.add_argument("--verdict", nargs=2, type=int, metavar=("FIRST", "LAST"))
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
+    if parsed.verdict:
+        print(f"{'off':38s} {'failed':>7s} {'silent':>7s} {'told':>7s} {'first':>7s}")
+        for name, off in sizes():
+            if re.search(parsed.only, name):
+                with off():
+                    print(row_of_verdict(name, range(*parsed.verdict)), flush=True)
+        return
     shown = [example(index, 1.0, SEED) for index in range(parsed.images)]
     head = ("recall", "false", "all four", "median", "95 %", "squared")
     print(f"{'off':38s} {head[0]:>7s} {head[1]:>6s} {head[2]:>10s} {head[3]:>8s} {head[4]:>8s} {head[5]:>8s}")

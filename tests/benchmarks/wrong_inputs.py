@@ -147,15 +147,20 @@ def judge(drive: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
         and outcome.false <= clean.false
         and outcome.markings >= 0.9 * clean.markings
     )
-    said = [f"{finding['check']} {finding['says']}" for finding in outcome.findings] or [outcome.message]
+    said = [_clause(finding) for finding in outcome.findings] or [outcome.message]
     pattern = fault.cause
     told = outcome.status in ("WARN", "FAIL", _REFUSED)
     hidden = fault.hidden_on_straight if "straight" in drive else None
     if hidden is not None and not told:
-        said = [f"{one['check']} {one['says']}" for one in outcome.untold]
+        said = [_clause(one) for one in outcome.untold]
         told, pattern = bool(said), hidden
     named = [pattern is None or re.search(pattern, one, re.IGNORECASE) is not None for one in said]
     return Row(drive, fault.name, outcome, right, told, any(named), bool(named and named[0]))
+
+
+def _clause(finding: dict[str, Any]) -> str:
+    """What a finding names, without the recovery, which may speak of other causes."""
+    return f"{finding['check']} {re.split('; |: (?:check|mend|see) ', finding['says'])[0]}"
 
 
 def clean_fault() -> Fault:

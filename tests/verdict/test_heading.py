@@ -170,6 +170,15 @@ def test_a_lost_fix_is_told_with_its_size_and_place():
     assert "at 4.95 s" in told["position jumps"] or "at 5.00 s" in told["position jumps"]
 
 
+def test_stamps_that_jitter_are_no_lost_fix():
+    recorded = poses()
+    late_s = np.random.default_rng(0).normal(0.0, 0.2, len(recorded.stamp_s))
+    stamp_s = np.maximum.accumulate(recorded.stamp_s + late_s) + 1e-6 * np.arange(len(late_s))
+    told = raised(check_jumps(motion(Trajectory(stamp_s, recorded.map_from_vehicle)), NOISE))
+    assert list(told) == ["pose stamps"]
+    assert "as much along the way as across it" in told["pose stamps"]
+
+
 def test_a_height_that_jumps_is_told_apart():
     recorded = poses()
     recorded.map_from_vehicle[100:, 2, 3] += 0.8
@@ -194,6 +203,18 @@ def test_a_pitch_that_counts_nose_up_goes_against_the_grade(sign, status):
     recorded.map_from_vehicle[:, :3, :3] = rotation_from_euler(zero, -sign * np.arctan(grade), zero)
     found = {finding.check: finding for finding in check_attitude(motion(recorded))}
     assert found["pitch sign"].status is status
+
+
+@pytest.mark.parametrize("ahead", [0, 1])
+def test_a_heading_made_from_positions_is_told_from_a_noisy_one(ahead):
+    recorded = poses()
+    step = np.diff(recorded.map_from_vehicle[:, :2, 3], axis=0)
+    course = np.arctan2(step[:, 1], step[:, 0])
+    followed = np.concatenate([course, course[-1:]] if ahead else [course[:1], course])
+    off = np.random.default_rng(0).normal(0.0, np.std(np.diff(course)), len(followed))
+    assert list(raised(check_noise(motion(with_yaw(recorded, followed)), NOISE))) == ["heading"]
+    noisy = with_yaw(recorded, yaw_of(recorded) + off)
+    assert list(raised(check_noise(motion(noisy), NOISE))) == ["pose scatter"]
 
 
 def test_poses_that_scatter_as_stated_pass():

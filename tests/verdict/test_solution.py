@@ -62,6 +62,16 @@ def test_a_clean_result_raises_nothing(drive):
     assert raised(result(), drive) == {}
 
 
+@pytest.mark.parametrize(("ratio", "named"), [(1.2, False), (5.0, True)])
+def test_noise_along_the_way_alone_is_of_stamps_that_jitter(drive, ratio, named):
+    noisy = replace(FINE, pose_noise={"position_m": 4.0}, jitter_s=0.02, along_over_across=ratio)
+    found = raised(result(replace(noisy, variance_factor=4.0)), drive)
+    assert ("image stamps" in found) is named
+    assert found["fit"].says.endswith("see image stamps") is named
+    quiet = replace(noisy, pose_noise={"position_m": 1.0})
+    assert "image stamps" not in raised(result(quiet), drive)
+
+
 def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
     dropped = replace(LEVER, value=-1.2, p_value=1e-200)
     found = raised(result(replace(FINE, corrected=(dropped,))), drive)

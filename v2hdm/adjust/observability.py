@@ -94,6 +94,15 @@ class PoseInnovations:
     state: IntArray
     normalised: FloatArray
 
+    @property
+    def along_over_across(self) -> float:
+        """How many times as much positions err anew along the way as across it; 1 where none is known."""
+        ahead, left = (np.flatnonzero(self.state == axis)[:1] for axis in (0, 1))
+        if not len(ahead) or not len(left):
+            return 1.0
+        along, across = np.sqrt(np.mean(self.normalised[:, [ahead[0], left[0]]] ** 2, axis=0))
+        return float(along / max(across, 1e-9))
+
     def rms(self) -> dict[str, float]:
         """Root mean square by the state's name, the larger one where it has two."""
         count = max(len(self.normalised), 1)

@@ -406,7 +406,7 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     answers = [_Answer.to(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
     said = [one.disagreement for one in answers if one.is_observable]
     usual = float(np.median(said)) if said else 1.0
-    found = _likeliest_changes([one.test(usual) for one in answers])
+    found = _likeliest_changes([(one, one.test(usual)) for one in answers])
     found += _control_points(problem, solution, usual)
     return tuple(sorted(found, key=lambda test: -test.gain))
 
@@ -451,20 +451,31 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.SIZE, _size(arrays.lengths.length_m == length_m), item=item)
 
 
-def _likeliest_changes(found: list[ScoreTest]) -> list[ScoreTest]:
-    """Of inputs that may change at many frames only the likeliest, which had so many chances."""
-    kept = [one for one in found if one.fault not in CHANGES]
-    changes: dict[tuple[Fault, int, int], list[ScoreTest]] = {}
-    for one in found:
+def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest]:
+    """Of inputs that may change at many frames only the likeliest, which had so many chances (Sidak)."""
+    kept = [one for _, one in found if one.fault not in CHANGES]
+    changes: dict[tuple[Fault, int, int], list[tuple[_Answer, ScoreTest]]] = {}
+    for answer, one in found:
         if one.fault in CHANGES:
-            changes.setdefault((one.fault, one.camera, one.axis), []).append(one)
+            changes.setdefault((one.fault, one.camera, one.axis), []).append((answer, one))
     for chances in changes.values():
-        best = max(chances, key=lambda one: one.gain)
-        many = len(chances)
-        kept.append(
-            replace(best, p_value=min(many * best.p_value, 1.0), gain=best.gain - float(np.log(many)))
-        )
+        best, many = max((one for _, one in chances), key=lambda one: one.gain), _chances(chances)
+        p_value = -float(np.expm1(many * np.log1p(-min(best.p_value, 1 - 1e-9))))
+        kept.append(replace(best, p_value=p_value, gain=best.gain - float(np.log(many))))
     return kept
+
+
+def _chances(changes: list[tuple[_Answer, ScoreTest]]) -> float:
+    """How many independent changes are as many chances as these: neighbours hang together by their noise.
+
+    The squared trace of the correlation over that of its square (Galwey, Genetic Epidemiology 33, 2009, has
+    this among others).
+    """
+    drawn = np.array([answer.drawn.ravel() for answer, one in changes if np.isfinite(one.sigma)])
+    if not len(drawn):
+        return float(len(changes))
+    drawn = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    return float(len(drawn) ** 2 / np.sum((drawn @ drawn.T) ** 2))
 
 
 def _control_points(problem: Problem, solution: Solution, usual: float) -> Iterator[ScoreTest]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from v2hdm.adjust import PoseSigma, Status, estimate_noise, select_model, solve
+from v2hdm.adjust import PoseSigma, Status, estimate_noise, select_model
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -245,12 +245,6 @@ class Optimiser:
         kinds = ("position_m", "heading_rad", "roll_pitch_rad")
         totals = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in own] for kind in kinds}
         return {kind: found / stated for kind, (found, stated) in totals.items() if stated > 0}
-
-    def under_own_noise(self, bundle: Bundle) -> Bundle:
-        """``bundle`` solved under all noise of the poses that the drive shows, for tests of its inputs."""
-        start = bundle.solution.cam_from_vehicle
-        problem = replace(bundle.problem, pose_sigma=self._own_noise, cam_from_vehicle=start)
-        return replace(bundle, problem=problem, solution=solve(problem, bundle.model.solver))
 
     def _reweigh(self, bundle: Bundle) -> None:
         """Scale the observations' variances as their residuals under ``bundle`` say."""

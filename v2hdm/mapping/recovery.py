@@ -237,6 +237,9 @@ def _evidence(
     factors, window_s = _along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
     innovations = pose_innovations(settled.solution)
     largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
+    stated_m = max(sigma.position_m for sigma in settled.problem.pose_sigmas)
+    twist = settled.problem.twist_vehicle
+    speed_mps = 0.0 if twist is None else float(np.median(np.hypot(twist[:, 0], twist[:, 1])))
     return SolveEvidence(
         score_tests=found,
         corrected=tuple(corrected),
@@ -250,6 +253,9 @@ def _evidence(
         worst_innovation=float(largest.max()),
         worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
         clock_s=_clocks(final),
+        # Noise of a coordinate is a mean of both: along the way alone its variance is twice as large.
+        jitter_s=math.sqrt(2) * stated_m * optimiser.pose_noise.get("position_m", 0.0) / max(speed_mps, 0.1),
+        along_over_across=innovations.along_over_across,
     )
 
 

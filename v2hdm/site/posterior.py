@@ -35,11 +35,8 @@ from v2hdm.site.shapes import (
 OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, PIECE, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(8)
 """Hypotheses about a candidate; the first six are markings."""
 
-_PRIOR_COUNT = np.array([14.0, 0.25, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
-"""Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says.
-
-An end that is worn looks like a dash of another length, and is twice as common.
-"""
+_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
+"""Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
 
 _KINDS = len(_PRIOR_COUNT)
 

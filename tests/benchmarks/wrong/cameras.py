@@ -163,7 +163,7 @@ def _sizes(**sizes: list[float]) -> Callable[[MappingOptions], MappingOptions]:
 
 def camera_faults() -> list[Fault]:
     """What can be wrong with cameras, images and settings."""
-    lens, distortion, clock = "focal|camera_info|intrinsic", "distortion|lens", "clock|late|stamps"
+    lens, distortion, clock = "focal|camera_info|square pixels", "distortion", r"\bclock|\bstamps?\b"
     return [
         Fault("front and rear images swapped", "swapped|other way|backward", _swap_cameras),
         Fault("one camera's images given twice", "twice|identical|swapped|other way", _one_camera_twice),
@@ -179,37 +179,37 @@ def camera_faults() -> list[Fault]:
         Fault("distortion of the wrong sign", distortion, partial(edit_lens, partial(_distortion, -1.0))),
         Fault(
             "survey: wrong sign of x",
-            "survey|centre",
+            r"\bsurvey|\bcentre",
             partial(edit_cameras, partial(_survey, (-1.0, 1.0, 1.0), (0.0, 0.0, 0.0))),
         ),
         Fault(
             "survey: 10 cm too high",
-            "survey|centre|height",
+            r"\bsurvey|\bcentre|camera height",
             partial(edit_cameras, partial(_survey, (1.0, 1.0, 1.0), (0.0, 0.0, 0.1))),
         ),
         Fault(
             "survey: 30 cm ahead",
-            "survey|centre",
+            r"\bsurvey|\bcentre",
             partial(edit_cameras, partial(_survey, (1.0, 1.0, 1.0), (0.3, 0.0, 0.0))),
-            hidden_on_straight="survey|centre|forward",
+            hidden_on_straight=r"\bsurvey|\bcentre",
         ),
         Fault("guess: pitch 10 deg off", None, partial(_turn_guess, axis=1, angle_deg=10.0)),
         Fault("guess: yaw 10 deg off", None, partial(_turn_guess, axis=2, angle_deg=10.0)),
-        Fault("guess inverted", "invers|cam_from_vehicle", _invert_guess),
+        Fault("guess inverted", r"invers|cam_from_vehicle|\bguess\b", _invert_guess),
         Fault("ROI behind the camera", "roi", partial(edit_cameras, partial(_roi, np.negative))),
         Fault("ROI of half a metre", "roi", partial(edit_cameras, partial(_roi, _tiny))),
         Fault("ROI of 60 m", None, partial(edit_cameras, partial(_roi, _wide))),
-        Fault("images upside down", "upside|rotated|turned", partial(_pictures, _upside_down)),
+        Fault("images upside down", "upside|rotated|turned by 180", partial(_pictures, _upside_down)),
         Fault("images mirrored", "mirror", partial(_pictures, _mirrored)),
-        Fault("images overexposed", "clip|expos|bright|satur", partial(_pictures, _overexposed)),
+        Fault("images overexposed", "clipped|exposed|bright", partial(_pictures, _overexposed)),
         Fault("images frozen for 15 frames", "frozen|repeat|identical", _frozen_images),
         Fault("stamps and images off by one", clock, _off_by_one, hidden_on_straight=clock),
         Fault("every second image missing", None, _every_second),
         Fault("linear_response wrong", None, partial(edit_cameras, _linear)),
         Fault(
             "known_sizes 10 % too large",
-            "known_sizes|size",
+            "known_sizes",
             mapping=_sizes(diamond=[1.1, 0.77], lane_dash=[2.2, 0.13]),
         ),
-        Fault("known_sizes 5 % too small", "known_sizes|size", mapping=_sizes(diamond=[0.95, 0.665])),
+        Fault("known_sizes 5 % too small", "known_sizes", mapping=_sizes(diamond=[0.95, 0.665])),
     ]

@@ -82,10 +82,10 @@ def frame_faults() -> list[Fault]:
         Fault("ten images mixed up", order, partial(_edit_list, _mix)),
         Fault("two images exchanged", None, partial(_edit_list, _exchange_two)),
         Fault("ten images of each camera exchanged", None, _exchange_cameras),
-        Fault("RTK lost for 2 s, no poses", "pose|gap", partial(edit_poses, partial(_lost, 2.0))),
+        Fault("RTK lost for 2 s, no poses", r"\bgap|without pose", partial(edit_poses, partial(_lost, 2.0))),
         Fault(
             "RTK lost for 4 s, 2 m off",
-            "jump|position|pose",
+            r"\bjump|\bposition|\bfix\b",
             partial(edit_poses, partial(_drifting, 2.0, 4.0)),
         ),
     ]

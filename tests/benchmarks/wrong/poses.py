@@ -119,7 +119,7 @@ def _noise(folder: Path, **values: float) -> None:
 
 def poses_faults() -> list[Fault]:
     """What can be wrong with times and poses."""
-    clock = "clock|late|stamps"
+    clock = r"\bclock|\bstamps?\b"
     return [
         Fault("clock: all 30 ms late", clock, partial(_later, 0.03, CAMERAS), hidden_on_straight=clock),
         Fault("clock: all 60 ms early", clock, partial(_later, -0.06, CAMERAS), hidden_on_straight=clock),
@@ -128,7 +128,9 @@ def poses_faults() -> list[Fault]:
         Fault("clock: rear 60 ms late", clock, partial(_later, 0.06, ("rear",)), hidden_on_straight=clock),
         Fault("clock: all 400 ms late", clock, partial(_later, 0.4, CAMERAS), hidden_on_straight=clock),
         Fault(
-            "axes swapped", "axes|swapped|north|mirror", partial(edit_poses, lambda t, p: (t, _swap_axes(p)))
+            "axes swapped",
+            r"\baxes|swapped|mirror",
+            partial(edit_poses, lambda t, p: (t, _swap_axes(p))),
         ),
         Fault(
             "yaw clockwise from north",
@@ -157,43 +159,51 @@ def poses_faults() -> list[Fault]:
             "invers|vehicle_from_map",
             partial(edit_poses, lambda t, p: (t, np.linalg.inv(p))),
         ),
-        Fault("pose stamps in ns", "nanosec|ns|unit", partial(_scaled_stamps, factor=1e9, of_poses=True)),
-        Fault("image stamps in ms", "millisec|ms|unit", partial(_scaled_stamps, factor=1e3, of_poses=False)),
+        Fault(
+            "pose stamps in ns",
+            r"nanosec|\bunit|not seconds",
+            partial(_scaled_stamps, factor=1e9, of_poses=True),
+        ),
+        Fault(
+            "image stamps in ms",
+            r"millisec|\bunit|not seconds",
+            partial(_scaled_stamps, factor=1e3, of_poses=False),
+        ),
         Fault("latitude and longitude as metres", "degree|latitude", partial(edit_poses, _as_degrees)),
-        Fault("positions in feet", "feet|scale|unit", partial(edit_poses, _as_feet)),
+        Fault("positions in feet", "feet", partial(edit_poses, _as_feet)),
         Fault("heights of 46.2 m", None, partial(edit_poses, partial(_raise, 46.2))),
         Fault("heights of 1.8 m", None, partial(edit_poses, partial(_raise, 1.8))),
         Fault("grade of 0.3 %", None, partial(edit_poses, partial(_tilt, 0.003))),
         Fault("grade of 1 %", None, partial(edit_poses, partial(_tilt, 0.01))),
-        Fault("z axis down", "z axis|upside|down", partial(edit_poses, _z_down)),
+        Fault("z axis down", r"z axis|upside|\bz\b.* down", partial(edit_poses, _z_down)),
         Fault(
             "position jumps 0.5 m for 15 m",
-            "jump|position|fix",
+            r"\bjump|\bposition|\bfix\b",
             partial(edit_poses, partial(_jump, 0.5, 15.0)),
         ),
         Fault(
             "float solution of 0.3 m",
-            "position|noise|float",
+            r"\bpositions?\b|noise|scatter|\bfloat",
             partial(edit_poses, partial(_float_solution, 0.3)),
         ),
-        Fault("poses frozen for 3 s", "frozen|repeat|jump|stand", partial(edit_poses, _frozen_poses)),
+        Fault("poses frozen for 3 s", "frozen|repeat|jump|stands", partial(edit_poses, _frozen_poses)),
         Fault(
             "antenna 1.2 m ahead of the axle",
-            "antenna|lever|survey|centre",
+            r"antenna|lever|\bsurvey|\bcentre|\borigin",
             partial(edit_poses, partial(_lever, 1.2, 0.0)),
-            hidden_on_straight="antenna|lever|survey|centre|forward",
+            hidden_on_straight=r"antenna|lever|\bsurvey|\bcentre|\borigin",
         ),
         Fault(
             "antenna 0.8 m to the left",
-            "antenna|lever|survey|centre",
+            r"antenna|lever|\bsurvey|\bcentre|\borigin",
             partial(edit_poses, partial(_lever, 0.0, 0.8)),
-            hidden_on_straight="antenna|lever|survey|centre|left",
+            hidden_on_straight=r"antenna|lever|\bsurvey|\bcentre|\borigin",
         ),
-        Fault("pose_noise: heading 0.15", "pose_noise|heading_rad", partial(_noise, heading_rad=0.15)),
-        Fault("pose_noise: position 2.0", "pose_noise|position_m", partial(_noise, position_m=2.0)),
+        Fault("pose_noise: heading 0.15", r"\bnoise\b|heading_rad", partial(_noise, heading_rad=0.15)),
+        Fault("pose_noise: position 2.0", r"\bnoise\b|position_m", partial(_noise, position_m=2.0)),
         Fault(
             "pose_noise a tenth of the truth",
-            "pose_noise|noise",
+            r"noise|scatter",
             partial(
                 _noise,
                 position_m=0.001,

@@ -38,6 +38,7 @@ HIDES: Mapping[str, tuple[str, ...]] = {
     "repeated poses": (*_STEPS, *_GROUND),
     "pose scatter": ("position jumps", *_GROUND),
     "position jumps": _GROUND,
+    "pose stamps": ("pose scatter", *_GROUND),
     "pose noise": _GROUND,
     "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),

@@ -31,6 +31,7 @@ _HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the 
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
 _TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
 _GRADE_CHANGE_RAD = 0.02  # grades must spread over this (2 %) before the sign of the pitch is observable
+_PITCH_SIGMAS = 4.0  # that the pitch must go against the grade by: heights err, and grades with them
 _RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a float solution
 # Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
 _HEADING_RAD = 0.035
@@ -190,10 +191,11 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
 
 def _jump(which: str, motion: Motion, values: FloatArray, limit: FloatArray) -> Finding:
     """The worst of all offsets of values (P, D), m, from the line between their neighbours, by its limit."""
-    part = (motion.interval_s[:-1] / (motion.interval_s[:-1] + motion.interval_s[1:]))[:, None]
-    off = values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2]))
+    off = _off_neighbours(motion, values)
     size = np.linalg.norm(off, axis=1)
     worst = int(np.argmax(size / limit))
+    if size[worst] > limit[worst] and (jitter := _jitter(motion, off)) is not None:
+        return jitter
     count = int((size > limit).sum())
     # a step shows as half of it before and minus half of it behind.
     beside = off[max(worst - 1, 0) : worst + 2]
@@ -204,6 +206,35 @@ def _jump(which: str, motion: Motion, values: FloatArray, limit: FloatArray) -> 
         wrong=f"the {which} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such "
         "records): the receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
     )  # fmt: skip
+
+
+def _off_neighbours(motion: Motion, values: FloatArray) -> FloatArray:
+    """How far values (P, D) are off the line between their neighbours (P - 2, D)."""
+    part = (motion.interval_s[:-1] / (motion.interval_s[:-1] + motion.interval_s[1:]))[:, None]
+    return np.asarray(values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2])))
+
+
+def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
+    """That stamps scatter, where positions are ``off`` (P - 2, D) along the way alone, and none stands out.
+
+    A lost fix moves a few records, and any way; a late stamp moves each, and only along the way.
+    """
+    ahead = motion.rotation[1:-1, :2, 0]
+    driven = motion.moving[:-1] & motion.moving[1:]
+    if off.shape[1] != 2 or not driven.any():
+        return None
+    along = (off * ahead).sum(axis=1)[driven]
+    across = (off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])[driven]
+    along_m, across_m = _robust_sigma(along), _robust_sigma(across)
+    if not 0 < _UNDERSTATED * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
+        return None
+    # What lies between two neighbours that err as much is off by sqrt(1 + 1/4 + 1/4) sigmas.
+    jitter_ms = 1e3 * float(np.sqrt((along_m**2 - across_m**2) / 1.5) / np.median(motion.speed_mps))
+    says = (
+        f"the stamps of the poses jitter by {jitter_ms:.0f} ms: positions scatter {along_m / across_m:.0f} "
+        "times as much along the way as across it; stamp poses when they are measured, not when they arrive"
+    )
+    return Finding("pose stamps", Status.FAIL, jitter_ms, None, "ms", says, "poses")
 
 
 def check_attitude(motion: Motion) -> Iterator[Finding]:
@@ -235,8 +266,11 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
     if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
         return
     slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
+    # Chords overlap: those of the way that do not are so many.
+    apart = max(float(motion.step_m[motion.moving].sum()) / _CHORD_M, 1.0)
+    sigma = float(np.std(middle + slope * grade_rad) / np.std(grade_rad) / np.sqrt(apart))
     yield judge(
-        "pitch sign", "poses", 1 - slope, 1.0, "",
+        "pitch sign", "poses", 1 - slope - _PITCH_SIGMAS * sigma, 1.0, "",
         fine="the pitch follows the grade",
         wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
         "down (a rotation about y, which points left)",
@@ -257,8 +291,25 @@ def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
     if position_m is not None and noise.position_m > 0:
         findings.append(_against("position_m", position_m, noise.position_m, "m"))
     if heading_rad is not None and noise.heading_rad > 0:
-        findings.append(_against("heading_rad", heading_rad, noise.heading_rad, "rad"))
+        scatter = _against("heading_rad", heading_rad, noise.heading_rad, "rad")
+        by_course = scatter.status is not Status.PASS and _is_course(motion, heading_rad)
+        findings.append(_course(heading_rad) if by_course else scatter)
     return findings
+
+
+def _is_course(motion: Motion, scatter_rad: float) -> bool:
+    """Whether the heading's scatter from pose to pose is mostly that of the course, so of positions."""
+    ahead, at = motion.rotation[1:-1, :2, 0], motion.position[:, :2]
+    courses = (at[1:-1] - at[:-2], at[2:] - at[1:-1], at[2:] - at[:-2])
+    return min(_robust_sigma(_fourth(angle_between(ahead, one))) for one in courses) < scatter_rad / 2
+
+
+def _course(scatter_rad: float) -> Finding:
+    says = (
+        f"the heading is the course from position to position, with their scatter of {scatter_rad:.2g} rad,"
+        " and not the vehicle's; record the heading of the vehicle, as two antennas or an INS measure it"
+    )
+    return Finding("heading", Status.FAIL, scatter_rad, None, "rad", says, "poses")
 
 
 def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: str) -> Finding:

@@ -127,7 +127,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
     causes: list[Finding] = []
     symptoms: list[Finding] = []
     if best.evidence is not None:
-        causes = check_inputs(best.evidence)
+        causes = [*_stamps(best.evidence), *check_inputs(best.evidence)]
         symptoms = [*check_fit(best.evidence), _excluded(best)]
     symptoms += check_doubles(best)
     if len(methods) > 1:
@@ -272,6 +272,17 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         )  # fmt: skip
     if evidence.pose_noise:
         yield from _poses(evidence)
+
+
+def _stamps(evidence: SolveEvidence) -> Iterator[Finding]:
+    """Stamps that scatter: the poses err more than stated, from image to image, and only along the way."""
+    ratio = evidence.along_over_across
+    if evidence.pose_noise.get("position_m", 0.0) > _POSE_NOISE_LIMIT < ratio:
+        says = (
+            f"the stamps of the images jitter by {1e3 * evidence.jitter_s:.0f} ms: poses err {ratio:.0f} "
+            "times as much along the way as across it: stamp images when exposed, not when they arrive"
+        )
+        yield Finding("image stamps", Status.FAIL, ratio, _POSE_NOISE_LIMIT, "", says, "poses")
 
 
 def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
