@@ -111,8 +111,8 @@ class SurveyOptions:
 class MappingOptions:
     """Everything about the mapping but the solver's own settings.
 
-    Observations farther than ``max_range_m`` from the camera are left out: by default none, since a far one
-    weighs what its covariance on the ground says. ``model_floor_px`` is
+    Observations farther than ``max_range_m`` from the camera are left out: of a repainted site they would tie
+    the old place of a marking to its new one. ``model_floor_px`` is
     added to every corner's covariance for what no corner fit knows of: lens, shutter, flatness.
     ``pose_model`` says what of each frame's pose is estimated along with the map: ``paper``, nothing;
     ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
@@ -124,7 +124,7 @@ class MappingOptions:
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
 
-    max_range_m: float = 100.0
+    max_range_m: float = 16.0
     model_floor_px: float = 0.15
     mode: str = BATCH
     pose_model: str = AUTO
