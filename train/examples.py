@@ -118,14 +118,15 @@ def photograph(image: LabelledImage, config: DataConfig, rng: np.random.Generato
     camera = camera_from_calibration(rough_calibration("photo", width, height, up_m, pitch_deg, fov_deg))
     labels, unknown = paint_labels(image, Place.whole(width, height))
     names = (*CORNERED_CLASSES, *OUTLINED_CLASSES)
+    silent = [k for k in PAINT_CLASSES if config.coco_complete is not None and k not in config.coco_complete]
     markings = []
     for shape in image.shapes or ():
         if NOT_PAINT in shape.kinds:
             continue
         kind = shape.kinds[0] if shape.kinds[0] in names else ANY
         for ring_px in shape.rings_px:
-            markings.append(TrueMarking(kind, ring_px, np.nan, kind != ANY))
-    silent = [k for k in PAINT_CLASSES if config.coco_complete is not None and k not in config.coco_complete]
+            # Where labels are silent on a class they do not tell it from others either.
+            markings.append(TrueMarking(kind, ring_px, np.nan, kind != ANY and kind not in silent))
     return Example(pixels, camera, markings, [], [], unknown & (labels == 0), tuple(silent))
 
 
