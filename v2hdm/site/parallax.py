@@ -27,6 +27,9 @@ NOT_ON_GROUND = "stands above the ground, or moves"
 _ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
 """Mean and sigma of s of what is no marking: half as high as the camera, or moving along with the vehicle."""
 
+_UNEVEN = 0.1
+"""Sigma of s on the ground: a bump of a tenth of the camera's height, or edges fitted worse from afar."""
+
 _ONE_VIEW_M = 0.1
 """Way, m, within which images show one view, so that they err alike: the same texture lies along an edge."""
 
@@ -105,7 +108,7 @@ class Parallax:
         # What stands upright is not as high everywhere: half of the variance is that of each point.
         apart = (np.ones((count, count)) + np.eye(count)) / 2
         elsewhere = [_log_normal(self.slope - at, self.covariance + own**2 * apart) for at, own in _ELSEWHERE]
-        ground = _log_normal(self.slope - 1, self.covariance)
+        ground = _log_normal(self.slope - 1, self.covariance + _UNEVEN**2 * apart)
         return np.asarray(ground - np.logaddexp(*elsewhere) + np.log(len(_ELSEWHERE)))
 
     def objections(self, min_probability: float) -> list[str | None]:
