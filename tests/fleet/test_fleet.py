@@ -229,7 +229,7 @@ def test_files_that_make_no_site_are_one_row_that_says_why(tmp_path):
     tuesday.write_text(tuesday.read_text() + "mapping: {max_range_m: 9.0}\n")
     (row,) = plan_site([monday, tuesday], [], "port").refused
     assert (row.drive, row.status) == ("port", "ERROR")
-    assert "tuesday.yaml: mapping.max_range_m is 9.0, and 100.0 in" in row.says
+    assert "tuesday.yaml: mapping.max_range_m is 9.0, and 16.0 in" in row.says
     assert plan_site([monday, tuesday], ["mapping.max_range_m=9.0"], "port").jobs
     rendered = tmp_path / "rendered.yaml"
     rendered.write_text("# @package _global_\nname: rendered\nsimulate: {}\n")
