@@ -1,4 +1,4 @@
-"""What the shipped network sees in photographs whose labels leave something unsaid.
+"""The shipped network fills in where the labels of photographs leave something unsaid.
 
 A label set may leave far or worn paint out, may call all lines alike, and may draw one outline about a whole
 crosswalk. There the shipped network is asked: paint that it sees and that nobody labelled is unknown rather

@@ -208,7 +208,7 @@ class Place:
         return (points_px + 0.5 - self.corner_px) * self.scale - 0.5
 
     def sampled(self, cells: np.ndarray) -> BoolArray:
-        """What a plane of cells of 4 px of the image says of the window's pixels (height, width)."""
+        """The values of a plane of cells of 4 px of the image at the window's pixels (height, width)."""
         u = (np.arange(self.width) + 0.5) / self.scale[0] + self.corner_px[0]
         v = (np.arange(self.height) + 0.5) / self.scale[1] + self.corner_px[1]
         column = np.minimum((u / CELL_PX).astype(np.intp), cells.shape[1] - 1)

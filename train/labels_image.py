@@ -37,7 +37,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Silence:
-    """What a label set leaves unsaid, as 1-bit planes of cells of 4 px: see :mod:`train.label_hints`.
+    """The gaps of a label set, as 1-bit planes of cells of 4 px: see :mod:`train.label_hints`.
 
     ``paint`` are the cells that the shipped network takes for paint, ``unknown`` those of them that may be
     paint that nobody labelled; both are packed rows of ``shape`` (h, w).

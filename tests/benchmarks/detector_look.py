@@ -1,4 +1,4 @@
-"""What the shipped detector sees, drawn: ``docs/detector_look.jpg`` of the detector's page.
+"""Draws what the shipped detector sees: ``docs/detector_look.jpg`` of the detector's page.
 
     python -m tests.benchmarks.detector_look OUT.jpg
 

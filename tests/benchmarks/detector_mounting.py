@@ -128,7 +128,7 @@ def _kind(name: str, polygon_px: FloatArray, mounting: tuple[float, float, float
 
 
 def mountings(folder: Folder) -> Iterator[tuple[str, tuple[float, float, float] | None]]:
-    """What is stated, by name."""
+    """The stated mounting, by name."""
     height_m, pitch_deg, fov_deg = folder.mounting
     yield "nothing stated", None
     yield "stated", folder.mounting

@@ -56,7 +56,7 @@ class Labels:
         return np.asarray(cv2.dilate(mask, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)))
 
     def small(self) -> np.ndarray:
-        """What is labelled, (256, 256) bool."""
+        """The labelled area, (256, 256) bool."""
         mask = np.zeros((SMALL, SMALL), np.uint8)
         for polygon in self.polygons:
             cv2.fillPoly(mask, [np.round(polygon * (SMALL / WIDTH, SMALL / HEIGHT)).astype(np.int32)], 1)
@@ -80,7 +80,7 @@ def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
 
 
 class Tally:
-    """What has been counted so far."""
+    """Counts over images, added up one by one."""
 
     def __init__(self) -> None:
         self.count: Counter[tuple[str, int]] = Counter()

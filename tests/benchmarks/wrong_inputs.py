@@ -159,7 +159,7 @@ def judge(drive: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
 
 
 def _clause(finding: dict[str, Any]) -> str:
-    """What a finding names, without the recovery, which may speak of other causes."""
+    """The cause that a finding names; the recovery is left out, since it may speak of other causes."""
     return f"{finding['check']} {re.split('; |: (?:check|mend|see) ', finding['says'])[0]}"
 
 

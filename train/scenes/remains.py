@@ -1,4 +1,4 @@
-"""What looks like a marking on the ground and is none: litter, leaves, markings that were removed."""
+"""Draws on the ground what looks like a marking and is none: litter, leaves, markings that were removed."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def _wheel(picture: Picture, middle: float, radius: float, rim: Bgr) -> None:
 
 
 def _colour(rng: np.random.Generator) -> Bgr:
-    """Of a vehicle: white, grey or black mostly."""
+    """The colour of a vehicle: white, grey or black mostly."""
     grey = float(rng.choice([rng.uniform(0.5, 0.8), rng.uniform(0.02, 0.5)]))
     if rng.random() < 0.6:
         return grey, grey, grey

@@ -1,4 +1,4 @@
-"""What lies between the scene and the sensor: glare, wet reflections, the own vehicle, what is on its glass.
+"""Draws what lies between scene and sensor: glare, wet reflections, the own vehicle, what is on its glass.
 
 All of it is drawn on the radiance that reaches the lens, so that blur and noise of the sensor come after.
 """
@@ -32,7 +32,7 @@ _LEAST_MIRRORED_PX = 8
 def before_lens(
     for_weather: np.random.Generator, for_vehicle: np.random.Generator, scene: Scene, own_vehicle: float
 ) -> BeforeLens:
-    """What the weather and, in a share ``own_vehicle`` of images, the own vehicle add to the radiance."""
+    """Light that the weather and, in a share ``own_vehicle`` of images, the own vehicle add."""
 
     def draw(view: View, radiance: Float32, hidden: Hidden) -> None:
         if scene.ground.wet_fraction >= RAINED_FRACTION:

@@ -452,7 +452,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
 
 
 def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest]:
-    """Of inputs that may change at many frames only the likeliest, which had so many chances (Sidak)."""
+    """Keep the likeliest frame of each input that may change; Sidak corrects for the others."""
     kept = [one for _, one in found if one.fault not in CHANGES]
     changes: dict[tuple[Fault, int, int], list[tuple[_Answer, ScoreTest]]] = {}
     for answer, one in found:

@@ -141,7 +141,7 @@ class MountingEstimate:
 
     @property
     def mounting(self) -> Mounting:
-        """What is known by now; the standard deviations leave out an image's own pitch."""
+        """The mounting as known by now; its standard deviations leave out an image's own pitch."""
         belief = np.exp(self._log_belief - self._log_belief.max())
         belief /= belief.sum()
         moments = [
