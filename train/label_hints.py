@@ -26,14 +26,14 @@ CELL_PX = 4
 """Planes of hints have a cell for so many px, as the network's classes do."""
 
 _HINT = 0.3
-"""Paint is hinted at from this probability on: half of the true paint that the network misses on photographs
-by a hard decision lies between this and a half."""
+"""Paint is hinted at from this probability on: lower than a decision, for what it hints at is only left open.
+Chosen, not measured."""
 
 _SURE = 0.8
 """A class is taken from this posterior probability on, otherwise it stays unknown."""
 
 _LABELLED_M = 30.0
-"""Beyond this range nobody labels completely; a diamond of 2 m is 3 px tall there."""
+"""Beyond this range nobody labels completely; a diamond of 2 m is 2 px tall there."""
 
 Tell = Callable[[float], None]
 
