@@ -38,6 +38,9 @@ TALL_PX = ((24.0, np.inf), (12.0, 24.0))
 SMALL = 256
 PUBLISHED = ".628 / .747"
 
+OF_PIECES = frozenset({"crosswalk_outline", "bus_lane", "yellow_box", "slow", "bicycle"})
+"""Labels that outline many pieces of paint and the bare ground between them."""
+
 _SYMBOLS = ("diamond", *SHIPPED.of_family(SYMBOL))
 
 
@@ -55,12 +58,14 @@ class Labels:
             cv2.fillPoly(mask, [np.round(polygon).astype(np.int32)], 1)
         return np.asarray(cv2.dilate(mask, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)))
 
-    def small(self) -> np.ndarray:
-        """The labelled area, (256, 256) bool."""
-        mask = np.zeros((SMALL, SMALL), np.uint8)
-        for polygon in self.polygons:
-            cv2.fillPoly(mask, [np.round(polygon * (SMALL / WIDTH, SMALL / HEIGHT)).astype(np.int32)], 1)
-        return mask > 0
+    def small(self) -> tuple[np.ndarray, np.ndarray]:
+        """The labelled area, and what outlines of many pieces enclose, (256, 256) bool each."""
+        masks = np.zeros((2, SMALL, SMALL), np.uint8)
+        for name, polygon in zip(self.names, self.polygons, strict=True):
+            ring = np.round(polygon * (SMALL / WIDTH, SMALL / HEIGHT)).astype(np.int32)
+            for mask in masks[: 1 + (name in OF_PIECES)]:
+                cv2.fillPoly(mask, [ring], 1)
+        return masks[0] > 0, masks[1] > 0
 
 
 def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
@@ -145,7 +150,7 @@ def main() -> None:
     labelled = dict(list(read(parsed.labels, tuple(parsed.role)).items())[: parsed.limit])
     options = DetectorOptions(model=parsed.model)
     network = Network(Path(parsed.model) if parsed.model else None)
-    tally, both, either, true, said = Tally(), 0, 0, 0, 0
+    tally, areas = Tally(), np.zeros((2, 4), dtype=np.int64)
     with tempfile.TemporaryDirectory() as folder:
         for name in labelled:
             image = cv2.imread(str(parsed.images / name))
@@ -158,13 +163,16 @@ def main() -> None:
             paint = cv2.resize(
                 network.run(seen.frame.pixels).paint, (SMALL, SMALL), interpolation=cv2.INTER_AREA
             )
-            truth = labels.small()
-            both += int((truth & (paint > 0)).sum())
-            either += int((truth | (paint > 0)).sum())
-            true, said = true + int(truth.sum()), said + int((paint > 0).sum())
+            truth, of_pieces = labels.small()
+            for row, known in enumerate((np.ones_like(truth), ~of_pieces)):
+                true, said = truth & known, (paint > 0) & known
+                areas[row] += [each.sum() for each in (true & said, true | said, true, said)]
     print(f"{tally.images} images, mounting {parsed.mounting or 'not stated'}")
     tally.print()
-    print(f"paint: IoU / F1 {both / either:.3f} / {2 * both / (true + said):.3f} (published {PUBLISHED})")
+    for (both, either, true, said), how in zip(
+        areas, (f"filled (published {PUBLISHED})", "left out"), strict=True
+    ):
+        print(f"paint: IoU / F1 {both / either:.3f} / {2 * both / (true + said):.3f}, outlines {how}")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,15 @@ from v2hdm.site.candidates import Candidates, Counts, Dissent, with_dissent
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
-from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, PIECE, posterior
+from v2hdm.site.posterior import (
+    CLUTTER,
+    OF_CLASS,
+    OTHER_LENGTH,
+    PART_OF_SYMBOL,
+    PIECE,
+    WRONG_END,
+    posterior,
+)
 from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
@@ -121,14 +129,41 @@ def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_d
 
 def test_a_worn_end_is_not_taken_for_the_end_of_the_paint():
     true, candidates = row(5, [DASH] * 60, 0.005)
-    for worn in (10, 20, 30, 40):
-        k = int(np.argmax(np.linalg.norm(np.roll(true[worn], -1, axis=0) - true[worn], axis=1)))
-        for corner, other in ((k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)):
-            candidates.corners_map[worn, corner] += 0.12 * (true[worn, other] - true[worn, corner])
+    for worn, share in ((10, 0.07), (20, 0.12), (30, 0.16), (40, 0.22)):
+        wear_off(candidates, true, worn, share, 0.03)
     found = of_one_class(candidates)
     error = np.linalg.norm(found.candidates.corners_map - true, axis=2)
     assert (error < 3 * found.candidates.sigma_m).all()
     assert (found.log_odds > 5).all()
+
+
+def wear_off(candidates, true, place, share, sigma_m=0.0):
+    """Take a share of its length off one end of a dash, of which images then disagree by ``sigma_m``."""
+    k = int(np.argmax(np.linalg.norm(np.roll(true[place], -1, axis=0) - true[place], axis=1)))
+    for corner, other in ((k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)):
+        candidates.corners_map[place, corner] += share * (true[place, other] - true[place, corner])
+        rows = slice(2 * corner, 2 * corner + 2)
+        candidates.covariance_m2[place, rows, rows] += sigma_m**2 * np.eye(2)
+
+
+def test_an_end_on_which_images_disagree_is_likelier_worn_than_one_on_which_they_agree():
+    true, candidates = row(5, [DASH] * 60, 0.005)
+    wear_off(candidates, true, 10, 0.1)
+    wear_off(candidates, true, 20, 0.15, 0.05)
+    crisp, ragged = of_one_class(candidates).probability[[10, 20], WRONG_END]
+    assert ragged > 0.9
+    assert crisp < 0.5
+
+
+def test_a_length_that_several_dashes_have_is_no_wear():
+    alone, repeated = (
+        solved(
+            painted([DASH] * 50 + [DASH * [0.7, 1.0]] * count, rng := np.random.default_rng(6)), rng, 0.005
+        )
+        for count in (1, 5)
+    )
+    others = [of_one_class(candidates).probability[50:, OTHER_LENGTH] for candidates in (alone, repeated)]
+    assert others[1].min() > 0.95 > others[0].max()
 
 
 def moved_end(candidates, place, along, slant=0.0):

@@ -298,7 +298,8 @@ def with_side_seams(
         lengths_m = np.linalg.norm(sides, axis=1)
         k = int(rng.choice(len(polygon), p=lengths_m / lengths_m.sum()))
         before_m, after_m = rng.exponential(1.0, 2)
-        along_m = np.arange(-before_m, lengths_m[k] + after_m, _SEAM_STEP_M)
+        reach_m = before_m + lengths_m[k] + after_m
+        along_m = np.linspace(-before_m, lengths_m[k] + after_m, 2 + int(reach_m / _SEAM_STEP_M))
         line = polygon[k] + along_m[:, None] * sides[k] / lengths_m[k]
         rough_m = rng.uniform(0, 0.012) * np.cumsum(rng.normal(0, 1, len(line)))
         seams.append(_beside(line, rng.normal(0, 0.03) + rough_m - rough_m.mean()))

@@ -46,6 +46,17 @@ _SIZE_SIGMA_M = 1.0
 _LENGTH_SIGMA_M = 0.3
 """Sigma, m, of the length of paint that is rolled by the metre: a tenth of a dash's."""
 
+_REPEATED_COUNT = 1.0
+"""Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
+
+_SOUND_SPREAD, _WORN_SPREAD = (0.0, 0.4), (1.5, 0.7)
+"""Mean and sigma of the logarithm of how uncertain an end is beside a typical one of its class: images of a
+sound end agree, a worn one ends elsewhere in each (229 sound ends and 10 worn ones of a rendered port)."""
+
+_UNCLEAR_SHARE, _CLEAR_SHARE = 0.05, 0.1
+"""Share of the sound ends that are as uncertain as worn ones, being far off, and of the worn ones that all
+images show alike (5 of 229 and 1 of 11 ends there)."""
+
 _MISPLACED_M = 0.3
 """Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
 
@@ -132,10 +143,10 @@ def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posteri
 def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     """The posterior of the candidates of one class, which together say what its markings are like."""
     share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
-    weight = _weight_before(candidates, counts)
+    weight, probability = _weight_before(candidates, counts), np.zeros((len(candidates), _KINDS))
     for _ in range(_PASSES):
         shapes = learn_shapes(candidates.subset(weight > 0.5))
-        hypotheses = _hypotheses(candidates, shapes, share, paint)
+        hypotheses = _hypotheses(candidates, shapes, share, paint, weight, probability[:, OTHER_LENGTH])
         by_kind, sources = np.array([one.kind for one in hypotheses]), _counted(counts, weight)
         shaped = np.stack([one.log_likelihood for one in hypotheses])
         joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
@@ -214,7 +225,7 @@ class _Hypothesis:
     In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
     laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced`` (..., 8,
     8), only along each of the K columns of ``one_way`` (N, 8, K) if given: paint wears inwards, and runs on
-    outwards.
+    outwards. ``beside`` (N,) is the log likelihood of what else is known of them.
     """
 
     kind: int
@@ -226,6 +237,7 @@ class _Hypothesis:
     misplaced: FloatArray
     paint_m2: float
     one_way: FloatArray | None
+    beside: FloatArray | float
 
     @cached_property
     def formal(self) -> FloatArray:
@@ -245,6 +257,7 @@ class _Hypothesis:
         """Marginal likelihood (N,) of the residual."""
         innovation, solved, squared = self.fit
         both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
+        both_ways = both_ways + self.beside
         if self.one_way is None:
             return np.asarray(both_ways)
         moved = self.directions @ self.one_way
@@ -273,9 +286,18 @@ def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _hypotheses(
-    candidates: Candidates, shapes: Sequence[Shape], share: FloatArray, paint: PaintError
+    candidates: Candidates,
+    shapes: Sequence[Shape],
+    share: FloatArray,
+    paint: PaintError,
+    weight: FloatArray,
+    other_length: FloatArray,
 ) -> list[_Hypothesis]:
-    """All that N candidates may be, given the shapes of their class."""
+    """All that N candidates may be, given the shapes of their class.
+
+    ``weight`` and ``other_length`` (N,) are the probabilities so far of being a marking, and one of another
+    length.
+    """
     out: list[_Hypothesis] = []
     nothing = np.zeros((8, 8))
 
@@ -286,13 +308,23 @@ def _hypotheses(
         scatter: FloatArray,
         misplaced: FloatArray = nothing,
         one_way: FloatArray | None = None,
+        beside: FloatArray | float = 0.0,
     ) -> None:
         off = (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
         residual = (laid.directions @ off)[..., 0]
         prior, paint_m2 = float(np.log(part * share[kind])), paint.sigma_m**2
         out.append(
             _Hypothesis(
-                kind, prior, candidates, laid.directions, residual, scatter, misplaced, paint_m2, one_way
+                kind,
+                prior,
+                candidates,
+                laid.directions,
+                residual,
+                scatter,
+                misplaced,
+                paint_m2,
+                one_way,
+                beside,
             )
         )
 
@@ -304,18 +336,25 @@ def _hypotheses(
         add(OF_CLASS, part / 2, laid, scatter)
         add(OF_CLASS, part / 2, otherwise, scatter)
         ends = _inwards(laid.corners_map, shape.is_elongated)
+        worn = _worn_evidence(candidates, [end for end, _ in ends], weight)
         lengths, angles = [(1.0, scatter)], [[nothing]] * len(ends)
         if shape.is_elongated:
-            longer = scatter + _LENGTH_SIGMA_M**2 * _outer((ends[0][0] + ends[1][0]) / 2)
-            add(OTHER_LENGTH, part, laid, longer)
+            shorter = (ends[0][0] + ends[1][0]) / 2
+            longer = scatter + _LENGTH_SIGMA_M**2 * _outer(shorter)
+            again = _repeated(candidates, laid, shorter, shape.sigma_m, other_length)
+            add(OTHER_LENGTH, part, laid, longer, beside=again)
             other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
             lengths = [(1 - other, scatter), (other, longer)]
             angles = [[nothing, _slanted(laid.corners_map, end)] for end, _ in ends]
-        for (end, extent_m), cuts in zip(ends, angles, strict=True):
-            ways = (_MISPLACED_M * end, _WORN_SHARE * extent_m * end, -_RUN_ON_M * end)
-            for way, cut, (likely, size) in itertools.product(ways, cuts, lengths):
-                weight = part * likely / len(ends) / len(ways) / len(cuts)
-                add(WRONG_END, weight, laid, size, _outer(way) + cut, way[..., None])
+        for (end, extent_m), cuts, ragged in zip(ends, angles, worn, strict=True):
+            ways = (
+                (_MISPLACED_M * end, ragged),
+                (_WORN_SHARE * extent_m * end, ragged),
+                (-_RUN_ON_M * end, 0.0),
+            )
+            for (way, beside), cut, (likely, size) in itertools.product(ways, cuts, lengths):
+                each = part * likely / len(ends) / len(ways) / len(cuts)
+                add(WRONG_END, each, laid, size, _outer(way) + cut, way[..., None], beside)
         for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
             both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
             misplaced = both @ np.swapaxes(both, 1, 2) + _slanted(
@@ -331,6 +370,48 @@ def _hypotheses(
     add(PART_OF_SYMBOL, 1.0, own, any_size)
     add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8))
     return out
+
+
+def _worn_evidence(
+    candidates: Candidates, ends: Sequence[FloatArray], weight: FloatArray
+) -> list[FloatArray]:
+    """Log likelihood ratios (N,) that an end is worn rather than sound, by how far images disagree on it.
+
+    ``ends`` (N, 8) are motions inwards of two corners by 1 m each, in opposite pairs; what moves a pair alike
+    shifts the whole marking and does not count. ``weight`` (N,) says who is a marking.
+    """
+    whole = candidates.known.all(axis=1)
+    variance = [
+        _along(candidates.covariance_m2, end / 2, (end + ends[k ^ 1]) / 2) for k, end in enumerate(ends)
+    ]
+    sigma = 0.5 * np.log(np.maximum(variance, 0.0) + SHAPE_SIGMA_M**2)
+    off = sigma - np.median(sigma[:, weight * whole > 0.5])
+    worn, sound = norm.pdf(off, *_WORN_SPREAD), norm.pdf(off, *_SOUND_SPREAD)
+    odds = worn + _CLEAR_SHARE * (sound - worn)
+    odds /= sound + _UNCLEAR_SHARE * (worn - sound)
+    return list(np.where(whole, np.log(odds), 0.0))
+
+
+def _repeated(
+    candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
+) -> FloatArray:
+    """Log likelihood ratio (N,) of a length, as others have it, beside that of a length of its own.
+
+    ``shorter`` (N, 8) moves corners so that paint gets shorter by 1 m; of paint that has the length of its
+    own with the probabilities ``weight`` (N,) each may be repeated (a Dirichlet process).
+    """
+    off_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
+    own_m2 = _along(candidates.covariance_m2, shorter, shorter)
+    alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + _LENGTH_SIGMA_M**2))
+    apart = np.sqrt(own_m2 + own_m2[:, None] + 2 * sigma_m**2)
+    alike = weight * (1 - np.eye(len(weight))) * norm.pdf(off_m, off_m[:, None], apart)
+    drawn = (_REPEATED_COUNT * alone + alike.sum(axis=1)) / (_REPEATED_COUNT + weight.sum() - weight)
+    return np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
+
+
+def _along(covariance: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Covariances (N,) of what moves along two directions (N, 8) each."""
+    return np.asarray(np.einsum("ni,nij,nj->n", first, covariance, second))
 
 
 def _as_seen(candidates: Candidates) -> Laid:
