@@ -10,7 +10,14 @@ from train.augment import random_crop, random_photometry
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from train.scenes import scenes
-from train.scenes.hardships import Hardships, bleached, junction_approach, things_beside, tight_bend
+from train.scenes.hardships import (
+    Hardships,
+    bleached,
+    junction_approach,
+    things_beside,
+    tight_bend,
+    with_side_seams,
+)
 from train.scenes.letters import WORDS, word
 from train.scenes.paint import (
     Bend,
@@ -574,3 +581,12 @@ def test_photometry_changes_values_but_not_shape_or_type_or_its_input():
         assert out.shape == image.shape
         assert out.dtype == np.uint8
     np.testing.assert_array_equal(image, before)
+
+
+def test_seams_run_along_sides_however_short():
+    corners = 0.02 * np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]]) + [5.0, 0.0]
+    made = [
+        with_side_seams(np.random.default_rng(k), None, [Paint(kind=DIAMOND, polygon_map=corners)], 3.0)
+        for k in range(100)
+    ]
+    assert any(marks is not None and marks.factor.std() > 0 for marks in made)
