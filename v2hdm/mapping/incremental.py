@@ -47,13 +47,12 @@ _LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
 @dataclass(frozen=True)
 class Grown:
-    """The map so far: its markings as groups of sightings, of usable corners (S, 4).
+    """The map so far: its markings as groups of sightings.
 
     ``rig`` holds the extrinsics, and the poses as they were last solved for.
     """
 
     association: Association
-    usable: BoolArray
     rig: Rig
 
 
@@ -135,7 +134,7 @@ class IncrementalMapper:
             self._begin(rig, len(self._places))
             due *= _LINK_GROWTH
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
-        return Grown(association, usable, self._present_rig())
+        return Grown(association, self._present_rig())
 
     def _begin(self, rig: Rig, known: int) -> None:
         """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""

@@ -162,12 +162,13 @@ class Optimiser:
         )
         grown = mapper.run(progress)
         self.growth = tuple(mapper.growth)
-        bundle = self._solve(grown.association, grown.usable, grown.rig)
+        association = self._with_all_that_fit(grown.association, grown.rig)
+        bundle = self._solve(association, self._usable(association, grown.rig), grown.rig)
         self._reweigh(bundle)
         return self._weigh_poses(bundle)
 
     def _locate(self, rig: Rig) -> Located:
-        """Ground positions, restricted to the range within which observations are used."""
+        """Ground positions, restricted to the range within which sightings make groups."""
         located = locate(self._sightings, rig)
         with np.errstate(invalid="ignore"):
             near = located.range_m <= self._options.max_range_m
@@ -176,7 +177,7 @@ class Optimiser:
     def _usable(self, association: Association, rig: Rig) -> BoolArray:
         """Corners (S, 4) that a joint solve may use, given where their groups are."""
         jitter_rad = self._pose_noise.roll_pitch_rad
-        return in_view(association, self._locate(rig), self._sightings, rig, jitter_rad)
+        return in_view(association, locate(self._sightings, rig), self._sightings, rig, jitter_rad)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         noise = self._pose_noise
@@ -202,8 +203,13 @@ class Optimiser:
             max_distance_m=options.max_gate_m,
             shape_tolerance=options.shape_tolerance,
         )
-        fused = fuse_groups(merged, located, self._pose_noise.roll_pitch_rad)
-        return attach(merged, self._sightings, located, rig, fused, self._pose_noise.roll_pitch_rad)
+        return self._with_all_that_fit(merged, rig)
+
+    def _with_all_that_fit(self, association: Association, rig: Rig) -> Association:
+        """The groups with those sightings without one, however far off, that fit one of them alone."""
+        jitter_rad = self._pose_noise.roll_pitch_rad
+        fused = fuse_groups(association, self._locate(rig), jitter_rad)
+        return attach(association, self._sightings, locate(self._sightings, rig), rig, fused, jitter_rad)
 
     def _solve_steep(self, tracks: Association) -> Bundle:
         located = self._locate(self.initial_rig)

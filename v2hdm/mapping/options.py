@@ -111,9 +111,9 @@ class SurveyOptions:
 class MappingOptions:
     """Everything about the mapping but the solver's own settings.
 
-    Observations farther than ``max_range_m`` from the camera are left out: of a repainted site they would tie
-    the old place of a marking to its new one. ``model_floor_px`` is
-    added to every corner's covariance for what no corner fit knows of: lens, shutter, flatness.
+    Sightings farther than ``max_range_m`` from the camera start no marking, but join the one that alone they
+    fit: by themselves they would tie the old place of a repainted marking to its new one.
+    ``model_floor_px`` is added to every corner's covariance for what no corner fit knows of: lens, shutter.
     ``pose_model`` says what of each frame's pose is estimated along with the map: ``paper``, nothing;
     ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
     clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
