@@ -182,7 +182,9 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
         return []
     longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
     spare = 0.5 * _HARDEST_MPS2 * longest_s**2
-    usual = _EXTREME * noise.position_m / 2
+    # Poses that all scatter by so many times what is stated do not jump: their scatter is a check of its own.
+    scatter_m = max(map(_robust_sigma, _off_neighbours(motion, motion.position[:, :2]).T)) / np.sqrt(1.5)
+    usual = _EXTREME / 2 * float(np.clip(scatter_m, noise.position_m, _UNDERSTATED * noise.position_m))
     return [
         _jump("position", motion, motion.position[:, :2], usual + spare),
         _jump("height", motion, motion.position[:, 2:], _HEIGHT_NOISE * usual + spare),
