@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
     from rich.console import Console
 
-_EVERY_S = 10.0
-"""Between two lines on one task."""
+_EVERY_S = 10.0  # between two lines on one task
 
 
 Steps = Callable[[int, int], None]

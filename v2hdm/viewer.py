@@ -28,9 +28,7 @@ _log = logging.getLogger(__name__)
 
 VIEWERS = ("none", "rerun")
 
-FILE = "recording.rrd"
-"""The recording's name in a result folder."""
-
+FILE = "recording.rrd"  # the recording's name in a result folder
 _RESULT = "Opt"
 _ROUTE, _MARKING, _LANE, _SYMBOL = (
     [int(colour[at : at + 2], 16) for at in (1, 3, 5)]

@@ -34,9 +34,7 @@ ENTRY_FILE = "drive_camera.yaml"
 POINTS_FILE = "points.csv"
 PICTURE_FILE = "points.png"
 
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
-"""Units other than metres, in m."""
-
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}  # units other than metres, in m
 _MISREAD = 0.01  # prior probability of each way to write the table wrongly
 _SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
 _ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles

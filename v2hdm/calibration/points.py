@@ -17,9 +17,7 @@ from v2hdm.store.files import read_text
 COLUMNS = ("u", "v", "x", "y")
 """Pixel (centre of the first at 0, 0) and place in the vehicle frame (x forward, y left, m)."""
 
-LEAST_POINTS = 4
-"""A homography has eight degrees of freedom, a point two coordinates."""
-
+LEAST_POINTS = 4  # a homography has eight degrees of freedom, a point two coordinates
 _ALIASES: Mapping[str, str] = {"u_px": "u", "v_px": "v", "x_m": "x", "y_m": "y"}
 _NAME = "name"
 

@@ -14,8 +14,7 @@ from v2hdm.errors import EXIT_FAILED_VERDICT, MapFileError
 if TYPE_CHECKING:
     from v2hdm.calibration.compare import Movement
 
-_LEAST = 1e-12
-"""Smaller probabilities are all the same."""
+_LEAST = 1e-12  # smaller probabilities are all the same
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -21,9 +21,7 @@ from v2hdm.errors import ConfigError, DriveError
 if TYPE_CHECKING:
     from v2hdm.detection.stopwatch import Stopwatch
 
-_FIRST = b'{"source": '
-"""The beginning of every line of detections."""
-
+_FIRST = b'{"source": '  # the beginning of every line of detections
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
 
 

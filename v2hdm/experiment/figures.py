@@ -23,8 +23,7 @@ from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.report import style
 from v2hdm.report.photos import project_outline
 
-Caption = Mapping[str, Any]
-"""The values in a figure's caption, by their names in the template ``figures.md``."""
+Caption = Mapping[str, Any]  # the values in a figure's caption, by their names in the template figures.md
 
 
 def save_figures(
@@ -70,8 +69,7 @@ def save_figures(
     return captions
 
 
-LINK = "#e3001b"
-"""Colour of lines between corners that belong together."""
+LINK = "#e3001b"  # colour of lines between corners that belong together
 
 
 def _drive_of(record: Mapping[str, Any]) -> str:
@@ -170,8 +168,7 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
     return {"drive": _drive_of(record), "cameras": cameras, "markings": len(common), **errors}
 
 
-_Place = tuple[FloatArray, float, str]
-"""An inset: its centre (2,) and half its width, m, and its title."""
+_Place = tuple[FloatArray, float, str]  # an inset: its centre (2,) and half its width, m, and its title
 
 
 def _true_corners(record: Mapping[str, Any]) -> FloatArray:

@@ -15,12 +15,8 @@ from v2hdm.errors import ConfigError
 from v2hdm.extras import need
 from v2hdm.pipeline.config import RunConfig
 
-LOCAL = "local"
-"""The address of a Ray of our own on this machine."""
-
-RETRIES = 3
-"""How often work is begun anew whose worker died."""
-
+LOCAL = "local"  # the address of a Ray of our own on this machine
+RETRIES = 3  # how often work is begun anew whose worker died
 _OBJECT_STORE_BYTES = 1 << 30
 
 _QUIET = {

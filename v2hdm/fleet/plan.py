@@ -21,9 +21,7 @@ from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.report.terminal import new_table
 from v2hdm.store.remote import place_of
 
-ERROR = "ERROR"
-"""Status of a drive of which there is no result."""
-
+ERROR = "ERROR"  # status of a drive of which there is no result
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
 
 

@@ -15,9 +15,7 @@ from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, 
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.results import GrowingFolder, growing_folder
 
-ALL = "fleet"
-"""In place of a drive's name, for the progress of the fleet."""
-
+ALL = "fleet"  # in place of a drive's name, for the progress of the fleet
 _LOOK_EVERY_S = 0.3
 
 

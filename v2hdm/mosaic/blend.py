@@ -36,12 +36,8 @@ from v2hdm.records import FloatArray
 TILES_PX = (128, 64, 32, 16)
 """Sides that a tile may have, px of the canvas: as large as :data:`WARP_ERROR_PX` allows."""
 
-SHEET_PX = 2048
-"""Side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen."""
-
-WARP_ERROR_PX = 0.02
-"""By so much of an image's pixels may interpolated positions be off."""
-
+SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
+WARP_ERROR_PX = 0.02  # by so much of an image's pixels may interpolated positions be off
 _NODES = 8  # Chebyshev nodes along a tile's side
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 

@@ -142,9 +142,7 @@ class Picture:
 
 _log = logging.getLogger(__name__)
 
-RESOLUTION_M = 0.02
-"""Side of a pixel of the mosaic unless another is asked for."""
-
+RESOLUTION_M = 0.02  # side of a pixel of the mosaic unless another is asked for
 TIFF, PICTURE, EXTENT, COMPARISON = "mosaic.tif", "mosaic.webp", "mosaic.json", "mosaic_before_after.png"
 
 

@@ -25,11 +25,8 @@ from v2hdm.store.files import load_json, take_array
 _SITE_M = 40.0
 """A marking farther from all of a drive's route is not seen from it, m: twice what a camera reaches."""
 
-_POSITION_SIGMA_M = 0.02
-"""Sigma of a written pose's height by which its road is laid flat, m."""
-
-LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)
-"""Fates that are changes of the site, and no want of images."""
+_POSITION_SIGMA_M = 0.02  # sigma of a written pose's height by which its road is laid flat, m
+LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
 
 
 def read_base(path: Path) -> Base:

@@ -20,9 +20,7 @@ from v2hdm.site.changes import Base
 
 _log = logging.getLogger(__name__)
 
-BEST = "Opt"
-"""The method whose map and calibration are the result."""
-
+BEST = "Opt"  # the method whose map and calibration are the result
 STAGE = "map"
 
 

@@ -16,8 +16,7 @@ from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig
 
-ACCURACY_GOAL_CM = 5.0
-"""The 95 % radius, cm, that is asked of a map where nobody states another."""
+ACCURACY_GOAL_CM = 5.0  # the 95 % radius, cm, that is asked of a map where nobody states another
 
 NO_DRIVE = (
     "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, "

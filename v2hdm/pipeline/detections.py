@@ -24,9 +24,7 @@ from v2hdm.store.cache import key_of
 _log = logging.getLogger(__name__)
 
 STAGE = "detect"
-PIECE = 16
-"""Images of a piece: a second or two of work."""
-
+PIECE = 16  # images of a piece: a second or two of work
 _Masks = dict[str, NDArray[np.bool_]]
 _Piece = list[ImageDetections]
 

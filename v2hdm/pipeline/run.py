@@ -36,11 +36,8 @@ from v2hdm.verdict.verdict import Verdict
 _log = logging.getLogger(__name__)
 
 _STAGE = "finished"
-_UPLOADS = "uploads"
-"""Folder in the cache of results that are not uploaded yet."""
-
-_RECORD = ".v2hdm-finished"
-"""Object beside a result at a store, which says what it was made of."""
+_UPLOADS = "uploads"  # folder in the cache of results that are not uploaded yet
+_RECORD = ".v2hdm-finished"  # object beside a result at a store, which says what it was made of
 
 
 @dataclass(frozen=True)

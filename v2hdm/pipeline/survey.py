@@ -22,11 +22,8 @@ from v2hdm.verdict.results.survey import check_frame, check_points
 
 _log = logging.getLogger(__name__)
 
-_NAMED = 5
-"""Points that a line of the log names."""
-
-_NEAR_M = 22.0
-"""How far from the route, m, images may show a point: as far as the detector looks by default."""
+_NAMED = 5  # points that a line of the log names
+_NEAR_M = 22.0  # how far from the route, m, images may show a point: as far as the detector looks by default
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from v2hdm.store.files import replace_text
 JointCovariance = Callable[[IntArray, IntArray], FloatArray]
 """Joint covariance (2N, 2N), m^2, of the corners (N,) of markings (N,) of a map, stacked x0, y0, x1, ..."""
 
-INSIDE = 0.95
-"""Probability of the ellipse that a point is reported to lie in or not."""
+INSIDE = 0.95  # probability of the ellipse that a point is reported to lie in or not
 
 COLUMNS: tuple[str, ...] = (
     *("id", "description", "x_map_m", "y_map_m", "marking", "class", "corner"),

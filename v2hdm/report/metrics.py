@@ -21,14 +21,11 @@ from v2hdm.geometry.quadrilateral import long_axis
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
 
-MATCH_GATE_M = 2.0
-"""A mapped marking farther than this from every true one of its class is false."""
-
+MATCH_GATE_M = 2.0  # a mapped marking farther than this from every true one of its class is false
 MIN_SIGHTINGS = 3
 """A marking was driven past when this many images show all of it inside the region of interest."""
 
-FULLY_VISIBLE = 0.99
-"""Visible fraction from which a marking counts as unoccluded."""
+FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unoccluded
 
 
 @dataclass(frozen=True)
@@ -134,11 +131,8 @@ def rms(errors: FloatArray) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else float("nan")
 
 
-SAMPLE_STEP_M = 0.1
-"""Polylines are compared at points this far apart."""
-
-LATERAL_GATE_M = 0.3
-"""A mapped lane this near to a true one maps it."""
+SAMPLE_STEP_M = 0.1  # polylines are compared at points this far apart
+LATERAL_GATE_M = 0.3  # a mapped lane this near to a true one maps it
 
 
 @dataclass(frozen=True)
@@ -232,11 +226,8 @@ def _stack(pieces: Iterable[FloatArray]) -> FloatArray:
     return np.concatenate(arrays) if arrays else np.empty((0, 2))
 
 
-MAX_CYCLE_M = 15.0
-"""Successors farther away belong to another row of dashes."""
-
-MAX_OFFSET_M = 0.5
-"""A successor lies at most this far beside the axis of its dash."""
+MAX_CYCLE_M = 15.0  # successors farther away belong to another row of dashes
+MAX_OFFSET_M = 0.5  # a successor lies at most this far beside the axis of its dash
 
 
 @dataclass(frozen=True)

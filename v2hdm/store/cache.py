@@ -29,11 +29,8 @@ from v2hdm.store.lock import HOST, STAGES, in_use
 
 _log = logging.getLogger(__name__)
 _Value = TypeVar("_Value")
-Line = tuple[str, int, str]
-"""Name of a logger, level, message."""
-
-ENDING = ".v2hdm"
-"""Of an entry's name, after its key."""
+Line = tuple[str, int, str]  # name of a logger, level, message
+ENDING = ".v2hdm"  # of an entry's name, after its key
 
 LIBRARIES = (
     "torch", "kornia", "numpy", "scipy", "onnxruntime", "onnxruntime-gpu", "opencv-python-headless", "numba",
@@ -46,8 +43,7 @@ _PACKAGE = Path(__file__).parents[1]
 _CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
 """Files of the package that decide what comes out: sources, catalogue, weights, templates."""
 
-_NUMBERS = "biufc"
-"""Kinds of numpy's element types that are numbers; objects are none."""
+_NUMBERS = "biufc"  # kinds of numpy's element types that are numbers; objects are none
 
 
 class CodecError(ValueError):

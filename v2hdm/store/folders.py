@@ -23,18 +23,13 @@ from v2hdm.io.safe.texts import read_json
 from v2hdm.store.files import file_digest
 from v2hdm.store.lock import HOST, use_until_exit
 
-LIST = ".v2hdm-cache.json"
-"""Name of the list in a folder."""
-
+LIST = ".v2hdm-cache.json"  # name of the list in a folder
 _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
 
-_VERSION = 3
-"""Raised whenever an import comes out as other files."""
-
+_VERSION = 3  # raised whenever an import comes out as other files
 _IMAGES = (".png", ".jpg", ".jpeg")
 _WRITER = f"{HOST}-{secrets.token_hex(4)}"
-_STALE_S = 3600.0
-"""A folder that nothing was written to for so long was left by a process that was killed."""
+_STALE_S = 3600.0  # a folder that nothing was written to for so long was left by a process that was killed
 
 
 def note_use(folder: Path) -> None:

@@ -21,9 +21,7 @@ _log = logging.getLogger(__name__)
 LIST = ".v2hdm-results.jsonl"
 """Name of the list of our files in a folder of results: a head, then a line of JSON for each file written."""
 
-_DEEPEST = 3
-"""Folders above a file that may have a list: ours lie at most two folders deep."""
-
+_DEEPEST = 3  # folders above a file that may have a list: ours lie at most two folders deep
 _noted: ContextVar[set[tuple[int, int]] | None] = ContextVar("inputs of this command", default=None)
 _reported: set[tuple[Path, str]] = set()
 

@@ -20,9 +20,7 @@ from typing import IO
 
 _log = logging.getLogger(__name__)
 
-STAGES = "stages"
-"""Folder within a cache of what runs keep, and of the locks of those in progress."""
-
+STAGES = "stages"  # folder within a cache of what runs keep, and of the locks of those in progress
 IN_USE = f"{STAGES}/in_use"
 HOST = platform.node() or "this host"
 _ENDING = ".lock"

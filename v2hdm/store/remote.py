@@ -26,13 +26,10 @@ from v2hdm.store.files import file_digest
 from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, finish_entry, is_whole, note_use
 from v2hdm.store.inputs import LIST
 
-Report = Callable[[int, int], None]
-"""Called as ``report(done, total)`` with numbers of objects."""
-
+Report = Callable[[int, int], None]  # called as report(done, total) with numbers of objects
 _log = logging.getLogger(__name__)
 
-_MEMORY = "memory"
-"""A store that is gone with its process: for tests."""
+_MEMORY = "memory"  # a store that is gone with its process: for tests
 
 _PACKAGES = {
     "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs",
@@ -41,12 +38,8 @@ _PACKAGES = {
 }  # fmt: skip
 """Protocols of stores that replace an object at once, and the package that speaks each."""
 
-_NOTHING = ".v2hdm-nothing"
-"""A prefix that nobody writes to: cheap to list."""
-
-_AT_ONCE = 32
-"""Objects of one call, downloaded side by side."""
-
+_NOTHING = ".v2hdm-nothing"  # a prefix that nobody writes to: cheap to list
+_AT_ONCE = 32  # objects of one call, downloaded side by side
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
 _MESSAGE_LETTERS = 200
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-GOAL = "coarse"
-"""The check whether map and calibrations are as good as ``accuracy_goal_cm`` asks."""
+GOAL = "coarse"  # the check whether map and calibrations are as good as accuracy_goal_cm asks
 
 
 class Status(Enum):

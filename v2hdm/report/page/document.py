@@ -92,9 +92,7 @@ def _ellipses(facts: Facts) -> str:
     return charts.ellipse_chart(series) if series else ""
 
 
-FILE = "report.html"
-"""Name of the page in a result folder."""
-
+FILE = "report.html"  # name of the page in a result folder
 _ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templates", "map.js": "templates"}
 """Scripts and styles that stand in the page as they are, by the folder that holds them."""
 

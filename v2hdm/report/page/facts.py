@@ -26,8 +26,7 @@ from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntA
 from v2hdm.report.metrics import way_along
 from v2hdm.store.files import load_json, load_yaml, read_text, take_number
 
-BEST = "Opt"
-"""The method whose map is the run's result, as ``metrics.json`` names it."""
+BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,7 @@ def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
 
 EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 
-LARGEST_BYTES = 3_500_000
-"""Budget of the mosaic, as text in the page."""
-
+LARGEST_BYTES = 3_500_000  # budget of the mosaic, as text in the page
 _QUALITY = 72
 _COMPARISON_WIDTH_PX = 1400
 

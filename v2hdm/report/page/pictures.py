@@ -16,9 +16,7 @@ from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, shrunk
 
-BUDGET_BYTES = 8_000_000
-"""Budget of all pictures together, as text in the page: a report stays below 15 MB."""
-
+BUDGET_BYTES = 8_000_000  # budget of all pictures together, as text in the page: a report stays below 15 MB
 PER_CAMERA = 2
 """Pictures of a marking by one camera: the nearest one, and one from the middle of its sightings."""
 

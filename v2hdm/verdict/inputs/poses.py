@@ -17,8 +17,7 @@ _CHORD_M = 2.0
 # A vehicle that takes longer for a chord counts as standing: its path is then mostly noise.
 _SLOWEST_MPS = 0.5
 
-STEEPEST_DEG = 15.0
-"""No road that is mapped is steeper, nor rolls a vehicle farther."""
+STEEPEST_DEG = 15.0  # no road that is mapped is steeper, nor rolls a vehicle farther
 
 # Chords per drive: enough for medians to a hundredth of a degree, and a tenth of a second of work.
 _MOST_STARTS = 4000

@@ -16,9 +16,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, judge
 
-SAME_M = 1.0
-"""Centres of one marking in the maps of two cameras lie closer than this."""
-
+SAME_M = 1.0  # centres of one marking in the maps of two cameras lie closer than this
 _LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
 # Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3.
 _OFFSET_LIMIT_SIGMAS = 5.0

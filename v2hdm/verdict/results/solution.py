@@ -30,8 +30,7 @@ from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-BEST = "Opt"
-"""The method whose map is the result."""
+BEST = "Opt"  # the method whose map is the result
 
 # Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5.
 _HELD_OUT_LIMIT = 4.0

@@ -17,8 +17,7 @@ from v2hdm.verdict.verdict import Finding, Status, passed
 
 CHECK = "check points"
 FRAME = "survey frame"
-SIGNIFICANCE = 1e-3
-"""Share of maps as good as they state that are contradicted by chance."""
+SIGNIFICANCE = 1e-3  # share of maps as good as they state that are contradicted by chance
 
 
 def check_points(table: CheckTable) -> Finding:

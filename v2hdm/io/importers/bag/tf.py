@@ -14,9 +14,7 @@ from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray, Trajectory
 
-Edge = tuple[str, str]
-"""Parent and child."""
-
+Edge = tuple[str, str]  # parent and child
 TF_TOPIC, TF_STATIC = "/tf", "/tf_static"
 
 _FIXED = 1e-9  # elements of a transform, m or 1, that change by less do so by rounding
