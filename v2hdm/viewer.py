@@ -41,8 +41,7 @@ _PNG = b"\x89PNG"
 class RerunViewer:
     """Shows a run in Rerun where there is a display, and always records it.
 
-    Raises:
-        ConfigError: rerun is not installed; the line names the extra that brings it.
+    Raises ConfigError where rerun is not installed.
     """
 
     def __init__(self, name: str = "v2hdm") -> None:
@@ -155,8 +154,7 @@ class RerunViewer:
 def check_viewer(name: str) -> bool:
     """Whether a run is to be watched by :class:`RerunViewer`.
 
-    Raises:
-        ConfigError: there is no viewer of this name.
+    Raises ConfigError where there is no viewer of this name.
     """
     if name not in VIEWERS:
         raise ConfigError(f"viewer is {shown(name)}: choose {' or '.join(VIEWERS)}")

@@ -59,8 +59,7 @@ def compare_calibrations(
 ) -> list[Movement]:
     """The movements of the cameras, by name, that both hold.
 
-    Raises:
-        MapFileError: they have no camera in common, or see :func:`movement`.
+    Raises MapFileError where they have no camera in common, or as :func:`movement`.
     """
     common = [name for name in before if name in after]
     if not common:
@@ -73,8 +72,7 @@ def compare_calibrations(
 def movement(before: Calibration, after: Calibration) -> Movement:
     """The movement between two calibrations of one camera, whose errors are independent.
 
-    Raises:
-        MapFileError: they are of two cameras or lenses, or one has no covariance.
+    Raises MapFileError where they are of two cameras or lenses, or one has no covariance.
     """
     _check_comparable(before, after)
     assert before.covariance is not None

@@ -39,10 +39,8 @@ class SurveyedPoints:
 def read_points(path: Path) -> SurveyedPoints:
     """Read the CSV file at ``path``: names of columns in its first line, then a point a line.
 
-    Columns are :data:`COLUMNS` and, if wanted, ``name``, parted by commas, semicolons, tabs or blanks.
-
-    Raises:
-        DriveError: the file is missing, a column is, or a cell does not parse; with the line.
+    Columns are :data:`COLUMNS` and, if wanted, ``name``, parted by commas, semicolons, tabs or blanks. Raises
+    DriveError where the file is missing, a column is, or a cell does not parse; with the line.
     """
     lines = [(n, line) for n, line in enumerate(read_text(path, DriveError).splitlines(), 1) if line.strip()]
     lines = [(n, line) for n, line in lines if n == lines[0][0] or not line.lstrip().startswith("#")]
@@ -74,8 +72,7 @@ def read_points(path: Path) -> SurveyedPoints:
 def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
     """Refuse points outside the image, and one that is there twice.
 
-    Raises:
-        DriveError: there are some; names the first.
+    Raises DriveError, which names the first.
     """
     size = np.array([info.width, info.height])
 

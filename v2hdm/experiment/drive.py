@@ -88,10 +88,8 @@ def recipe_file(recipe: str) -> str:
 def drive_record(job: Job, workers: int, progress: Progress) -> dict[str, Any]:
     """The record of a drive and of its maps, from disk or made now and kept there.
 
-    ``workers`` are processes to render and detect in; 1 stays in this one.
-
-    Raises:
-        V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
+    ``workers`` are processes to render and detect in; 1 stays in this one. Raises V2hdmError where the drive
+    cannot be rendered, read or looked at, or has no truth.
     """
     known = _kept(job)
     if known is None:

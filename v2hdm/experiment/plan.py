@@ -94,9 +94,8 @@ class Job:
 def jobs(config: ExperimentConfig) -> list[Job]:
     """The drives of an experiment, seed by seed, so that what is finished first compares all ports.
 
-    Raises:
-        ConfigError: a setting cannot work; the message names the key.
-        DetectorError: ``detector.model`` cannot be used.
+    Raises ConfigError, which names the key, where a setting cannot work, DetectorError where
+    ``detector.model`` cannot be used.
     """
     _check(config)
     changed: dict[str, dict[str, Any]] = {

@@ -39,9 +39,7 @@ def run_experiment(
 
     Drives that an earlier run has finished under the same settings are taken from there. ``config_yaml`` is
     the configuration as text, kept beside the results. Returns the folder, and the figures of every drive.
-
-    Raises:
-        V2hdmError: a setting or a drive is at fault, or the folder holds something that is not ours.
+    Raises V2hdmError where a setting or a drive is at fault, or the folder holds something that is not ours.
     """
     todo = jobs(config)
     folder = Path(config.output) / config.name

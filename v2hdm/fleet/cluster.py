@@ -44,10 +44,8 @@ NO_GPU = (
 def cluster(address: str, workers: int) -> Iterator[Any]:
     """The module ``ray``, connected to a running cluster (``auto`` finds that of this machine).
 
-    ``local`` starts one here of so many cores, 0 for all; it ends with the block or the process.
-
-    Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
+    ``local`` starts one here of so many cores, 0 for all; it ends with the block or the process. Raises
+    ConfigError where Ray is not installed, or there is no cluster at the address.
     """
     with ExitStack() as stack:
         for name in _ONE_THREAD:

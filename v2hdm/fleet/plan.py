@@ -143,8 +143,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
 def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Plan:
     """All drives of run files, whose other settings are equal, as the one site of that name.
 
-    Raises:
-        ConfigError: the site's name cannot be that of a folder.
+    Raises ConfigError where the site's name cannot be that of a folder.
     """
     take_name(site, "--site", ConfigError)
     source = ", ".join(map(str, files))

@@ -137,8 +137,7 @@ def detect_by(
 ) -> None:
     """:func:`v2hdm.detection.batch.detect_images` by actors, with the same detections and errors.
 
-    Raises:
-        WorkerError: an actor died again and again.
+    Raises WorkerError where an actor died again and again.
     """
     reference = ray.put(drive)
     batches = [images[begin : begin + IMAGES_A_BATCH] for begin in range(0, len(images), IMAGES_A_BATCH)]

@@ -75,10 +75,8 @@ def blend(
 ) -> Iterator[Sheet]:
     """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
 
-    ``shots`` are in driving order; ``progress`` counts images put onto sheets.
-
-    Raises:
-        DriveError: an image is missing, damaged or of the wrong size.
+    ``shots`` are in driving order; ``progress`` counts images put onto sheets. Raises DriveError where an
+    image is missing, damaged or of the wrong size.
     """
     tiling = Tiling.of(canvas, shots, lenses)
     plan = _plan(canvas, shots, lenses, tiling.side_px)
@@ -207,8 +205,7 @@ class Tiling:
     def of(cls, canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> Tiling:
         """The largest tiles in which the first image of each camera lies as exactly as it has to.
 
-        Raises:
-            ConfigError: not even the smallest do; the canvas is too coarse for the cameras.
+        Raises ConfigError where not even the smallest do; the canvas is too coarse for the cameras.
         """
         first = {shot.camera: shot for shot in reversed(shots)}
         for side_px in TILES_PX:

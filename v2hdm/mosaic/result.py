@@ -75,8 +75,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
     """Put sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
 
-    Raises:
-        ConfigError: rasterio is not installed.
+    Raises ConfigError where rasterio is not installed.
     """
     rasterio = need("rasterio", "gis", path.name, ConfigError)
     west, _, _, north = canvas.bounds_m
@@ -167,11 +166,8 @@ def write_mosaic(
 
     ``folder`` holds the run's map, calibrations and adjusted trajectory, ``drive`` is what it has mapped.
     ``resolution_m`` is the side of a pixel on the ground; ``progress`` counts images put onto the ground.
-
-    Raises:
-        MapFileError: the folder is no result, or not one of this drive.
-        DriveError: an image is missing or damaged.
-        ConfigError: the resolution makes no mosaic.
+    Raises MapFileError where the folder is no result, or not one of this drive, DriveError where an image is
+    missing or damaged, ConfigError where the resolution makes no mosaic.
     """
     if not resolution_m > 0:
         raise ConfigError(f"a resolution of {resolution_m:g} m a pixel makes no mosaic; give a positive one")

@@ -288,8 +288,7 @@ def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
 def files_of_result(folder: Path) -> dict[str, str]:
     """SHA-256 of our files in a result folder by their names; none where it is no result.
 
-    Raises:
-        ConfigError: its list is damaged.
+    Raises ConfigError where its list is damaged.
     """
     return {name: digests[-1] for name, digests in (_Target(folder, "output=").listed() or {}).items()}
 

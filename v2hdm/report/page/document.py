@@ -23,8 +23,7 @@ from v2hdm.store.files import replace_text
 def document(facts: Facts) -> SimpleNamespace:
     """The content of the page by the names of its templates; parts that a run lacks are None or empty.
 
-    Raises:
-        DriveError: an image of the drive cannot be read.
+    Raises DriveError where an image of the drive cannot be read.
     """
     metrics, verdict = facts.metrics, facts.metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
@@ -100,11 +99,9 @@ _ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templat
 def write_page(folder: Path, drive: Drive | None) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
-    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand.
-
-    Raises:
-        MapFileError: the folder is no result, or a file in it is damaged.
-        DriveError: an image or the truth of the drive is damaged.
+    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand. Raises
+    MapFileError where the folder is no result, or a file in it is damaged, DriveError where an image or the
+    truth of the drive is damaged.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),

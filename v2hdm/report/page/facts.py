@@ -90,9 +90,8 @@ class Facts:
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read the result folder of a run; ``drive`` is the one that it mapped, if it is at hand.
 
-    Raises:
-        MapFileError: the folder is no result, or a file in it is damaged.
-        DriveError: the drive's truth is damaged.
+    Raises MapFileError where the folder is no result, or a file in it is damaged, DriveError where the
+    drive's truth is damaged.
     """
     if not (folder / "metrics.json").is_file():
         raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
@@ -121,8 +120,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     """The calibrations of a result folder by camera.
 
-    Raises:
-        MapFileError: a file is damaged.
+    Raises MapFileError where a file is damaged.
     """
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):

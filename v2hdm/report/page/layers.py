@@ -49,8 +49,7 @@ class GroundPage(NamedTuple):
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     """The mosaic for the map: WebP in base64 and its bounds (west, south, east, north), m; None without one.
 
-    Raises:
-        MapFileError: ``mosaic.json`` is damaged, or the picture that it names is missing.
+    Raises MapFileError where ``mosaic.json`` is damaged, or the picture that it names is missing.
     """
     if not (folder / EXTENT).is_file():
         return None

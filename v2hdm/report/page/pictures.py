@@ -48,10 +48,8 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     Empty without the drive.
 
     Each has ``src`` (JPEG as base64), ``size``, ``camera``, ``image``, ``t`` (s), the shape as the map puts
-    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture.
-
-    Raises:
-        DriveError: an image of the drive cannot be read.
+    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture. Raises
+    DriveError where an image of the drive cannot be read.
     """
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}

@@ -315,10 +315,7 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
 def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None:
     """The usual mistake after whose undoing the ground of a camera that never matched does.
 
-    None where a camera matches, or no mistake explains it.
-
-    Raises:
-        DriveError: an image cannot be read.
+    None where a camera matches, or no mistake explains it. Raises DriveError where an image cannot be read.
     """
     lost = [
         name

@@ -136,8 +136,7 @@ def _spacing(drive: Drive, motion: Motion, name: str) -> Iterator[Finding]:
 def check_images(drive: Drive) -> list[Finding]:
     """Whether the images are those of a moving camera each, and show road.
 
-    Raises:
-        DriveError: a sampled image cannot be decoded.
+    Raises DriveError where a sampled image cannot be decoded.
     """
     findings = _shared(drive)
     for name, camera in drive.cameras.items():
