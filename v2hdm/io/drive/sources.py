@@ -158,9 +158,8 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
         if not paths:
             raise DriveError(f"{where}: {folder}: no image ({', '.join(_SUFFIXES)}) in this folder")
         if "stamps" in entry:
-            stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
-            if len(stamp_s) != len(paths):
-                raise DriveError(f"{where}: {len(paths)} images in {folder}, but {len(stamp_s)} stamps")
+            stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
+            stamp_s = read_stamps(stamps, len(paths), f"images in {folder}")
         else:
             try:
                 stamp_s = np.array([float(path.stem) for path in paths])
@@ -227,10 +226,10 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         if "start_s" in entry:
             return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
         listed = _of_list(camera, frames)
-        stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
-        if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
-            problem = f"{len(listed.paths)} frames in {path} and {len(stamp_s)} stamps"
-            raise DriveError(f"{where}: {problem}; give one a frame, rising")
+        stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
+        stamp_s = read_stamps(stamps, len(listed.paths), f"frames of {path}")
+        if (np.diff(stamp_s) <= 0).any():
+            raise DriveError(f"{stamps}: times do not rise strictly; mend them")
         return replace(listed, stamp_s=stamp_s)
 
     return images
