@@ -25,7 +25,7 @@ from v2hdm.io.calibration import (
     write_calibration,
     write_calibration_as,
 )
-from v2hdm.io.maps import read_geojson, read_geopackage_verdict
+from v2hdm.io.maps import read_geojson, read_verdict
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
@@ -51,7 +51,7 @@ def test_every_format_of_a_map_is_documented():
 
 def test_the_verdict_goes_along(folder):
     assert run(["export", "map.geojson", "--format", "gpkg", "--output", "there"]) == 0
-    assert read_geopackage_verdict(folder / "there" / "map.gpkg") == VERDICT
+    assert read_verdict(folder / "there" / "map.gpkg") == VERDICT
 
 
 def test_an_edited_geopackage_becomes_the_geojson_again(folder):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.cli.main import parser_of
-from v2hdm.errors import EXIT_FAILED_VERDICT, MapFileError
+from v2hdm.errors import EXIT_FAILED_VERDICT
 
 if TYPE_CHECKING:
     from v2hdm.calibration.compare import Movement
@@ -28,12 +28,6 @@ def run(arguments: Sequence[str]) -> int:
     from v2hdm.io.calibration import trusted_calibrations
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
-    common = [name for name in before if name in after]
-    if not common:
-        raise MapFileError(
-            f"{parsed.before} has {', '.join(before)} and {parsed.after} has {', '.join(after)}: "
-            "no camera in common"
-        )
     movements = compare_calibrations(before, after)
     if parsed.json:
         print(json.dumps([_as_json(one) for one in movements]))

@@ -21,12 +21,11 @@ def run(arguments: Sequence[str]) -> int:
     parsed = parser.parse_args(arguments)
     from v2hdm.io.calibration import trusted_calibrations
     from v2hdm.io.maps import read_geojson
-    from v2hdm.localization.run import check_together, localize, summary_lines, write_localised
+    from v2hdm.localization.run import localize, summary_lines, write_localised
 
     path = parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map
     hd_map, calibrations = read_geojson(path), trusted_calibrations(path.parent)
     drive = drive_of(parsed)
-    check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
     with result_of(folder, settings) as unfinished:

@@ -15,12 +15,12 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
 from v2hdm.io.maps import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
+from v2hdm.io.maps.evidence import read_exclusions
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.figures import save_changes
 from v2hdm.site.changes import Base
-from v2hdm.store.files import load_json, take_array
 
 _SITE_M = 40.0
 """A marking farther from all of a drive's route is not seen from it, m: twice what a camera reaches."""
@@ -51,7 +51,9 @@ def read_base(path: Path) -> Base:
             "naive methods; map its drive anew"
         )
     poses = [lay_flat(read_tum(one), _POSITION_SIGMA_M).trajectory.map_from_vehicle for one in trajectories]
-    return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), _left_out(excluded))
+    left_out = read_exclusions(excluded) if excluded.is_file() else []
+    candidates = tuple((one.kind, one.position_map, one.sightings) for one in left_out)
+    return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), candidates)
 
 
 def check_together(base: Base, drive: Drive, path: str) -> None:
@@ -78,19 +80,6 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
         return np.asarray(read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32))
 
     return grey
-
-
-def _left_out(path: Path) -> tuple[tuple[str, FloatArray, int], ...]:
-    """Class, place (2,) and sightings of the candidates that an earlier map left out."""
-    if not path.is_file():
-        return ()
-    out = []
-    for feature in load_json(path, MapFileError).get("features", []):
-        properties = feature.get("properties", {})
-        if "position_map" in properties:
-            place = take_array(properties["position_map"], (2,), f"{path}: position_map", MapFileError)
-            out.append((str(properties.get("class")), place, int(properties.get("sightings", 0))))
-    return tuple(out)
 
 
 def changes_json(changes: Changes) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
-from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.records import Drive, Image
 from v2hdm.store.cache import key_of
@@ -68,8 +67,3 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     return key_of(
         code, asked, model_key(config.detector), [drive.root.resolve() for drive in drives], of_drives, read
     )
-
-
-def read_drives(config: RunConfig, paths: Sequence[Path]) -> list[Drive]:
-    """The drives of a run; raises DriveError where one cannot be read."""
-    return [read_drive(path, config.drive) for path in paths]

@@ -18,10 +18,11 @@ from typing import Any
 
 from v2hdm import __version__
 from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.io.drive import read_drive
 from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit, run_name
 from v2hdm.pipeline.context import Context, Unwatched, Viewer, log_file, logging_to
-from v2hdm.pipeline.keys import Contents, read_drives, result_key
+from v2hdm.pipeline.keys import Contents, result_key
 from v2hdm.progress import Progress, silent
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
@@ -126,7 +127,7 @@ def _is_of(config: RunConfig, key: str) -> bool:
     if config.simulate is not None:
         paths = (folder_of_port(config.simulate, Path(config.cache)),)
         note_use(paths[0])
-    drives = read_drives(config, paths)
+    drives = [read_drive(path, config.drive) for path in paths]
     return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
 
 

@@ -7,13 +7,12 @@ from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import (
     read_geojson,
     read_geopackage,
-    read_geopackage_verdict,
     read_map,
     read_verdict,
 )
 
 __all__ = [
     "FORMATS", "check_formats", "geojson_feature", "geojson_positions", "ground_height_m", "read_geojson",
-    "read_geopackage", "read_geopackage_verdict", "read_map", "read_verdict", "with_heights",
+    "read_geopackage", "read_map", "read_verdict", "with_heights",
     "write_features", "write_geojson", "write_geopackage", "write_map",
 ]  # fmt: skip

@@ -60,7 +60,7 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
     if reader is None:
         endings = " or ".join(_READERS)
         raise MapFileError(f"{path}: no map that can be read; give a file that ends in {endings}")
-    return reader[0](path), reader[1](path)
+    return reader(path), read_verdict(path)
 
 
 def read_geojson(path: Path) -> HdMap:
@@ -95,9 +95,12 @@ def read_geojson(path: Path) -> HdMap:
 
 
 def read_verdict(path: Path) -> Verdict:
-    """The verdict beside a map in GeoJSON, None where there is none."""
-    about = load_json(path, MapFileError).get("v2hdm")
-    verdict = about.get("verdict") if isinstance(about, dict) else None
+    """The verdict beside a map, None where there is none; errors as :func:`read_map`."""
+    if path.suffix.lower() == ".gpkg":
+        verdict = _about(path, "verdict")
+    else:
+        about = load_json(path, MapFileError).get("v2hdm")
+        verdict = about.get("verdict") if isinstance(about, dict) else None
     return verdict if isinstance(verdict, dict) else None
 
 
@@ -114,16 +117,7 @@ def read_geopackage(path: Path) -> HdMap:
     return reader.map()
 
 
-def read_geopackage_verdict(path: Path) -> Verdict:
-    """The verdict beside a map in a GeoPackage, None where there is none."""
-    verdict = _about(path, "verdict")
-    return verdict if isinstance(verdict, dict) else None
-
-
-_READERS: Mapping[str, tuple[Callable[[Path], HdMap], Callable[[Path], Verdict]]] = {
-    ".geojson": (read_geojson, read_verdict),
-    ".gpkg": (read_geopackage, read_geopackage_verdict),
-}
+_READERS: Mapping[str, Callable[[Path], HdMap]] = {".geojson": read_geojson, ".gpkg": read_geopackage}
 
 
 @dataclass(frozen=True)
