@@ -177,7 +177,7 @@ def damaged_map(origin=None, **properties):
         ("{", "line 1 JSON syntax error"),
         ("[]", "expected a JSON object"),
         ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
-        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither a geometry nor 'corn"),
+        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has no geometry, 'corn"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
         (damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}), "origin, latitude"),

@@ -64,7 +64,7 @@ def compare_calibrations(
     common = [name for name in before if name in after]
     if not common:
         raise MapFileError(
-            f"the cameras {', '.join(before)} and {', '.join(after)} are compared: no camera in common"
+            f"no camera in common: {', '.join(before)} and {', '.join(after)}; compare one vehicle"
         )
     return [movement(before[name], after[name]) for name in common]
 
@@ -113,9 +113,7 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
         raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
     kinds = [(info.width, info.height, info.distortion_model) for info in (first, second)]
     if kinds[0] != kinds[1]:
-        raise MapFileError(
-            f"{who}: image sizes or lens models differ; calibrate with the same intrinsics both times"
-        )
+        raise MapFileError(f"{who}: image sizes or lens models differ; calibrate with the same intrinsics")
     off = np.abs(first.intrinsic - second.intrinsic).max()
     if off > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
         raise MapFileError(

@@ -226,10 +226,7 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
         table.writerow(_COLUMNS)
         points, off = found.points, found.residuals
         for k, name in enumerate(points.names):
-            shift = [
-                *(f"{value:.3f}" for value in off.off_px[k]),
-                *(f"{value:.4f}" for value in off.off_m[k]),
-            ]
+            shift = [*(f"{px:.3f}" for px in off.off_px[k]), *(f"{m:.4f}" for m in off.off_m[k])]
             known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
             table.writerow(
                 [name, *points.points_px[k].tolist(), *points.points_vehicle[k].tolist(), *shift, *known]

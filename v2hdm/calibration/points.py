@@ -53,9 +53,7 @@ def read_points(path: Path) -> SurveyedPoints:
         rows.append([parse_number(row[column], f"{path}: line {number}: {column}") for column in COLUMNS])
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     if len(table) < LEAST_POINTS:
-        raise DriveError(
-            f"{path}: {len(table)} points; {LEAST_POINTS} barely fix a camera, ten tell how well: survey more"
-        )
+        raise DriveError(f"{path}: {len(table)} points; {LEAST_POINTS} barely fix a camera: survey more")
     return SurveyedPoints(path, tuple(names), tuple(labels), table[:, :2], table[:, 2:])
 
 
@@ -102,7 +100,5 @@ def _columns(header: list[str], path: Path) -> list[str]:
     for name in columns:
         if name not in (*COLUMNS, _NAME):
             hint = "points must lie on the ground; drop it" if name in ("z", "z_m") else "drop it"
-            raise DriveError(
-                f"{path}: column '{name}' is not known ({', '.join(COLUMNS)} and {_NAME} are); {hint}"
-            )
+            raise DriveError(f"{path}: column '{name}' is not one of {', '.join(COLUMNS)}, {_NAME}; {hint}")
     return columns

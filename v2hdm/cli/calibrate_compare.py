@@ -64,7 +64,5 @@ def _line(one: Movement) -> str:
 
 
 def _as_json(one: Movement) -> dict[str, object]:
-    arrays = {
-        name: getattr(one, name).tolist() for name in ("shift_m", "turn_rad", "covariance", "detectable")
-    }
+    arrays = {key: getattr(one, key).tolist() for key in ("shift_m", "turn_rad", "covariance", "detectable")}
     return {"camera": one.camera, "moved": one.moved, "probability": one.probability, **arrays}

@@ -35,9 +35,7 @@ def run(arguments: Sequence[str]) -> int:
     for option, default, unit, of in (("pixel", 0.5, "PX", "clicking"), ("survey", 0.01, "M", "surveying")):
         meaning = _SIGMA.format(of, unit.lower())
         parser.add_argument(f"--{option}-sigma", type=float, default=default, metavar=unit, help=meaning)
-    parser.add_argument(
-        "--output", type=Path, help="folder for the results (default: outputs/<camera>-calibrate)"
-    )
+    parser.add_argument("--output", type=Path, help="folder of results (default: outputs/<camera>-calibrate)")
     parsed = parser.parse_args(arguments)
     from dataclasses import replace
 

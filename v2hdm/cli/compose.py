@@ -230,9 +230,7 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     if "missing EQUAL" in message:
         bare = [one for one in overrides if "=" not in one and not one.startswith(("-", "~"))]
         named = " ".join(bare[:1]) or "an argument"
-        return ConfigError(
-            f"configuration: '{named}' is no key=value; write drive.path={named}, or see --help"
-        )
+        return ConfigError(f"configuration: '{named}' is no key=value; write drive.path={named}, see --help")
     # Of a long command line only what the message is about: the override that has the key it names.
     about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
     where = f" (in {' '.join(about or overrides)})" if 0 < len(about or overrides) <= _FEW_OVERRIDES else ""

@@ -29,9 +29,7 @@ def run(arguments: Sequence[str]) -> None:
         help="of a map: geojson, csv, gpkg, lanelet2, dxf; of a calibration: camera_info, static_transform, "
         "urdf, kalibr, opencv; may be repeated",
     )
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="folder of the files (default: that of MAP)"
-    )
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of files (default: that of MAP)")
     parser.add_argument(
         "--projector",
         metavar="NAME",
@@ -50,9 +48,7 @@ def run(arguments: Sequence[str]) -> None:
     except BrokenPipeError:  # the reader of our output has had enough
         raise
     except OSError as error:
-        raise MapFileError(
-            f"{error.filename}: cannot be written ({error.strerror}); set another --output"
-        ) from None
+        raise MapFileError(f"{error.filename}: cannot be written ({error.strerror}); set --output") from None
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:

@@ -18,9 +18,7 @@ def run(arguments: Sequence[str]) -> None:
     """Add the mosaic to a result."""
     parser = parser_of("mosaic")
     parser.add_argument("result", type=Path, help="result folder of v2hdm map")
-    parser.add_argument(
-        "--drive", type=Path, help="the drive's folder (default: where it was when it was mapped)"
-    )
+    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
     parser.add_argument(
         "--resolution", type=float, metavar="M", default=0.02, help="side of a pixel on the ground (0.02 m)"
     )
@@ -39,13 +37,9 @@ def run(arguments: Sequence[str]) -> None:
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
     drive = drive_of(parsed.result, parsed.drive)
     if drive is None:
-        raise DriveError(
-            f"{parsed.result}: its drive is not where it was; give its folder with --drive, or map it anew"
-        )
+        raise DriveError(f"{parsed.result}: its drive is not where it was; give its folder with --drive")
     if drive.joined:
-        raise MapFileError(
-            f"{parsed.result} is of several drives; a mosaic shows one: map them one by one for it"
-        )
+        raise MapFileError(f"{parsed.result} is of several drives; a mosaic shows one: map them one by one")
     with added_to(parsed.result, "RESULT") as folder:
         found = write_mosaic(folder, drive, parsed.resolution, parsed.device, _show)["sharpness"]
     if found["edges"]:

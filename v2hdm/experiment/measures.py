@@ -176,10 +176,8 @@ def residuals(
         except MappingError:
             continue  # a camera that saw nothing has no residuals
         seen = _Seen.of(drive, sightings, name, best)
-        out[name] = {
-            "field": _field(drive, seen, name, best),
-            "range": _by_range(drive, seen, name, methods, truth),
-        }
+        field, ranges = _field(drive, seen, name, best), _by_range(drive, seen, name, methods, truth)
+        out[name] = {"field": field, "range": ranges}
     return out
 
 

@@ -183,10 +183,8 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
 def _differences(settings: RunConfig, config: RunConfig) -> Iterator[tuple[str, Any, Any]]:
     """Every setting besides name and path that is another in the second: its key, and both values."""
     without = [replace(one, name=None, drive=replace(one.drive, path=None)) for one in (settings, config)]
-    mine, other = (dict(_leaves(asdict(one))) for one in without)
-    return (
-        (key, mine.get(key), other.get(key)) for key in [*mine, *other] if mine.get(key) != other.get(key)
-    )
+    mine, its = (dict(_leaves(asdict(one))) for one in without)
+    return ((key, mine.get(key), its.get(key)) for key in [*mine, *its] if mine.get(key) != its.get(key))
 
 
 def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

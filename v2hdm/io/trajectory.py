@@ -48,8 +48,7 @@ def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, wher
     """Refuse poses off the earth, or far from the map's ``origin`` on it."""
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
-        problem = f"a position is {farthest_m:.3g} m from zero, off the earth"
-        raise DriveError(f"{where}: {problem}; mend the poses")
+        raise DriveError(f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend it")
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "

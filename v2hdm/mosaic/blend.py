@@ -161,9 +161,7 @@ def _sources(
 ) -> Iterator[_Source]:
     """The images of shots in some order; the next is decoded meanwhile, the last used stay decoded."""
     boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
-    trusts = {
-        name: torch.from_numpy(lenses[name].trust[box].copy()).to(device) for name, box in boxes.items()
-    }
+    trusts = {key: torch.from_numpy(lenses[key].trust[box].copy()).to(device) for key, box in boxes.items()}
 
     @lru_cache(maxsize=_KEPT_IMAGES)
     def decoded(path: Path, camera: str) -> np.ndarray:

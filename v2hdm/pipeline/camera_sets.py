@@ -85,10 +85,8 @@ def _map_set(
     last: bool,
     executor: Executor,
 ) -> MappedSet:
-    log_step, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(
-        drive, detections, cameras, survey.mapping, log_step, base, grey_reader(drive), executor
-    )
+    log, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
+    methods = run_methods(drive, detections, cameras, survey.mapping, log, base, grey_reader(drive), executor)
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None
     # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.

@@ -124,9 +124,7 @@ def _lens(
     if camera_name is not None:
         raise ConfigError(f"--camera-name: {camera} is the calibration of one camera; drop it")
     if mounting is not None:
-        raise ConfigError(
-            "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
-        )
+        raise ConfigError("--camera and --mounting exclude each other: drop one, a calibration has both")
     return None
 
 
@@ -267,9 +265,7 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
-            raise DriveError(
-                f"{path}: no camera '{name}', as the calibration calls it; this drive has {', '.join(roads)}"
-            )
+            raise DriveError(f"{path}: no camera '{name}' of the calibration, but {', '.join(roads)}")
         roads = {name: road}
     return (
         (replace(frame, name=f"{image.camera}_{frame.name}", stamp_s=image.stamp_s), roads[image.camera])

@@ -81,9 +81,7 @@ def detect_in_pieces(
 
 def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
     """The known pieces, by their first images, under the drive's numbers of images."""
-    return [
-        replace(found, image=start + found.image) for start, piece in pieces.items() for found in piece or ()
-    ]
+    return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
 
 
 def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]:

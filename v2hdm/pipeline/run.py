@@ -164,9 +164,8 @@ def _take_or_upload(
         if there is None:
             entry = _noted(made.folder, cache)
             record = {} if entry is None else {_RECORD: encode(entry)}
-            remote.upload(
-                place, {**remote.contents_of(made.folder), **record}, writer, partial(progress, "upload")
-            )
+            contents = remote.contents_of(made.folder) | record
+            remote.upload(place, contents, writer, partial(progress, "upload"))
         drop_result(made.folder)
     with suppress(OSError):  # other results wait there for their upload
         folder.rmdir()
@@ -249,9 +248,7 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
             raise ConfigError(NO_DRIVE)
         return config.drive.paths
     if config.drive.paths:
-        raise ConfigError(
-            "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
-        )
+        raise ConfigError("both simulate and drive.path are set: a run takes one, remove the other")
     from v2hdm.simulate import rendered_drive
 
     with context.timed("render"):

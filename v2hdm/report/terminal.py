@@ -98,9 +98,7 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
         lines = progress_lines(lambda line: plain(console, line))
         yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
         return
-    texts = [
-        TextColumn(text, markup=False) for text in ("{task.description:<20}", "{task.fields[stage]:<16}")
-    ]
+    texts = [TextColumn(one, markup=False) for one in ("{task.description:<20}", "{task.fields[stage]:<16}")]
     bar = (BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*texts, *bar, console=console) as bars:
         tasks: dict[str, TaskID] = {}

@@ -101,9 +101,7 @@ def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     """
     content = read_yaml(path, error)
     if not isinstance(content, dict):
-        raise error(
-            f"{path}: expected 'key: value' entries, got {shown(content)}; see the format's description"
-        )
+        raise error(f"{path}: expected 'key: value' entries, got {shown(content)}; see its description")
     return content
 
 

@@ -174,9 +174,8 @@ def _write_list(folder: Path) -> None:
     described = {path.relative_to(folder).as_posix(): _described(path) for path in files}
     size = sum(size for size, _ in described.values())
     partial = folder / f".{_WRITER}.part"
-    partial.write_text(
-        json.dumps({"about": _ABOUT, "bytes": size, "files": described}) + "\n", encoding="utf-8"
-    )
+    text = json.dumps({"about": _ABOUT, "bytes": size, "files": described})
+    partial.write_text(text + "\n", encoding="utf-8")
     partial.replace(folder / LIST)
 
 

@@ -141,9 +141,7 @@ class RemoteFolder:
             with self._asked():
                 self._files.get(names, [str(path) for path in places.values()])
         except FileNotFoundError as failure:
-            raise ConfigError(
-                f"{self.url}: {_first_line(failure)} went while it was copied; start again"
-            ) from None
+            raise ConfigError(f"{self.url}: {_first_line(failure)} went while copied; start again") from None
 
     def write(self, name: str, content: bytes | Path) -> None:
         """Put an object, given as bytes or as a file, in whatever one of that name has been."""
@@ -195,7 +193,7 @@ class RemoteFolder:
             if not in_bucket:
                 raise
             raise ConfigError(
-                f"{self.url}: no such bucket or container; make it, or give another {self._option}"
+                f"{self.url}: no such bucket; make it, or give another {self._option}"
             ) from None
         except Exception as failure:  # each package has errors of its own
             advice = f"check the network and start again, or give another {self._option}"

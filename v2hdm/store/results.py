@@ -130,7 +130,7 @@ class _Target:
         for left in (unfinished, previous):
             if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
                 raise ConfigError(
-                    f"{left}: is in the way of our work and not ours; move it, or give another {self.option}"
+                    f"{left}: is in our way and not ours; move it, or give another {self.option}"
                 )
         if previous.exists() and not self.path.exists():
             previous.replace(self.path)

@@ -29,8 +29,7 @@ def take_ipm(content: object, where: str) -> FloatArray:
     for axis in (1, 0) * 4 if invertible else ():
         balanced = balanced / np.linalg.norm(balanced, axis=axis, keepdims=True)
     if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
-        advice = "calibrate it again from at least 4 point pairs"
-        raise DriveError(f"{where}: IPM matrix is not invertible; {advice}")
+        raise DriveError(f"{where}: IPM matrix is not invertible; calibrate it from 4 or more point pairs")
     return np.asarray(ipm / np.linalg.norm(ipm))
 
 
@@ -83,9 +82,7 @@ def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray
     if (rays[:, 2] <= 0).all() and lowest[2] > 0:
         raise DriveError(f"{where}: lies behind the camera; give ground that it sees, x forward and y left")
     if not _in_image(info, rays if (rays[:, 2] > 0).any() else -rays).any():
-        raise DriveError(
-            f"{where}: lies outside the image, as the camera is mounted by its initial IPM; mend one of them"
-        )
+        raise DriveError(f"{where}: lies outside the image, by the initial IPM; mend one of them")
 
 
 def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
@@ -118,8 +115,7 @@ def take_centre_prior(content: object, where: str) -> CentrePrior:
     sigmas = sigma if isinstance(sigma, list) else [sigma] * 3
     sigma_m = take_array(sigmas, (3,), f"{where}, sigma_m", DriveError)
     if (sigma_m <= 0).any():
-        advice = "give the survey's standard deviation in metres"
-        raise DriveError(f"{where}, sigma_m: must be positive; {advice}")
+        raise DriveError(f"{where}, sigma_m: must be positive; give the survey's standard deviation in m")
     return CentrePrior(take_array(entry["xyz"], (3,), f"{where}, xyz", DriveError), sigma_m)
 
 

@@ -113,14 +113,11 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
             if key not in content:
-                advice = "frame of the map, vehicle of the vehicle"
-                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: {advice}")
+                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: frame the map's, vehicle the vehicle's")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
-        transforms = streams.TfStream(True, where)
-        tf_folder = sources.want(transforms)
-        return lambda: readings_of_poses(
-            transforms.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where)
-        )
+        tf = streams.TfStream(True, where)
+        tf_folder = sources.want(tf)
+        return lambda: readings_of_poses(tf.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where))
     for key in ("frame", "vehicle"):
         if key in content:
             raise DriveError(f"{where}, {key}: only for {TF_TOPIC}; drop it")
@@ -205,8 +202,7 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
                     (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
-            problem = f"not readable as a video ({reason})"
-            raise DriveError(f"{path}: {problem}; convert or copy it again") from None
+            raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
         write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)

@@ -103,8 +103,7 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
         turn = _VEHICLE_FROM_CAMERA_AXES
         rotation, points = turn @ rotation @ turn.T, points @ turn.T
     elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
-        advice = "say axes: camera if they are KITTI's own"
-        raise DriveError(f"{path}: the poses' z axis does not point up; {advice}")
+        raise DriveError(f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's")
     rows = in_order(stamp_s, str(path))
     return readings_of_poses(Trajectory(stamp_s[rows], make_transform(rotation[rows], points[rows])))
 

@@ -141,9 +141,7 @@ class _Reader:
 
     def add(self, properties: Mapping[str, Any], geometry: Geometry | None, where: str) -> None:
         if geometry is None and not properties.keys() & set(LAYERS):
-            raise MapFileError(
-                f"{where}: has neither a geometry nor '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it"
-            )
+            raise MapFileError(f"{where}: has no geometry, '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it")
         if geometry is not None and geometry.closed and len(geometry.positions) < 3:
             raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
         geodetic = geometry is not None and self._origin is not None
@@ -153,9 +151,7 @@ class _Reader:
         stored = _stored(properties, closed, where)
         feature = stored if geometry is None else _believed(stored, geometry, self._origin, self._rounding)
         if closed and not feature.symbol and len(feature.points_map) != 4:
-            raise MapFileError(
-                f"{where}: a marking has four corners, this has {len(feature.points_map)}; mend its outline"
-            )
+            raise MapFileError(f"{where}: a marking has four corners, not {len(feature.points_map)}; mend it")
         if feature is not stored and len(stored.points_map):
             self._edited.append(len(self._features))
         self._features.append(feature)
@@ -257,8 +253,7 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     kind, parts = entry.get("type"), entry.get("coordinates")
     closed = kind in ("Polygon", "MultiPolygon")
     if not closed and kind not in ("LineString", "MultiLineString"):
-        advice = "draw markings as Polygons, lanes as LineStrings"
-        raise MapFileError(f"{where}: its geometry is a {kind}; {advice}")
+        raise MapFileError(f"{where}: its geometry is a {kind}; draw Polygons (markings) or LineStrings")
     for _ in range({"Polygon": 1, "MultiPolygon": 2, "MultiLineString": 1}.get(str(kind), 0)):
         if not isinstance(parts, list) or len(parts) != 1:
             raise MapFileError(f"{where}: its {kind} has holes or several parts; split it")

@@ -133,17 +133,11 @@ def _suspicious(facts: Facts) -> dict[str, list[str]]:
     kinds = {one.id: one.kind for one in facts.hd_map.markings} if facts.hd_map else {}
     rows = {}
     for one in facts.best.get("suspicious") or []:
-        number, tests = (
-            one["marking"],
-            {name: one[f"p_{name}"] for name in ("shape", "residuals", "sightings")},
-        )
+        number = one["marking"]
+        tests = {name: one[f"p_{name}"] for name in ("shape", "residuals", "sightings")}
         if number in kinds:
-            cells = [
-                str(number),
-                tables.name_of(kinds[number]),
-                f"{one['p']:.2g}",
-                min(tests, key=tests.__getitem__),
-            ]
+            cells = [str(number), tables.name_of(kinds[number]), f"{one['p']:.2g}"]
+            cells.append(min(tests, key=tests.__getitem__))
             cells += [*(f"{p:.2g}" for p in tests.values()), f"{100 * one['disputed']:.0f}"]
             rows[f"m{number}"] = cells
     return rows

@@ -84,9 +84,7 @@ def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
 
 def relative_m(markings: Iterable[Marking]) -> FloatArray:
     """The 95 % radius (M,), m, of what a marking adds to the error of a distance to its neighbours."""
-    return np.array(
-        [SIGMAS_95 * one.relative_sigma_m for one in markings if one.relative_sigma_m is not None]
-    )
+    return np.array([SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None])
 
 
 def key_figures(facts: Facts) -> tuple[Figure, ...]:

@@ -128,9 +128,7 @@ def check_road(drive: Drive) -> Iterator[Finding]:
     if drive.road is None or len(drive.road.points_map) < 2:
         yield passed("road", "poses", "the ground was recorded as the plane z = 0", 0.0, "deg")
         return
-    reach_m = max(
-        float(np.linalg.norm(camera.roi_vehicle, axis=1).max()) for camera in drive.cameras.values()
-    )
+    reach_m = max(float(np.linalg.norm(one.roi_vehicle, axis=1).max()) for one in drive.cameras.values())
     worst = unevenness(drive.road, reach_m)
     lean_rad = worst.value_m / worst.distance_m
     sigma_rad = max(drive.pose_noise.roll_pitch_rad, _LEAST_SWAY_RAD)

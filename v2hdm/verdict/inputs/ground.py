@@ -190,9 +190,7 @@ def check_ground(
     rival = rival_of(ground)
     if rival is not None:
         return [_read_as(name, estimate, rival) for name, estimate in ground.items()]
-    findings = [
-        finding for name, estimate in ground.items() for finding in _camera(drive, name, estimate, cause)
-    ]
+    findings = [finding for name, one in ground.items() for finding in _camera(drive, name, one, cause)]
     return [*findings, *_clocks(ground)]
 
 

@@ -211,9 +211,7 @@ def _cause(motion: Motion, path: Path | None) -> str | None:
             "the heading's antennas from yaw"
         )
     if _turns_too_fast(motion):
-        return (
-            "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
-        )
+        return "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw"
     return "heading and path have nothing to do with each other; check that both are of one drive"
 
 

@@ -41,9 +41,7 @@ def check_clocks(drive: Drive, motion: Motion) -> Iterator[Finding]:
     if motion.moving.any():
         yield from _pose_rate(drive, motion)
         yield _held(motion)
-    stamps = {
-        name: [image.stamp_s for image in drive.images if image.camera == name] for name in drive.cameras
-    }
+    stamps = {name: [one.stamp_s for one in drive.images if one.camera == name] for name in drive.cameras}
     spans = {name: (own[0], own[-1]) for name, own in stamps.items() if own}
     for name, own in stamps.items():
         yield _posed(drive, name, len(own))

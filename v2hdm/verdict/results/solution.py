@@ -169,9 +169,8 @@ def _observable(tested: list[Contradiction]) -> list[Contradiction]:
 
 def _corrected(one: Contradiction) -> Finding:
     done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
-    return _input(
-        one, Status.WARN, f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
-    )
+    says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
+    return _input(one, Status.WARN, says)
 
 
 def _unknown(one: Contradiction) -> Finding:

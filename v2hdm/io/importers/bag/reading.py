@@ -187,8 +187,7 @@ def _check_database(path: Path) -> None:
         header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
-        problem = f"was not closed, {journal.name} holds its end"
-        raise DriveError(f"{path}: {problem}; mend it with 'ros2 bag reindex'")
+        raise DriveError(f"{path}: was not closed, {journal.name} holds its end; run 'ros2 bag reindex'")
     if len(header) < 100:
         return
     page_bytes = int.from_bytes(header[16:18], "big")

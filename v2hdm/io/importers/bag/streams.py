@@ -211,9 +211,7 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     """
     files = bag_files(path)
     folders = [entry_folder(cache, files, stream.label, stream.settings) for stream in streams]
-    missing = {
-        folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
-    }
+    missing = {folder: one for folder, one in zip(folders, streams, strict=True) if not is_whole(folder)}
     if not missing:
         return folders
     size_mb = sum(file.stat().st_size for file in files) / 1e6
