@@ -13,8 +13,7 @@ if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
 _EVERY_S = 10.0  # between two lines on one task
 
 
-Steps = Callable[[int, int], None]
-"""Progress of one task: called with how many steps are done, and of how many."""
+Steps = Callable[[int, int], None]  # called with how many steps of one task are done, and of how many
 
 
 class Progress(Protocol):

@@ -26,7 +26,8 @@ from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration import read_calibration, read_provenance, write_calibration, write_camera_info
+from v2hdm.io.calibration.reading import read_calibration, read_provenance
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.drive import read_drive
 from v2hdm.records import Calibration, CameraInfo
 from v2hdm.verdict import Status

@@ -11,7 +11,10 @@ import pytest
 
 from tests.maps.gis import ORIGIN, move_feature, street
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, read_map, write_geojson, write_geopackage
+from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_map
 from v2hdm.io.maps.surveyed import match
 from v2hdm.records import HdMap, Marking
 

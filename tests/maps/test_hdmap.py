@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.io.calibration import read_calibration, write_calibration
-from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, read_verdict, with_heights, write_geojson
+from v2hdm.io.calibration.reading import read_calibration
+from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.evidence import (
     ExcludedMarking,
     Residuals,
@@ -22,6 +22,10 @@ from v2hdm.io.maps.evidence import (
     write_exclusions,
     write_residuals,
 )
+from v2hdm.io.maps.features import with_heights
+from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_verdict
 from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
 from v2hdm.store.files import load_yaml
 

@@ -13,9 +13,9 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import adjoint, camera_centre, inverse, log
 from v2hdm.records import Calibration, FloatArray
 
-FALSE_ALARM = 1e-3
-"""Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
-
+FALSE_ALARM = (
+    1e-3  # probability that a camera at rest is said to have moved: once in 20 years, checked weekly
+)
 _MISSED = 0.05  # probability with which a movement of the size reported as detectable would be missed
 # Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens: more of
 # it turns into pitch, yaw and height.

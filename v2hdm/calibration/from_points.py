@@ -24,7 +24,8 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.io.calibration import Provenance, write_calibration, write_camera_info
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.outputs import write_json
 from v2hdm.store.files import dump_yaml

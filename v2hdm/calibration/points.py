@@ -14,9 +14,7 @@ from v2hdm.io.importers.tables import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
-COLUMNS = ("u", "v", "x", "y")
-"""Pixel (centre of the first at 0, 0) and place in the vehicle frame (x forward, y left, m)."""
-
+COLUMNS = ("u", "v", "x", "y")  # pixel (centre of the first at 0, 0) and place, m forward and left
 LEAST_POINTS = 4  # a homography has eight degrees of freedom, a point two coordinates
 _ALIASES: Mapping[str, str] = {"u_px": "u", "v_px": "v", "x_m": "x", "y_m": "y"}
 _NAME = "name"

@@ -25,7 +25,7 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON list instead of lines")
     parsed = parser.parse_args(arguments)
     from v2hdm.calibration.compare import compare_calibrations, turned_alike
-    from v2hdm.io.calibration import trusted_calibrations
+    from v2hdm.io.calibration.reading import trusted_calibrations
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
     movements = compare_calibrations(before, after)

@@ -248,7 +248,6 @@ _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous
 
 
 def _advice(message: str, schema: type[Any]) -> str:
-    """Advice on an error of Hydra."""
     if _UNQUOTED.search(message):
         return "a value with signs or letters of its own wants quotes: \"drive.path='müll (1)'\""
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)

@@ -139,7 +139,6 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
 
 
 def _report(stopwatch: Stopwatch) -> None:
-    """How long it took, on stderr."""
     import numpy as np
 
     from v2hdm.detection.stopwatch import TOTAL

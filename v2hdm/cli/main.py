@@ -17,12 +17,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm import __version__
 from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, describe, one_line
+from v2hdm.progress import Steps, progress_lines
 
 if TYPE_CHECKING:
     from v2hdm.records import Drive
@@ -191,6 +193,11 @@ def result_of(folder: Path, settings: Mapping[str, object]) -> Iterator[Path]:
     with result_folder(folder, "--output") as unfinished:
         (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
         yield unfinished
+
+
+def steps_of(task: str) -> Steps:
+    """Progress of a task as lines on stderr."""
+    return partial(progress_lines(partial(print, file=sys.stderr, flush=True)), task)
 
 
 def exit_code(verdict: Verdict) -> int:

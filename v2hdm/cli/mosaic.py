@@ -6,11 +6,10 @@ docs/mosaic.md describes it.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import parser_of
+from v2hdm.cli.main import parser_of, steps_of
 from v2hdm.errors import DriveError, MapFileError
 
 
@@ -41,7 +40,8 @@ def run(arguments: Sequence[str]) -> None:
     if drive.joined:
         raise MapFileError(f"{parsed.result} is of several drives; a mosaic shows one: map them one by one")
     with added_to(parsed.result, "RESULT") as folder:
-        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, _show)["sharpness"]
+        steps = steps_of("put images on the ground")
+        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)["sharpness"]
     if found["edges"]:
         print(
             f"paint edges {100 * found['edge_width_before_m']:.1f} cm wide before, "
@@ -49,8 +49,3 @@ def run(arguments: Sequence[str]) -> None:
             f"{found['after_over_before']:.1f} times as sharp (median of {found['edges']} sides)"
         )
     print(f"mosaic in {parsed.result}")
-
-
-def _show(done: int, total: int) -> None:
-    if done == total or done % 200 == 0:
-        print(f"put {done} of {total} images on the ground", file=sys.stderr, flush=True)

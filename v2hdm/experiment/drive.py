@@ -143,7 +143,6 @@ def _find(job: Job, workers: int, progress: Progress) -> None:
 
 
 def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
-    """The drive itself: truth, route, cameras, and one image of each."""
     job.folder.mkdir(parents=True, exist_ok=True)
     sets = camera_sets(drive)
     manual = {} if job.site.simulate is None else surveyed_cameras(job.site.simulate)

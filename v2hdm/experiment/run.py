@@ -102,8 +102,7 @@ def _work(job: Job) -> dict[str, Any]:
         return drive_record(job, 1, report)
 
 
-_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")
-"""Columns of the main table that the terminal shows."""
+_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")  # columns on the terminal
 
 
 def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:

@@ -31,8 +31,7 @@ _QUIET = {
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Workers share the cores among them; linear algebra of one takes one."""
 
-DETECTORS_A_GPU = 8
-"""Actors that detect on one GPU: each takes memory there, and most of an image's time is the CPU's."""
+DETECTORS_A_GPU = 8  # actors on one GPU: each takes memory there, and most of an image's time is the CPU's
 
 NO_GPU = (
     "device=cuda or detector.device=cuda is set, and none of Ray's machines has a GPU: set them to cpu, or "

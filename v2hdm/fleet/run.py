@@ -92,7 +92,6 @@ class _Table:
 
 
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, progress: DriveProgress) -> None:
-    """Map the drives, as many at a time as there are cores."""
     from v2hdm.fleet.workers import ProgressActor, map_drive, open_detectors
 
     cores, gpus = (int(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))

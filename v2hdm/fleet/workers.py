@@ -31,13 +31,10 @@ from v2hdm.store.cache import Line, StageCache, log_again, recorded
 
 _Result = TypeVar("_Result")
 
-IMAGES_A_BATCH = 8
-"""Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
-
+IMAGES_A_BATCH = 8  # images of one call: seconds of work against a millisecond of Ray's
 _BATCHES_AHEAD = 2  # calls that wait at each actor, so that it is never idle between them
 _DRIVES_KEPT = 4
-_CORES_EACH = 0.5
-"""Booked for a task: the other half of its core is an actor's that detects, which then has nothing to do."""
+_CORES_EACH = 0.5  # of a task: the other half is of an actor that detects, which has nothing to do meanwhile
 _REPORT_EVERY_S = 0.5
 
 

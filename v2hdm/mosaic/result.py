@@ -16,7 +16,7 @@ from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.extras import need
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
 from v2hdm.mosaic.sharpness import (
@@ -35,12 +35,8 @@ from v2hdm.report.outputs import write_json
 from v2hdm.report.page.facts import read_cameras
 from v2hdm.store.files import whole_file
 
-LARGEST_PICTURE_PX = 8192
-"""Limit of either side of the picture, which graphics cards of computers and phones alike can draw."""
-
-MULTIPLE_PX = 256
-"""Sides of a canvas are multiples of it, so that pictures reduced by up to that factor fit it exactly."""
-
+LARGEST_PICTURE_PX = 8192  # of either side of the picture: graphics cards of computers and phones draw that
+MULTIPLE_PX = 256  # divides sides of a canvas, so that pictures reduced by up to that factor fit it exactly
 _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
 _SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen

@@ -77,9 +77,7 @@ class Canvas:
         return west, north - self.rows * self.cell_m, west + self.columns * self.cell_m, north
 
 
-FEATHER = 1 / 15
-"""Band at the edge of what is trusted over which the weight rises from 0 to 1, in heights of the image."""
-
+FEATHER = 1 / 15  # band at the edge of what is trusted where the weight rises to 1, in heights of the image
 _OUTLINE_STEP_PX = 16  # distance of the points by which the outline of what is trusted is laid on the ground
 
 

@@ -14,17 +14,16 @@ from scipy.spatial import cKDTree
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.maps import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
 from v2hdm.io.maps.evidence import read_exclusions
+from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
+from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.figures import save_changes
 from v2hdm.site.changes import Base
 
-_SITE_M = 40.0
-"""A marking farther from all of a drive's route is not seen from it, m: twice what a camera reaches."""
-
+_SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
 _POSITION_SIGMA_M = 0.02  # sigma of a written pose's height by which its road is laid flat, m
 LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
 

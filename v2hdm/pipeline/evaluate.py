@@ -18,8 +18,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_figures, growth_figures, headline, map_figures
 
-CameraSets = Mapping[str, Mapping[str, MethodResult]]
-"""Results by camera set (``front``, ``rear``, ``both``), then by method."""
+CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
 
 
 @dataclass(frozen=True)

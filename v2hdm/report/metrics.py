@@ -21,9 +21,7 @@ from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
 
 MATCH_GATE_M = 2.0  # a mapped marking farther than this from every true one of its class is false
-MIN_SIGHTINGS = 3
-"""A marking was driven past when this many images show all of it inside the region of interest."""
-
+MIN_SIGHTINGS = 3  # images that show all of a marking in the region of interest, for it to be driven past
 FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unoccluded
 
 

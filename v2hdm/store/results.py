@@ -26,8 +26,7 @@ from v2hdm.store.lock import HOST, take_lock
 _log = logging.getLogger(__name__)
 
 _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
-"""The disk is at fault, whatever was being written."""
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)  # the disk is at fault
 
 
 class _Target:

@@ -166,7 +166,6 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _stamps_of(paths: Sequence[Path], stamps_path: Path, thing: str) -> FloatArray:
-    """The stamps (N,) of numbered files."""
     stamps = _read_stamps(stamps_path)
     numbers = [int(path.stem) for path in paths]
     if numbers[-1] >= len(stamps):

@@ -74,7 +74,6 @@ def _tables_folder(path: Path) -> Path | None:
 
 
 def _table(path: Path) -> dict[str, Row]:
-    """The rows of a table by their tokens."""
     rows = read_json(path, DriveError)
     if not isinstance(rows, list) or not all(isinstance(row, dict) and "token" in row for row in rows):
         raise DriveError(f"{path}: expected a list of rows with a 'token' each; restore the table")

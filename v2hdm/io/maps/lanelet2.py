@@ -251,7 +251,6 @@ class _Document:
 
 
 def _part(owner: Feature, number: int) -> int:
-    """The id of a part of a feature."""
     return _FIRST_PART + owner.id * _PARTS + number
 
 

@@ -41,9 +41,7 @@ _TEXT_ROUNDING, _BINARY_ROUNDING, _LOCAL_ROUNDING_M = (1e-9, 1e-9, 1e-4), (1e-11
 RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
 """Members of GeoJSON that state how coordinates are rounded, m or degrees, for GDAL since 3.9."""
 
-EXACT = ("heights_m", "covariance_m2")
-"""Columns of a GeoPackage that hold JSON, beside that of the coordinates."""
-
+EXACT = ("heights_m", "covariance_m2")  # columns of a GeoPackage with JSON, beside the coordinates
 LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 """Layers of a GeoPackage by the property that holds the coordinates of their features."""
 

@@ -27,8 +27,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
 CELLS = (9, 16)  # rows and columns that an image is divided into for the mean residual of each
-_LEAST_IN_CELL = 10
-"""Observations of a cell from which its mean is drawn: its error is a third of one observation's."""
+_LEAST_IN_CELL = 10  # observations from which a mean is drawn: its error is a third of one's
 
 _RC: dict[Any, Any] = RC | {
     "axes.titleweight": "normal",

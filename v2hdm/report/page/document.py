@@ -59,7 +59,6 @@ def document(facts: Facts) -> SimpleNamespace:
 
 
 def _summary(facts: Facts) -> str:
-    """The contents of the map in a sentence."""
     hd_map = facts.hd_map
     if hd_map is None:
         return "No map came of this drive."

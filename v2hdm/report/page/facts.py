@@ -15,12 +15,12 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.io.calibration import read_calibration
+from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
 from v2hdm.report.metrics import way_along

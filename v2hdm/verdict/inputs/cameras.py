@@ -142,7 +142,6 @@ def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
 
 
 def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
-    """Height, tilt and direction of the guess."""
     height = float(camera_centre(cam_from_vehicle)[2])
     yield judge(
         "camera height", name, height, _HIGHEST_M, "m", least=_LOWEST_M,

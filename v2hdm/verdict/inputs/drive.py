@@ -96,12 +96,8 @@ def check_drive(
 def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None) -> list[Finding]:
     """The findings of :func:`check_drive`; causes without their consequences.
 
-    Args:
-        drive: the drive.
-        ground: estimates of bare ground by camera; cameras that it leaves out are checked without.
-
-    Raises:
-        DriveError: a sampled image cannot be decoded.
+    Cameras that ``ground``, the estimates by camera, leaves out are checked without. Raises DriveError where
+    a sampled image cannot be decoded.
     """
     ground = ground or {}
     motion = Motion.of(drive)

@@ -180,13 +180,7 @@ def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
 def check_ground(
     drive: Drive, ground: Mapping[str, GroundEstimate], cause: str | None = None
 ) -> list[Finding]:
-    """All findings from the cameras' ground.
-
-    Args:
-        drive: the drive.
-        ground: by camera.
-        cause: the sentence that says why no ground matches, where that is known.
-    """
+    """All findings from the cameras' ground; ``cause`` says why none matches, where that is known."""
     rival = rival_of(ground)
     if rival is not None:
         return [_read_as(name, estimate, rival) for name, estimate in ground.items()]
@@ -284,7 +278,6 @@ def _asked_clocks(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
 
 
 def _is_off(clock: Parameter | None) -> bool:
-    """Whether a clock is off beyond doubt."""
     return clock is not None and clock.observable and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
 
 

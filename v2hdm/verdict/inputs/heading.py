@@ -106,9 +106,7 @@ class Path(Enum):
 def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
     """Whether the recorded poses drive where they point, z up.
 
-    Args:
-        motion: the recorded poses.
-        path: the verdict of the images' ground on the path; None where it was not asked or has none.
+    ``path`` is the verdict of the images' ground; None where it was not asked or has none.
     """
     if not len(motion.chords):
         return []  # the check of the path's length says so

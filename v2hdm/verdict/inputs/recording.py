@@ -256,5 +256,4 @@ def _roi_mask(camera: Camera, grey: np.ndarray) -> np.ndarray:
 
 
 def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
-    """At most ``count`` items, evenly spread."""
     return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, count).astype(int))]

@@ -56,9 +56,7 @@ def _difference(one: Calibration, other: Calibration) -> FloatArray:
 def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
     """Single cameras against one another and against all of them.
 
-    Args:
-        results: the optimised results by camera set; the last one is that of all cameras.
-        drive: for the driving direction.
+    ``results`` are the optimised ones by camera set, that of all cameras last.
     """
     together = list(results.values())[-1]
     alone = {name: one for name, one in results.items() if len(one.cameras) == 1}

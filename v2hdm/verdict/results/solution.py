@@ -92,9 +92,7 @@ _CORRECTED_BY = {
     Fault.SIZE: "all known sizes were left out of the result",
 }
 
-_RIVAL_LOG_ODDS = float(np.log(10.0))
-"""A cause that is up to ten times less likely than the likeliest is named beside it."""
-
+_RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 _MAP_AXES = ("east", "north")
 
@@ -106,10 +104,8 @@ def check_result(
 ) -> list[Finding]:
     """The checks after the solve, and the mapper's mountings against those of bare ground.
 
-    Args:
-        drive: the mapped drive.
-        methods: results by camera set, the one of all cameras last, then by method.
-        ground: of each session, by camera, the estimates of bare ground; empty where it was not asked.
+    ``methods`` are results by camera set, that of all cameras last, then by method, ``ground`` the estimates
+    of each session, by camera; empty where it was not asked.
     """
     best = list(methods.values())[-1][BEST]
     findings = check_solution(drive, methods)
@@ -189,7 +185,6 @@ def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
 
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
-    """The finding on a tested input."""
     check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
     return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
 

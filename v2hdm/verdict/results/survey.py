@@ -48,8 +48,7 @@ def check_points(table: CheckTable) -> Finding:
 def check_frame(found: Mapping[str, int]) -> list[Finding]:
     """A survey that fits the map not at all, or better when it is read in another way than stated.
 
-    Args:
-        found: corners that have a point within reach, as stated ("") and by other ways to read the file.
+    ``found`` counts corners that have a point within reach, as stated ("") and by other readings of the file.
     """
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
@@ -102,7 +101,6 @@ def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Fault:
 
 
 def _without(table: CheckTable, k: int) -> _Fault:
-    """The point ``k`` left out."""
     kept = np.delete(np.arange(2 * len(table.compared)), [2 * k, 2 * k + 1])
     one = table.compared[k]
     says = (
