@@ -63,9 +63,7 @@ def compare_calibrations(
     """
     common = [name for name in before if name in after]
     if not common:
-        raise MapFileError(
-            f"no camera in common: {', '.join(before)} and {', '.join(after)}; compare one vehicle"
-        )
+        raise MapFileError(f"no camera in common: {', '.join(before)} and {', '.join(after)}; compare others")
     return [movement(before[name], after[name]) for name in common]
 
 

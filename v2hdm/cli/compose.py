@@ -65,8 +65,7 @@ class Job:
             return output
         if "://" in output:
             raise ConfigError(
-                f"output={output}: a sweep writes to folders of this machine; give one, or map with one "
-                "setting at a time"
+                f"output={output}: a sweep writes to folders of this machine; give one, or sweep nothing"
             )
         return str(Path(output) / self.label)
 
@@ -153,8 +152,7 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
     """Compose ``conf/<name>.yaml`` with a run file, as ``--config-dir`` and ``+run=`` do, and overrides.
 
     What the run file names in a ``defaults`` list of its own is looked for beside it, where its folder is
-    called ``run``, and among the shipped ones. Raises ConfigError where the file is missing or damaged, or a
-    key or value is wrong.
+    called ``run``, and among the shipped ones. Raises ConfigError where the file, a key or a value is wrong.
     """
     if not isinstance(read_yaml(path, ConfigError), dict):  # OmegaConf would expand whatever aliases repeat
         raise ConfigError(f"{path}: expected 'key: value' entries; write it as conf/run/*.yaml are")

@@ -28,15 +28,12 @@ _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
 def run(arguments: Sequence[str]) -> None:
     """Detect in every image of a source."""
     parser = parser_of("detect")
-    parser.add_argument(
-        "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"
-    )
+    parser.add_argument("source", help="an image, a folder, a drive, a video, or a camera's index")
     parser.add_argument(
         "--camera",
         type=Path,
         metavar="FILE",
-        help="the camera's calibration: gives metres; or its intrinsics, as written by Kalibr, OpenCV, ROS "
-        "or COLMAP",
+        help="the camera's calibration: gives metres; or its intrinsics, by Kalibr, OpenCV, ROS, COLMAP",
     )
     parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
     parser.add_argument(

@@ -19,7 +19,7 @@ def run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
     parser = parser_of("export")
     parser.add_argument(
-        "source", type=Path, metavar="MAP", help="map.geojson, map.gpkg or calibration_<camera>.yaml"
+        "source", type=Path, metavar="MAP", help="map.geojson, .gpkg or calibration_<camera>.yaml"
     )
     parser.add_argument(
         "--format",
@@ -33,8 +33,7 @@ def run(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--projector",
         metavar="NAME",
-        help="of lanelet2: Local, LocalCartesian or MGRS (default: LocalCartesian for a map with an origin, "
-        "else Local)",
+        help="of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)",
     )
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to

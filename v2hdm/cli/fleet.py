@@ -18,7 +18,7 @@ def run(arguments: Sequence[str]) -> int:
     parser = parser_of("fleet")
     parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
     parser.add_argument(
-        "--workers", type=int, default=0, help="cores of this machine to use; 0, the default, takes all"
+        "--workers", type=int, default=0, help="cores of this machine to use; 0 (default): all"
     )
     parser.add_argument(
         "--address", default="local", help="of a running Ray cluster, or auto; without it one is started here"

@@ -161,12 +161,10 @@ def parser_of(name: str) -> argparse.ArgumentParser:
 def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     """Add what commands that read a drive have in common; ``result`` ends the name of the default folder."""
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
-    parser.add_argument(
-        "--camera", action="append", default=[], metavar="NAME", help="only this camera; may be repeated"
-    )
+    parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
     parser.add_argument("--format", default="auto", help="of the drive, as folder or kitti (default: auto)")
     parser.add_argument(
-        "--output", type=Path, metavar="DIR", help=f"folder of results (default: outputs/<drive>-{result})"
+        "--output", type=Path, metavar="DIR", help=f"results (default: outputs/<drive>-{result})"
     )
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
 

@@ -101,10 +101,8 @@ def jobs(config: ExperimentConfig) -> list[Job]:
     changed: dict[str, dict[str, Any]] = {
         OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}
     }  # fmt: skip
-    options = {
-        name: replace(deepcopy(config.mapping), **changed[name])
-        for name in dict.fromkeys([OURS, *config.recipes])
-    }
+    recipes = dict.fromkeys([OURS, *config.recipes])
+    options = {name: replace(deepcopy(config.mapping), **changed[name]) for name in recipes}
     folder = Path(config.output) / config.name / "drives"
     found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:

@@ -53,9 +53,7 @@ def run_experiment(
             write_tables(folder, measured)
             write_words(folder, measured, captions, config)
     except OSError as failure:
-        raise ConfigError(
-            f"output folder {folder} cannot be written: {failure.strerror}; set output="
-        ) from failure
+        raise ConfigError(f"{folder}: cannot be written ({failure.strerror}); set output=") from failure
     return folder, measured
 
 

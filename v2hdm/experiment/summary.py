@@ -235,10 +235,8 @@ def write_words(
 def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
     """The text in Markdown."""
     tested = claims(measured)
-    lines = [
-        [c.text, c.where, c.limit, c.figure, _with_range(c.shared), "yes" if c.holds else "**no**"]
-        for c in tested
-    ]
+    holds = ("**no**", "yes")
+    lines = [[c.text, c.where, c.limit, c.figure, _with_range(c.shared), holds[c.holds]] for c in tested]
     return _filled(
         "experiment.md",
         config=config,

@@ -130,8 +130,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
             place = job.place
             if place in taken:
                 raise ConfigError(
-                    f"{file}: its results go to {place}, as those of {taken[place]} do; give one of "
-                    "them another name"
+                    f"{file}: its results go to {place}, as those of {taken[place]}; name one otherwise"
                 )
             taken[place] = file
             jobs.append(job)

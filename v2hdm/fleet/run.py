@@ -53,8 +53,7 @@ def run_fleet(
 ) -> list[Row]:
     """Map the drives of run files: a row for each file, in their order, or one for a site.
 
-    The table is written anew whenever a drive is done. Raises V2hdmError where the table cannot be written,
-    or there is no Ray.
+    The table is written anew whenever a drive is done. Raises V2hdmError where it cannot, or without Ray.
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)

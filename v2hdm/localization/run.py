@@ -252,8 +252,7 @@ def summary_lines(found: Localised) -> list[str]:
     if not found.explained:
         lines.append(
             f"FAIL: the map explains {figures['matched_share']:.0%} of the detections, so that the figures "
-            "above cannot be relied on: is it of this site, as it is painted today, and does the drive begin "
-            "where its first pose says?"
+            "above cannot be relied on: is it of this site, as painted today, and is the first pose right?"
         )
     return lines
 

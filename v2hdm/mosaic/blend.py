@@ -132,8 +132,7 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
 def _tiles_under(polygon: FloatArray, limit: np.ndarray, side_px: int) -> np.ndarray:
     """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels.
 
-    Two convex shapes are apart if a side of either parts them; the box around the polygon is that of the
-    tiles' sides.
+    Two convex shapes are apart if a side of either parts them; the polygon's box is the tiles' sides.
     """
     low = np.maximum(np.floor((polygon.min(axis=0) - 1) / side_px).astype(int), 0)
     high = np.minimum(np.floor((polygon.max(axis=0) + 1) / side_px).astype(int) + 1, limit)
@@ -212,8 +211,7 @@ class Tiling:
             if max(errors, default=0.0) <= WARP_ERROR_PX:
                 return tiling
         raise ConfigError(
-            f"a resolution of {canvas.cell_m:g} m a pixel is too coarse for what the cameras show close by; "
-            "give a finer one"
+            f"a resolution of {canvas.cell_m:g} m a pixel is too coarse for these cameras; give a finer one"
         )
 
     def error_px(self, cell_m: float, shot: Shot, lens: Lens) -> float:

@@ -123,9 +123,8 @@ class Picture:
         reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
         seen = reduced[..., 3:]
         colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
-        self._rgba[row : row + rows, column : column + columns] = np.round(
-            np.concatenate([colours, 255 * seen], axis=2)
-        )
+        drawn = np.round(np.concatenate([colours, 255 * seen], axis=2))
+        self._rgba[row : row + rows, column : column + columns] = drawn
 
     def write(self, path: Path) -> None:
         """Write it as WebP, transparent where nothing was seen; whole or not at all."""
@@ -240,8 +239,7 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     taken_s = np.array([image.taken_s for image in drive.images])
     if adjusted.stamp_s[0] > taken_s.max() or adjusted.stamp_s[-1] < taken_s.min():
         raise MapFileError(
-            f"{folder / 'trajectory.tum'} and drive {drive.name} share no time: give the drive that this "
-            "result is of"
+            f"{folder / 'trajectory.tum'} and drive {drive.name} share no time: give the drive of this result"
         )
     drive = with_own_vehicle(drive, Detector.load())
     lenses = {

@@ -27,8 +27,7 @@ class Canvas:
     """``rows`` x ``columns`` square pixels of ``cell_m`` on the ground, seen from above.
 
     ``corner_map`` (2,) m is the outer corner of the first pixel, ``right_map`` (2,) the unit vector along
-    which columns rise; rows rise at a right angle to it, clockwise. A canvas whose columns rise to the east
-    has north above.
+    which columns rise; rows rise at a right angle to it, clockwise. North is above where columns rise east.
     """
 
     corner_map: FloatArray

@@ -31,8 +31,7 @@ LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the 
 def read_base(path: Path) -> Base:
     """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
 
-    Raises MapFileError where it is missing, damaged, of an older version or another method, or its verdict is
-    FAIL.
+    Raises MapFileError where it is missing, damaged, of an older version, of another method, or FAIL.
     """
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)

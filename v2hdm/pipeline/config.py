@@ -178,10 +178,7 @@ def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: 
     if has_base and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if drives > 1 and options.mode == INCREMENTAL:
-        raise ConfigError(
-            "mode=incremental maps one drive as the vehicle would; map several with mode=batch, or one by "
-            "one with map.base"
-        )
+        raise ConfigError("mode=incremental maps one drive as the vehicle would; map several with mode=batch")
     check_device(options.device)
 
 

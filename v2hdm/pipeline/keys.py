@@ -64,6 +64,5 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     files += [path for truth in truths for path in sorted(truth.rglob("*"))]
     read = [(str(path), file_digest(path)) for path in files if path.is_file()]
     of_drives = [contents.key(drive) for drive in drives]
-    return key_of(
-        code, asked, model_key(config.detector), [drive.root.resolve() for drive in drives], of_drives, read
-    )
+    roots = [drive.root.resolve() for drive in drives]
+    return key_of(code, asked, model_key(config.detector), roots, of_drives, read)

@@ -30,8 +30,7 @@ _NEAR_M = 22.0  # how far from the route, m, images may show a point: as far as 
 class Survey:
     """A survey as a run uses it: settings of the mapping with its control points, and its check points.
 
-    ``points`` are all of the file, ``elsewhere`` where they would lie, had it meant something else, by what
-    (N, 2).
+    ``points`` are all of the file, ``elsewhere`` where they would lie, had it meant something else (N, 2).
     """
 
     mapping: MappingOptions

@@ -222,8 +222,7 @@ class StageCache:
         except OSError as failure:
             self._can_write = False
             _log.warning(
-                "%s: nothing can be kept there (%s), so that a later run begins anew; free space or set "
-                "another cache=",
+                "%s: nothing can be kept there (%s): later runs begin anew; free space or set cache=",
                 path.parents[1], failure.strerror,
             )  # fmt: skip
         return decode(content, kind)

@@ -153,9 +153,7 @@ def drop_entry(folder: Path) -> None:
 
 def cannot_write(folder: Path, failure: OSError) -> DriveError:
     """The error of an import that finds no place."""
-    return DriveError(
-        f"{folder}: cannot write the import ({failure.strerror}); free space or choose another drive.cache"
-    )
+    return DriveError(f"{folder}: cannot be written ({failure.strerror}); free space or set drive.cache")
 
 
 def _partial(folder: Path) -> Path:

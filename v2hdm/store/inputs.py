@@ -76,7 +76,6 @@ def warn_if_changed(path: Path, data: bytes) -> None:
         if written and digest not in written and (path, digest) not in _reported:
             _reported.add((path, digest))
             _log.warning(
-                "%s: is not as we wrote it, so it was edited since or is damaged; if nobody edited it, "
-                "make it anew",
+                "%s: is not as we wrote it: edited since, or damaged; make it anew if nobody edited it",
                 path,
             )

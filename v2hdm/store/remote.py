@@ -192,9 +192,7 @@ class RemoteFolder:
         except FileNotFoundError:
             if not in_bucket:
                 raise
-            raise ConfigError(
-                f"{self.url}: no such bucket; make it, or give another {self._option}"
-            ) from None
+            raise ConfigError(f"{self.url}: no such bucket; make it or give another {self._option}") from None
         except Exception as failure:  # each package has errors of its own
             advice = f"check the network and start again, or give another {self._option}"
             if isinstance(failure, PermissionError) or "Credential" in type(failure).__name__:
@@ -210,8 +208,7 @@ def _first_line(failure: Exception) -> str:
 def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
     """The folder in ``cache`` that holds what is below a URL now, copied once for each content it has had.
 
-    Raises DriveError where there is no drive, a name of it leads out of its folder, or the copy cannot be
-    written.
+    Raises DriveError where there is no drive, a name of it leads out of its folder, or it cannot be copied.
     """
     there = {name: one for name, one in drive.listed().items() if not name.endswith("/")}
     if not there:
@@ -297,8 +294,7 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
         mine = next((one for one in known if one.is_of(there[name], place)), None)
         if mine is None:
             raise ConfigError(
-                f"{place}/{name}: was changed after we wrote it and is not replaced; move it, or "
-                "give another place"
+                f"{place}/{name}: was changed after we wrote it: move it, or give another place"
             )
         ours[name] = mine
     return ours
@@ -308,8 +304,7 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
     """Put a result in the place of an earlier one, whose objects that stay the same stay.
 
     ``contents`` are objects by name, as bytes or as files. The same ``writer`` may go on after it was
-    stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where another's object has a
-    name of ours.
+    stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where a name is taken.
     """
     new = {name: _Entry.of(name, content) for name, content in contents.items()}
     listing, ours = place.read(LIST), refuse_upload(place, writer)

@@ -128,9 +128,7 @@ class _Target:
         """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
         for left in (unfinished, previous):
             if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
-                raise ConfigError(
-                    f"{left}: is in our way and not ours; move it, or give another {self.option}"
-                )
+                raise ConfigError(f"{left}: is in our way, not ours; move it, or give another {self.option}")
         if previous.exists() and not self.path.exists():
             previous.replace(self.path)
         for left in (unfinished, previous):
@@ -173,8 +171,7 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
             for name, digests in (listed or {}).items():
                 if (target / name).is_file() and file_digest(target / name) not in digests:
                     raise ConfigError(
-                        f"{folder / name}: was changed after we wrote it and is not replaced; move it, or "
-                        f"give another {option}"
+                        f"{folder / name}: was changed after we wrote it: move it, or give another {option}"
                     )
             unfinished.mkdir()
             _write_list(unfinished, [])

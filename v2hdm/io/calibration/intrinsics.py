@@ -139,8 +139,7 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
         first, lens = _BEYOND[count]
         if any(values[first:]):
             raise DriveError(
-                f"{where}: a {lens} ({count} coefficients) is beyond our lens models; calibrate again with "
-                "5 or 8 coefficients"
+                f"{where}: a {lens} ({count} coefficients) is beyond our lenses; calibrate with 5 or 8"
             )
         values = values[:first]
     if count not in _BROWN_CONRADY:

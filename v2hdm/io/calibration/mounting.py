@@ -76,9 +76,8 @@ def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray
     if np.linalg.det(cam_from_ground) > 0:
         cam_from_ground = -cam_from_ground
     rays = np.column_stack([points, np.ones(len(points))]) @ cam_from_ground.T
-    lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(
-        info.intrinsic, [0.5 * info.width, info.height - 1.0, 1.0]
-    )
+    below_px = [0.5 * info.width, info.height - 1.0, 1.0]
+    lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(info.intrinsic, below_px)
     if (rays[:, 2] <= 0).all() and lowest[2] > 0:
         raise DriveError(f"{where}: lies behind the camera; give ground that it sees, x forward and y left")
     if not _in_image(info, rays if (rays[:, 2] > 0).any() else -rays).any():

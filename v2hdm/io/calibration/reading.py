@@ -88,8 +88,7 @@ def trusted_calibrations(path: Path) -> dict[str, Calibration]:
         found[calibration.info.name] = calibration
         if read_provenance(file).verdict == "FAIL":
             raise MapFileError(
-                f"{file}: the verdict on its drive is FAIL, so that it cannot be relied on; mend that drive "
-                "first (docs/verdict.md)"
+                f"{file}: the verdict on its drive is FAIL, so that it cannot be relied on: docs/verdict.md"
             )
     return found
 

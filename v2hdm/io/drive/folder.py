@@ -85,15 +85,13 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
-    truth_dir = None
+    truth = None
     if content.get("truth") is not None:
-        truth_dir = path / take_text(content["truth"], f"{where}: truth", DriveError)
-        if not truth_dir.is_dir():
-            raise DriveError(f"{where}: truth: no such folder {truth_dir}; restore it or drop the key")
+        truth = path / take_text(content["truth"], f"{where}: truth", DriveError)
+        if not truth.is_dir():
+            raise DriveError(f"{where}: truth: no such folder {truth}; restore it or drop the key")
     name = _name(content, path)
-    drive = Drive(
-        name, path, cameras, (), pose_noise, recorded.origin, truth_dir, recorded=recorded.trajectory
-    )
+    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=recorded.trajectory)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 

@@ -34,8 +34,7 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
 def drive_of(folder: Path, path: Path | None) -> Drive | None:
     """The drive of the result in ``folder``: at ``path``, else where it was; None where it is gone.
 
-    Raises MapFileError when the folder is no result of a run, DriveError when the drive cannot be read or is
-    another one.
+    Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that.
     """
     if not (folder / METRICS).is_file():
         raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm map")

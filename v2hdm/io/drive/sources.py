@@ -162,8 +162,7 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
                 stamp_s = np.array([float(path.stem) for path in paths])
             except ValueError:
                 raise DriveError(
-                    f"{where}: the images of {folder} are not named by their times; add stamps, a file with "
-                    "one time a line"
+                    f"{where}: the images of {folder} are not named by their times; add stamps, one a line"
                 ) from None
             order = np.argsort(stamp_s, kind="stable")
             stamp_s, paths = stamp_s[order], [paths[n] for n in order.tolist()]

@@ -101,8 +101,7 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
 
     ``crs`` is the projected system of eastings and northings, such as ``EPSG:32632``, ``geoid_m`` the height
     of the geoid above the ellipsoid, where heights count from the sea, and ``sigma_m`` that of points without
-    one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell does
-    not parse.
+    one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell wrong.
     """
     header, lines = read_rows(path, ";\t,", "point")
     names = _columns(header, path)

@@ -32,8 +32,7 @@ def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
     """The lanes between polylines (N, 2) m, in the order of their first line.
 
     A lane lies between a line and the nearest one across it, at a lane's width, for longer than it is wide.
-    Where one ends, those beside it are cut, too: neighbours share a bound from end to end, as lane changes
-    need.
+    Where one ends, those beside it are cut, too: for lane changes neighbours share all of a bound.
     """
     runs = _runs(lines_map)
     cuts = [_Cuts(line) for line in lines_map]

@@ -233,9 +233,8 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
             moved_cm = 100 * (np.linalg.inv(route.recorded) @ route.map_from_vehicle)[:, :2, 3]
             for axis, name in enumerate(("forward", "left")):
                 shift, band, look = moved_cm[:, axis], SIGMAS_95 * 100 * route.sigma[:, axis], _look(axis)
-                panels[1].fill_between(
-                    way_m, shift - band, shift + band, color=look["color"], alpha=0.15, lw=0
-                )
+                shade = {"color": look["color"], "alpha": 0.15, "lw": 0}
+                panels[1].fill_between(way_m, shift - band, shift + band, **shade)
                 panels[1].plot(way_m, shift, label=name, lw=1.1, **look)
             panels[1].axhline(0, color=MUTED, lw=0.6)
             panels[1].set_ylabel("correction (cm)")

@@ -207,9 +207,8 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     map_from_px, foot_map = np.full((len(of_image), 3, 3), np.nan), np.full((len(of_image), 2), np.nan)
     map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
     foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
-    seen, projected = (
-        apply_in_front(map_from_px[row_image], px[:, None])[:, 0] for px in (observed, observed + off)
-    )
+    ground = map_from_px[row_image]
+    seen, projected = (apply_in_front(ground, px[:, None])[:, 0] for px in (observed, observed + off))
     return GroundResiduals(
         cameras=names,
         camera=of_image[row_image],

@@ -146,8 +146,7 @@ def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
     yield judge(
         "camera height", name, height, _HIGHEST_M, "m", least=_LOWEST_M,
         fine="the guess puts the camera at the height of a vehicle",
-        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres) or the "
-        "guess",
+        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres)",
     )  # fmt: skip
     tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-cam_from_vehicle[0, 2], -1, 1))))
     if cam_from_vehicle[1, 2] > 0:  # upside down
@@ -167,9 +166,7 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
     lengths = np.linalg.norm(first), np.linalg.norm(second)
     ratio = float(lengths[0] / lengths[1] - 1)
     cosine = float(first @ second / (lengths[0] * lengths[1]))
-    value, part = (
-        (abs(ratio), "the focal length") if abs(ratio) > abs(cosine) else (abs(cosine), "the principal point")
-    )
+    value, part = max((abs(ratio), "the focal length"), (abs(cosine), "the principal point"))
     return judge(
         "ipm against camera matrix", name, value, _MISSHAPEN, "",
         fine="the IPM is a homography of this camera matrix",
@@ -201,8 +198,7 @@ def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: Flo
     return judge(
         "roi range", name, float(coarse), _COARSEST_M, "m/px",
         fine="a pixel shows little ground at the ROI's far end",
-        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m of ground; end it "
-        "nearer",
+        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m; end it nearer",
         status=Status.WARN,
     )  # fmt: skip
 

@@ -78,8 +78,7 @@ _UNTOLD = {
 class _Check:
     """The check of one parameter: its limit in the parameter's own unit, ``scale`` to ``unit``.
 
-    ``wrong`` is filled with the ``{size}`` and with one of the ``ways`` that a value can be positive or
-    negative.
+    ``wrong`` is filled with the ``{size}`` and with one of the ``ways`` for a positive and a negative value.
     """
 
     name: str
@@ -96,8 +95,7 @@ _CHECKS: Mapping[str, _Check] = {
     "focal_scale": _Check(
         "focal length from ground", _FOCAL, "%", 100.0, Status.FAIL, ("too short", "too long"),
         "the ground fits the focal length",
-        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate the "
-        "camera anew",
+        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate anew",
     ),
     "distortion_k1": _Check(
         "distortion", _DISTORTION, "", 1.0, Status.FAIL, ("larger", "smaller"),
@@ -367,7 +365,6 @@ _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     ),
     (
         upside_down,
-        "the ground matches once the images are turned by 180 deg: they are upside down; turn them, or the "
-        "calibration",
+        "the ground matches once the images are turned by 180 deg: they are upside down; turn them",
     ),
 )

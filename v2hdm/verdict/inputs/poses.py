@@ -143,8 +143,7 @@ def check_path(motion: Motion) -> list[Finding]:
         judge(
             "speed", "poses", speed, _FASTEST_MPS, "m/s",
             fine="the vehicle's speed is one of a road vehicle",
-            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; convert "
-            "them",
+            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; mend it",
         )
     ]  # fmt: skip
 

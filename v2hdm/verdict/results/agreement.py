@@ -177,8 +177,7 @@ def check_doubles(best: MethodResult) -> list[Finding]:
         judge(
             "double markings", "map", len(pairs) / len(markings), _DOUBLES_LIMIT, "",
             fine=says,
-            wrong=f"{says}{where}: laps or cameras do not agree; check clocks, the receiver's fix and the "
-            "mountings",
+            wrong=f"{says}{where}: laps or cameras do not agree; check clocks, fix and mountings",
         )
     ]  # fmt: skip
 

@@ -209,8 +209,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = (
-            f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, or change the "
-            "speed"
+            f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, change speed"
         )
         yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
@@ -253,15 +252,13 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         yield judge(
             "rejected", name, fit.rejected_share, _REJECTED_LIMIT, "",
             fine=f"{percent:.1f} % of its corners contradict the rest",
-            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is not "
-            "as stated",
+            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is wrong",
         )  # fmt: skip
     if evidence.held_out_loss is not None:
         yield judge(
             "held out", "map", evidence.held_out_loss, _HELD_OUT_LIMIT, "",
             fine="the map predicts corners that it has not seen as well as the noise allows",
-            wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
-            "left",
+            wrong="the map mispredicts corners that it has not seen: poses, clocks or lens still err",
         )  # fmt: skip
     if evidence.pose_noise:
         yield from _poses(evidence)
@@ -323,10 +320,7 @@ def _words(one: Contradiction) -> str:
         case Fault.CLOCK:
             late = "later" if one.value > 0 else "earlier"
             where = f" {one.about}" if one.about else ""
-            return (
-                f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than stamped: their "
-                "clock is off"
-            )
+            return f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than their stamps say"
         case Fault.CLOCK_DRIFT:
             return (
                 f"the clock of the images of {whose} runs {'slow' if one.value > 0 else 'fast'}: by "

@@ -60,10 +60,7 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
         "mend the file or mapping.survey.crs"
     )
     if not stated and not most:
-        says = (
-            "no corner of the map has a surveyed point within reach: mind datum, zone and units, and "
-            "mapping.survey.reach_m"
-        )
+        says = "no corner of the map has a surveyed point within reach: mind datum, zone, units, reach_m"
     return [Finding(FRAME, Status.WARN, float(stated), None, "", says, "survey")]
 
 

@@ -64,8 +64,7 @@ def _parts(path: Path) -> list[Path]:
 class Bag:
     """An open bag: a reader for each of its files, in the order of time.
 
-    Types are taken from the bag when needed: unknown definitions, such as services', do not concern other
-    topics.
+    Types are taken from the bag when needed: unknown definitions, such as services', matter to no other.
     """
 
     def __init__(self, path: Path, readers: Sequence[Any]) -> None:
