@@ -7,7 +7,6 @@ explains the points and by where cameras sit on vehicles. The likeliest one is n
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.outputs import write_json
-from v2hdm.store.files import dump_yaml
+from v2hdm.store.files import dump_yaml, replace_csv
 from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
@@ -222,16 +221,13 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
         "# For drive.yaml. images: name the list of your images (docs/drive-format.md).\n" + entry,
         encoding="utf-8",
     )
-    with (folder / POINTS_FILE).open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(_COLUMNS)
-        points, off = found.points, found.residuals
-        for k, name in enumerate(points.names):
-            shift = [*(f"{px:.3f}" for px in off.off_px[k]), *(f"{m:.4f}" for m in off.off_m[k])]
-            known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
-            table.writerow(
-                [name, *points.points_px[k].tolist(), *points.points_vehicle[k].tolist(), *shift, *known]
-            )
+    points, off, rows = found.points, found.residuals, []
+    for k, name in enumerate(points.names):
+        shift = [*(f"{px:.3f}" for px in off.off_px[k]), *(f"{m:.4f}" for m in off.off_m[k])]
+        known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
+        place = [*points.points_px[k].tolist(), *points.points_vehicle[k].tolist()]
+        rows.append([name, *place, *shift, *known])
+    replace_csv(folder / POINTS_FILE, [_COLUMNS, *rows])
     labels = found.points.labels
     save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
 

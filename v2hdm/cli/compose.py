@@ -46,13 +46,9 @@ def register(name: str, schema: type[Any]) -> None:
 
 @dataclass(frozen=True)
 class Job:
-    """One configuration to work on.
+    """One configuration to work on: ``settings``, and the same as text with all references resolved.
 
-    Attributes:
-        settings: the dataclass of the command.
-        yaml: the same as text, all references resolved, to be kept beside the results.
-        label: of a sweep (``--multirun``) the job's number and what it sets, as part of a file's name; None
-            where there is one job only.
+    ``label`` is, of a sweep (``--multirun``), the job's number and what it sets, as part of a file's name.
     """
 
     settings: Any
@@ -64,9 +60,7 @@ class Job:
         if self.label is None:
             return output
         if "://" in output:
-            raise ConfigError(
-                f"output={output}: a sweep writes to folders of this machine; give one, or sweep nothing"
-            )
+            raise ConfigError(f"output={output}: a sweep writes to folders of this machine; give one")
         return str(Path(output) / self.label)
 
 

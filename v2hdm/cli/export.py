@@ -18,9 +18,7 @@ from v2hdm.errors import ConfigError, MapFileError
 def run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
     parser = parser_of("export")
-    parser.add_argument(
-        "source", type=Path, metavar="MAP", help="map.geojson, .gpkg or calibration_<camera>.yaml"
-    )
+    parser.add_argument("source", type=Path, metavar="MAP", help="map.geojson, .gpkg, or calibration_*.yaml")
     parser.add_argument(
         "--format",
         action="append",

@@ -17,11 +17,9 @@ def run(arguments: Sequence[str]) -> int:
     """Map a fleet; 0, 2 where a drive gave no result, or 3 where a verdict is FAIL."""
     parser = parser_of("fleet")
     parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
+    parser.add_argument("--workers", type=int, default=0, help="cores of this machine; 0 (default): all")
     parser.add_argument(
-        "--workers", type=int, default=0, help="cores of this machine to use; 0 (default): all"
-    )
-    parser.add_argument(
-        "--address", default="local", help="of a running Ray cluster, or auto; without it one is started here"
+        "--address", default="local", help="of a running Ray cluster, or auto (default: a new one)"
     )
     parser.add_argument(
         "--table",

@@ -163,9 +163,7 @@ def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
     parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
     parser.add_argument("--format", default="auto", help="of the drive, as folder or kitti (default: auto)")
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help=f"results (default: outputs/<drive>-{result})"
-    )
+    parser.add_argument("--output", type=Path, metavar="DIR", help=f"results (outputs/<drive>-{result})")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
 
 

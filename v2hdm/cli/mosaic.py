@@ -18,9 +18,7 @@ def run(arguments: Sequence[str]) -> None:
     parser = parser_of("mosaic")
     parser.add_argument("result", type=Path, help="result folder of v2hdm map")
     parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
-    parser.add_argument(
-        "--resolution", type=float, metavar="M", default=0.02, help="side of a pixel (0.02 m)"
-    )
+    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="side of a pixel (0.02)")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it

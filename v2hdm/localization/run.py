@@ -151,9 +151,8 @@ def localize(
     drive, workers = as_drive(drive), workers or os.cpu_count() or 1
     check_together(hd_map, calibrations, drive)
     if detections is None:
-        detections = detect_all(
-            drive, DetectorOptions.for_mapping(), workers, progress or (lambda done, total: None)
-        )
+        report = progress or (lambda done, total: None)
+        detections = detect_all(drive, DetectorOptions.for_mapping(), workers, report)
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)
     attitude_rad = drive.pose_noise.roll_pitch_rad

@@ -114,9 +114,8 @@ def map_drive(
         checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
     paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
     about = describe_run(name or read.whole.name, read.whole, paths, reading)
-    unjudged = Result(
-        about, read.drives, read.contents, checked.drive_as_described, context.seconds, options.device
-    )
+    described, seconds = checked.drive_as_described, context.seconds
+    unjudged = Result(about, read.drives, read.contents, described, seconds, options.device)
     try:
         with closing(context.viewer):
             detections = _detect(checked.drive, read.contents, settings, context)

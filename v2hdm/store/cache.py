@@ -130,11 +130,8 @@ class StageCache:
     """The entries of a cache folder.
 
     The results of a stage have always been through the codec, and the log lines of their making are logged
-    again: a run that goes on with entries cannot tell them from results of its own.
-
-    Args:
-        folder: of the cache; None keeps nothing.
-        resume: whether entries are taken; otherwise everything is made anew, and kept.
+    again: a run that goes on with entries cannot tell them from results of its own. No ``folder`` keeps
+    nothing; without ``resume`` everything is made anew, and kept.
     """
 
     def __init__(self, folder: Path | None, resume: bool = True) -> None:

@@ -75,7 +75,5 @@ def warn_if_changed(path: Path, data: bytes) -> None:
                     written.add(str(entry["sha256"]))
         if written and digest not in written and (path, digest) not in _reported:
             _reported.add((path, digest))
-            _log.warning(
-                "%s: is not as we wrote it: edited since, or damaged; make it anew if nobody edited it",
-                path,
-            )
+            advice = "edited since, or damaged; make it anew if nobody edited it"
+            _log.warning("%s: is not as we wrote it: %s", path, advice)

@@ -293,9 +293,7 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
         known = (one for one in entries if one.file == name)
         mine = next((one for one in known if one.is_of(there[name], place)), None)
         if mine is None:
-            raise ConfigError(
-                f"{place}/{name}: was changed after we wrote it: move it, or give another place"
-            )
+            raise ConfigError(f"{place}/{name}: was changed after we wrote it: move it or give another place")
         ours[name] = mine
     return ours
 

@@ -131,10 +131,8 @@ class _Segments:
     @classmethod
     def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
         none, counts = np.empty((0, 2)), [max(len(line) - 1, 0) for line in lines_map]
-        start, end = (
-            np.concatenate([none, *(line[part] for line in lines_map)])
-            for part in (slice(None, -1), slice(1, None))
-        )
+        start = np.concatenate([none, *(line[:-1] for line in lines_map)])
+        end = np.concatenate([none, *(line[1:] for line in lines_map)])
         index = np.concatenate([np.arange(0), *map(np.arange, counts)])
         return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
 

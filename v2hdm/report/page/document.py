@@ -82,11 +82,8 @@ def _site(facts: Facts) -> str:
 
 def _ellipses(facts: Facts) -> str:
     markings = facts.hd_map.markings if facts.hd_map else ()
-    half_axes_m = {
-        "relative to neighbours": tables.relative_m(markings),
-        "absolute": tables.half_axes_m(markings),
-    }
-    series = {name: 100 * values for name, values in half_axes_m.items() if len(values)}
+    both = {"relative to neighbours": tables.relative_m, "absolute": tables.half_axes_m}
+    series = {name: 100 * values for name, of in both.items() if len(values := of(markings))}
     return charts.ellipse_chart(series) if series else ""
 
 

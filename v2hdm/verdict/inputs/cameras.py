@@ -108,10 +108,8 @@ def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[F
     if area < _ROI_AREA_M2:
         says = f"roi_vehicle covers {area:.2g} m2, less than a marking; enlarge it (metres, not kilometres)"
         return failed(area, _ROI_AREA_M2, "m2", says)
-    return [
-        passed("roi", name, "the ROI is in the image", seen),
-        _farthest(name, camera, cam_from_vehicle, grid[depth > 0]),
-    ]
+    farthest = _farthest(name, camera, cam_from_vehicle, grid[depth > 0])
+    return [passed("roi", name, "the ROI is in the image", seen), farthest]
 
 
 def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> Finding:
@@ -181,12 +179,8 @@ def _lens(name: str, info: CameraInfo) -> Finding:
     corners = np.array([[0.0, info.height / 2], [info.width - 1.0, info.height / 2]])
     pinhole = (undistort_points(info, corners) - info.intrinsic[:2, 2]) / np.diag(info.intrinsic)[:2]
     width_deg = float(np.rad2deg(np.arctan(np.abs(pinhole[:, 0])).sum()))
-    says = (
-        "the lens is undistorted by its coefficients"
-        if has_distortion(info)
-        else "the images count as free of distortion"
-    )
-    return passed("field of view", name, f"{width_deg:.0f} deg wide; {says}", width_deg, "deg")
+    bends = "the lens is undistorted by its coefficients" if has_distortion(info) else "it has no distortion"
+    return passed("field of view", name, f"{width_deg:.0f} deg wide; {bends}", width_deg, "deg")
 
 
 def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: FloatArray) -> Finding:

@@ -75,11 +75,8 @@ class Motion:
     def chords(self) -> Chords:
         """The chords of the stretches on which the vehicle moves."""
         stride = -(-len(self.stamp_s) // _MOST_STARTS)
-        pairs = [
-            (start, end)
-            for start in range(0, len(self.stamp_s), stride)
-            if (end := self._reached(start)) is not None
-        ]
+        starts = range(0, len(self.stamp_s), stride)
+        pairs = [(start, end) for start in starts if (end := self._reached(start)) is not None]
         first, last = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
         return Chords(first, last)
 

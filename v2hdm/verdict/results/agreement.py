@@ -93,10 +93,7 @@ def _offset(
     sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
-    cause = (
-        "their clocks or the forward survey of a centre disagree",
-        "a heading or a lateral survey disagrees",
-    )[axis]
+    cause = ("clocks or forward surveys of a centre disagree", "headings or lateral surveys disagree")[axis]
     return judge(
         "cameras apart", f"{first}, {second}", float(sigmas[axis]), _OFFSET_LIMIT_SIGMAS, "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",

@@ -87,10 +87,7 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
 }  # fmt: skip
 
 # How an input was corrected, where it was not just left out.
-_CORRECTED_BY = {
-    Fault.CLOCK: "the images were posed anew",
-    Fault.SIZE: "all known sizes were left out of the result",
-}
+_CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no known size was used"}
 
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
@@ -208,9 +205,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     loosest_s = max((one.sigma for one in clocks), default=0.0)
     if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
-        says = (
-            f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, change speed"
-        )
+        says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
         yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
     axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M})
