@@ -210,7 +210,9 @@ class Tiling:
             errors = [tiling.error_px(canvas.cell_m, shot, lenses[name]) for name, shot in first.items()]
             if max(errors, default=0.0) <= WARP_ERROR_PX:
                 return tiling
-        raise ConfigError(f"{canvas.cell_m:g} m a pixel is too coarse for these cameras; give a finer one")
+        raise ConfigError(
+            f"resolution of {canvas.cell_m:g} m is too coarse for these cameras; choose a finer"
+        )
 
     def error_px(self, cell_m: float, shot: Shot, lens: Lens) -> float:
         """The largest error, px, of interpolated positions in an image over the tiles that it shows."""
