@@ -32,5 +32,4 @@ class InProcess:
         return work
 
 
-IN_PROCESS = InProcess()
-"""The executor where no other is given."""
+IN_PROCESS = InProcess()  # the executor where no other is given

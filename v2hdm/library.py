@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.io.drive import read_drive
-from v2hdm.io.maps import read_map as _read
+from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HdMap, ImageDetections
 

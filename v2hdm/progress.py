@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
     from rich.console import Console
 
-_EVERY_S = 10.0
-"""Between two lines on one task."""
+_EVERY_S = 10.0  # between two lines on one task
 
 
-Steps = Callable[[int, int], None]
-"""Progress of one task: called with how many steps are done, and of how many."""
+Steps = Callable[[int, int], None]  # called with how many steps of one task are done, and of how many
 
 
 class Progress(Protocol):

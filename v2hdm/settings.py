@@ -12,8 +12,7 @@ from dataclasses import dataclass, is_dataclass
 
 from v2hdm.errors import ConfigError
 
-MOST_PROCESSES = 1024
-"""Processes or threads; more are a typing error, and take the machine's memory before they do any work."""
+MOST_PROCESSES = 1024  # or threads; more are a typing error, and take the machine's memory
 
 
 @dataclass(frozen=True)

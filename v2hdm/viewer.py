@@ -28,9 +28,7 @@ _log = logging.getLogger(__name__)
 
 VIEWERS = ("none", "rerun")
 
-FILE = "recording.rrd"
-"""The recording's name in a result folder."""
-
+FILE = "recording.rrd"  # the recording's name in a result folder
 _RESULT = "Opt"
 _ROUTE, _MARKING, _LANE, _SYMBOL = (
     [int(colour[at : at + 2], 16) for at in (1, 3, 5)]
@@ -43,8 +41,7 @@ _PNG = b"\x89PNG"
 class RerunViewer:
     """Shows a run in Rerun where there is a display, and always records it.
 
-    Raises:
-        ConfigError: rerun is not installed; the line names the extra that brings it.
+    Raises ConfigError where rerun is not installed.
     """
 
     def __init__(self, name: str = "v2hdm") -> None:
@@ -157,8 +154,7 @@ class RerunViewer:
 def check_viewer(name: str) -> bool:
     """Whether a run is to be watched by :class:`RerunViewer`.
 
-    Raises:
-        ConfigError: there is no viewer of this name.
+    Raises ConfigError where there is no viewer of this name.
     """
     if name not in VIEWERS:
         raise ConfigError(f"viewer is {shown(name)}: choose {' or '.join(VIEWERS)}")

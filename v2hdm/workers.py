@@ -26,8 +26,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
-_failure: list[Exception] = []
-"""Of the start of this worker process, for its first job to raise."""
+_failure: list[Exception] = []  # of the start of this worker process, for its first job to raise
 
 
 def share_out(

@@ -30,7 +30,7 @@ import yaml
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.drive.bags import messages_of, write_ros1, write_ros2
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
 from v2hdm.records import Marking

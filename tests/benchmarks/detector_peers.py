@@ -32,7 +32,7 @@ from train.scenes.views import looking
 from v2hdm.detection.frames import read_bgr
 from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
-from v2hdm.io.calibration import write_calibration
+from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.records import Calibration, CameraInfo
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 

@@ -25,8 +25,8 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import join_drives, read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader, read_base

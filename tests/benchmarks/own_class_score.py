@@ -22,7 +22,7 @@ import yaml
 from tests.benchmarks.own_class import RUN_FILE, stencils_of
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import ground_in_vehicle
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.records import ARROW, FloatArray, Symbol
 from v2hdm.report.metrics import MIN_SIGHTINGS
 from v2hdm.simulate.port.build import Port, build_port

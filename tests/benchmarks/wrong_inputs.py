@@ -28,7 +28,7 @@ from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.poses import poses_faults
 from v2hdm.cli import compose as hydra_config
 from v2hdm.errors import V2hdmError
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run

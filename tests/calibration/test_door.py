@@ -26,7 +26,8 @@ from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration import read_calibration, read_provenance, write_calibration, write_camera_info
+from v2hdm.io.calibration.reading import read_calibration, read_provenance
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.drive import read_drive
 from v2hdm.records import Calibration, CameraInfo
 from v2hdm.verdict import Status
@@ -266,7 +267,7 @@ TABLE = [(10.5, 20.0, 5.0, 1.0), (30.0, 20.5, 5.0, -1.0), (12.0, 12.0, 9.0, 1.5)
 TEXT = "u,v,x,y\n" + "".join(",".join(map(str, row)) + "\n" for row in TABLE)
 
 WRONG_TABLES = {
-    "empty": ("", "is empty; expected the columns u, v, x, y"),
+    "empty": ("", "holds no point; expected a line of column names"),
     "three": ("\n".join(TEXT.splitlines()[:4]), "3 points; 4 barely fix a camera"),
     "no header": (TEXT.split("\n", 1)[1], "no column 'u'; the first line must name u, v, x, y"),
     "millimetres by name": (TEXT.replace("x,y", "x_mm,y_mm"), "no column 'x'; .* it says: u, v, x_mm, y_mm"),

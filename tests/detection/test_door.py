@@ -21,7 +21,8 @@ from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.road import RoadDetector, draw_detections
 from v2hdm.detection.stopwatch import TOTAL, Stopwatch, lap
-from v2hdm.io.calibration import Provenance, write_calibration, write_calibration_as
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.io.calibration.writing import write_calibration, write_calibration_as
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 
 DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]

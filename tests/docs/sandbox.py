@@ -11,7 +11,8 @@ from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps import read_geojson, write_geopackage
+from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.records import Drive, Truth
 
 _COPIES = ("mysite", "monday", "friday", "port2_again")

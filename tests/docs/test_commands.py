@@ -19,7 +19,7 @@ from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
 from v2hdm.cli.main import COMMANDS
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 
 RUN_BY = {
     "docs/calibrate.md": "tests/calibration/test_door.py",

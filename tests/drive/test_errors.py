@@ -84,7 +84,7 @@ CASES: dict[str, tuple[Damage, str]] = {
     ),
     "drift over nothing": (
         edit("drive.yaml", r"position_drift_over_m: 25\.0", "position_drift_over_m: 0"),
-        r"position_drift_over_m: an error that fades over no distance",
+        r"position_drift_over_m: an error that fades over no way",
     ),
     "bad latitude": (edit("drive.yaml", r"latitude_deg: 53.5", "latitude_deg: 99"), r"latitude must lie"),
     "missing truth": (edit("drive.yaml", r"^truth: truth", "truth: elsewhere"), r"truth: no such folder"),

@@ -12,8 +12,9 @@ import yaml
 from tests.drive.example import camera_info, description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.geometry.lens import distort_points
-from v2hdm.io.calibration import Provenance, write_calibration, write_calibration_as
 from v2hdm.io.calibration.intrinsics import COLMAP_MODELS, read_intrinsics
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.io.calibration.writing import write_calibration, write_calibration_as
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 

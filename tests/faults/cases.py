@@ -15,8 +15,8 @@ import yaml
 
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
 from tests.faults.judge import Case, Prepare
-from v2hdm.io.calibration import write_calibration
-from v2hdm.io.maps import write_geojson
+from v2hdm.io.calibration.writing import write_calibration
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.records import Calibration
 
 CHECK = "v2hdm check"

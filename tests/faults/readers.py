@@ -10,7 +10,8 @@ from tests.drive.example import camera_info, looking_forward, make_map
 from tests.faults.cases import picture
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import V2hdmError
-from v2hdm.io.calibration import read_calibration, read_camera_info, write_calibration, write_camera_info
+from v2hdm.io.calibration.reading import read_calibration, read_camera_info
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.importers.nmea import read_nmea
 from v2hdm.io.importers.tables import read_kitti_rows, read_table
 from v2hdm.io.maps.geojson import write_geojson

@@ -208,7 +208,7 @@ def test_two_run_files_never_write_one_folder(tmp_path, drive):
     files[1].write_text(files[0].read_text())
     planned = plan(files, [])
     assert [job.name for job in planned.jobs] == ["one"]
-    assert "give one of them another name" in planned.refused[0].says
+    assert "name one otherwise" in planned.refused[0].says
 
 
 def test_the_drives_of_run_files_become_one_site(tmp_path):

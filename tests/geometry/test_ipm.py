@@ -25,7 +25,6 @@ from v2hdm.geometry.quadrilateral import (
     diameters,
     is_convex,
     is_convex_px,
-    long_axis,
     order_corners,
     quad_from_hull,
     side_frames,
@@ -239,10 +238,3 @@ def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
 @pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
 def test_points_that_enclose_nothing_give_no_quadrilateral(outline):
     assert quad_from_hull(cv2.convexHull(outline.astype(np.float32))) is None
-
-
-@pytest.mark.parametrize("shift", range(4))
-def test_the_axis_of_a_dash_does_not_depend_on_its_first_corner(shift):
-    dash = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 0.12], [0.0, 0.12]])
-    turned = np.roll(dash, shift, axis=0)
-    np.testing.assert_allclose(long_axis(turned), [1.0, 0.0], atol=1e-12)

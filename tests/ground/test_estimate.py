@@ -13,7 +13,7 @@ from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
 from v2hdm.ground.adjust import _by_stretch
 from v2hdm.ground.patches import read_grey
-from v2hdm.io.calibration import read_calibration
+from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.records import Trajectory
 from v2hdm.verdict.inputs.ground import scaled

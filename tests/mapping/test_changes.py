@@ -9,8 +9,8 @@ from tests.mapping.scene import ADDED, DIAMOND, MOVED, REMOVED, SceneOptions, ma
 from v2hdm.errors import MappingError
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import Fate, Lane, Marking
 from v2hdm.site.changes import Base, fused_markings

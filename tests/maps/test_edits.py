@@ -11,7 +11,10 @@ import pytest
 
 from tests.maps.gis import ORIGIN, move_feature, street
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, read_map, write_geojson, write_geopackage
+from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_map
 from v2hdm.io.maps.surveyed import match
 from v2hdm.records import HdMap, Marking
 
@@ -159,12 +162,12 @@ def test_ids_are_unique_and_stay_when_features_go_or_are_copied(tmp_path, caplog
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"coordinates": lambda rings: [[[122.05, 29.95, 12.0], *rings[0]]]}, "four corners, this has 5"),
+        ({"coordinates": lambda rings: [[[122.05, 29.95, 12.0], *rings[0]]]}, "four corners, not 5"),
         ({"coordinates": lambda rings: [rings[0], rings[0]]}, "holes or several parts"),
         ({"coordinates": lambda rings: [[[x, y + 500, z] for x, y, z in rings[0]]]}, "not in degrees"),
         ({"coordinates": lambda rings: "here"}, "holes or several parts"),
         ({"geometry": {"type": "Point", "coordinates": [0, 0]}}, "is a Point"),
-        ({"geometry": None, "corners_map": None}, "four corners, this has 0"),
+        ({"geometry": None, "corners_map": None}, "four corners, not 0"),
         ({"id": "three"}, "id: expected a finite number"),
         ({"id": 2**40}, "id: expected a whole number"),
         ({"class": None}, "class: expected a text as name"),

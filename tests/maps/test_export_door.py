@@ -16,19 +16,12 @@ from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration import (
-    CALIBRATION_FORMATS,
-    Provenance,
-    read_calibration,
-    read_camera_info,
-    read_provenance,
-    write_calibration,
-    write_calibration_as,
-)
-from v2hdm.io.maps import read_geojson, read_geopackage_verdict
+from v2hdm.io.calibration.reading import Provenance, read_calibration, read_camera_info, read_provenance
+from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration, write_calibration_as
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.records import Calibration
 
 VERDICT = {"status": "PASS"}
@@ -51,7 +44,7 @@ def test_every_format_of_a_map_is_documented():
 
 def test_the_verdict_goes_along(folder):
     assert run(["export", "map.geojson", "--format", "gpkg", "--output", "there"]) == 0
-    assert read_geopackage_verdict(folder / "there" / "map.gpkg") == VERDICT
+    assert read_verdict(folder / "there" / "map.gpkg") == VERDICT
 
 
 def test_an_edited_geopackage_becomes_the_geojson_again(folder):

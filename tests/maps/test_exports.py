@@ -20,8 +20,8 @@ from lanelet2.projection import LocalCartesianProjector, UtmProjector
 
 from tests.maps.gis import ORIGIN, street
 from v2hdm.errors import ConfigError
-from v2hdm.io.maps import FORMATS, check_formats, write_map
 from v2hdm.io.maps.closed_lanes import closed_lanes
+from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
 from v2hdm.io.maps.lanelet2 import grid_places
 from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.io.calibration import read_calibration, write_calibration
-from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, read_verdict, with_heights, write_geojson
+from v2hdm.io.calibration.reading import read_calibration
+from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.evidence import (
     ExcludedMarking,
     Residuals,
@@ -22,6 +22,10 @@ from v2hdm.io.maps.evidence import (
     write_exclusions,
     write_residuals,
 )
+from v2hdm.io.maps.features import with_heights
+from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_verdict
 from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
 from v2hdm.store.files import load_yaml
 
@@ -177,7 +181,7 @@ def damaged_map(origin=None, **properties):
         ("{", "line 1 JSON syntax error"),
         ("[]", "expected a JSON object"),
         ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
-        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither a geometry nor 'corn"),
+        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has no geometry, 'corn"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
         (damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}), "origin, latitude"),

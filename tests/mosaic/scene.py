@@ -13,11 +13,11 @@ from tests.cameras import mounted
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px, ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse
-from v2hdm.io.calibration import write_calibration
+from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import ReadOptions
 from v2hdm.io.drive.of_result import METRICS, told_of
 from v2hdm.io.drive.writing import write_drive
-from v2hdm.io.maps import write_geojson
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
 from v2hdm.records import (
     Calibration,

@@ -9,9 +9,10 @@ import pytest
 
 from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
+from v2hdm.io.drive import read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
-from v2hdm.pipeline.keys import Contents, read_drives, result_key
+from v2hdm.pipeline.keys import Contents, result_key
 from v2hdm.pipeline.run import RunResult, note_finished, take_or_make
 from v2hdm.store import remote
 from v2hdm.store.cache import code_key, key_of
@@ -39,7 +40,7 @@ class Work:
 
     def __call__(self, config, cache):
         self.done.append(config)
-        drives = read_drives(config, config.drive.paths)
+        drives = [read_drive(path, config.drive) for path in config.drive.paths]
         folder = Path(config.output) / run_name(config)
         with result_folder(folder) as unfinished:
             (unfinished / "maps").mkdir()

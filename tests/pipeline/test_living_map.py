@@ -15,8 +15,8 @@ from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.writing import write_drive
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory

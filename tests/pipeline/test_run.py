@@ -15,11 +15,12 @@ from tests.ports import run_config, short_port
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DetectorError, DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.calibration import CALIBRATION_FORMATS, read_calibration
+from v2hdm.io.calibration.reading import read_calibration
+from v2hdm.io.calibration.writing import CALIBRATION_FORMATS
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.evidence import read_residuals
 from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses

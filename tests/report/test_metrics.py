@@ -17,7 +17,6 @@ from v2hdm.report.check_points import COLUMNS, write_check_points
 from v2hdm.report.figures import save_birdseye, save_growth
 from v2hdm.report.metrics import (
     corner_errors,
-    dash_spacing,
     driven_past,
     extrinsic_metrics,
     lane_metrics,
@@ -102,31 +101,6 @@ def test_a_lane_where_there_is_none_is_false_length():
     assert result.false_length_m == pytest.approx(10.1)
     assert result.mapped_fraction == 0.0
     assert np.isnan(result.mean_lateral_error_m)
-
-
-def dash(along_m, across_m, heading_rad=0.7):
-    local = np.array([[1.5, 0.07], [-1.5, 0.07], [-1.5, -0.07], [1.5, -0.07]]) + np.array([along_m, across_m])
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
-    return Marking(LANE_DASH, local @ np.array([[c, s], [-s, c]]), 5)
-
-
-def test_two_rows_three_metres_apart_give_the_cycle_of_each():
-    rows = [dash(6.05 * n, y) for n in range(5) for y in (0.0, 3.0)]
-    spacing = dash_spacing(HdMap(tuple(rows)))
-    assert spacing.pairs == 8
-    assert spacing.median_m == pytest.approx(6.05)
-    assert spacing.deviation_m == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_missing_dash_does_not_move_the_median():
-    rows = [dash(6.0 * n, 0.0, heading_rad=2.3) for n in (0, 1, 2, 4, 5, 6)]
-    assert dash_spacing(HdMap(tuple(rows))).median_m == pytest.approx(6.0)
-
-
-def test_a_single_dash_has_no_spacing():
-    spacing = dash_spacing(HdMap((dash(0.0, 0.0),)))
-    assert spacing.pairs == 0
-    assert np.isnan(spacing.median_m)
 
 
 def test_the_birds_eye_view_is_drawn_with_and_without_truth(tmp_path):

@@ -24,8 +24,8 @@ from tests.drive.example import make_map
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
 from v2hdm.ground import GroundStatus, Reading
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection

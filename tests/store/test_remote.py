@@ -120,7 +120,7 @@ def test_s3_does_what_the_store_in_memory_does(s3, tmp_path):
 def test_a_bucket_that_is_not_there_is_told(s3):
     nowhere = RemoteFolder.at("s3://nowhere/results", "output=")
     for work in (nowhere.check, lambda: nowhere.write("a", b"x"), lambda: nowhere.create("a", b"x")):
-        with pytest.raises(ConfigError, match="no such bucket or container"):
+        with pytest.raises(ConfigError, match="no such bucket"):
             work()
 
 

@@ -13,9 +13,9 @@ from tests.ports import run_config
 from v2hdm.cli.main import run as run_command
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
-from v2hdm.io.calibration import read_calibration
+from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive import read_drive
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.pipeline.config import DriveConfig
 from v2hdm.pipeline.context import Context, Unwatched
 from v2hdm.pipeline.detections import detect_in_pieces

@@ -13,9 +13,9 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import adjoint, camera_centre, inverse, log
 from v2hdm.records import Calibration, FloatArray
 
-FALSE_ALARM = 1e-3
-"""Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
-
+FALSE_ALARM = (
+    1e-3  # probability that a camera at rest is said to have moved: once in 20 years, checked weekly
+)
 _MISSED = 0.05  # probability with which a movement of the size reported as detectable would be missed
 # Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens: more of
 # it turns into pitch, yaw and height.
@@ -59,22 +59,18 @@ def compare_calibrations(
 ) -> list[Movement]:
     """The movements of the cameras, by name, that both hold.
 
-    Raises:
-        MapFileError: they have no camera in common, or see :func:`movement`.
+    Raises MapFileError where they have no camera in common, or as :func:`movement`.
     """
     common = [name for name in before if name in after]
     if not common:
-        raise MapFileError(
-            f"the cameras {', '.join(before)} and {', '.join(after)} are compared: no camera in common"
-        )
+        raise MapFileError(f"no camera in common: {', '.join(before)} and {', '.join(after)}; compare others")
     return [movement(before[name], after[name]) for name in common]
 
 
 def movement(before: Calibration, after: Calibration) -> Movement:
     """The movement between two calibrations of one camera, whose errors are independent.
 
-    Raises:
-        MapFileError: they are of two cameras or lenses, or one has no covariance.
+    Raises MapFileError where they are of two cameras or lenses, or one has no covariance.
     """
     _check_comparable(before, after)
     assert before.covariance is not None
@@ -115,9 +111,7 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
         raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
     kinds = [(info.width, info.height, info.distortion_model) for info in (first, second)]
     if kinds[0] != kinds[1]:
-        raise MapFileError(
-            f"{who}: image sizes or lens models differ; calibrate with the same intrinsics both times"
-        )
+        raise MapFileError(f"{who}: image sizes or lens models differ; calibrate with the same intrinsics")
     off = np.abs(first.intrinsic - second.intrinsic).max()
     if off > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
         raise MapFileError(

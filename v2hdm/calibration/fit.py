@@ -35,12 +35,8 @@ from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
 _WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one slip in five tables of ten
 
-STATED_AS = 4.0
-"""Observations that the stated errors count for: people know theirs to a factor of about 1.4."""
-
-UNKNOWNS = 6
-"""Of a mounting."""
-
+STATED_AS = 4.0  # observations that the stated errors count for: people know theirs to a factor of about 1.4
+UNKNOWNS = 6  # of a mounting
 _LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated
 _SUBSETS = 300  # subsets of four points that are tried; of ten points these are all 210
 _REFINED = 4  # starts that are refined

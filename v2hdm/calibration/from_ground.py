@@ -8,7 +8,8 @@ from pathlib import Path
 
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.show import draw_matched_ground, lines
-from v2hdm.io.calibration import Provenance, write_calibration
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.io.safe.pixels import png
 from v2hdm.records import Calibration, Drive

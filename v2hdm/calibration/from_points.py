@@ -7,7 +7,6 @@ explains the points and by where cameras sit on vehicles. The likeliest one is n
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,19 +23,18 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.io.calibration import Provenance, write_calibration, write_camera_info
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.outputs import write_json
-from v2hdm.store.files import dump_yaml
+from v2hdm.store.files import dump_yaml, replace_csv
 from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
 POINTS_FILE = "points.csv"
 PICTURE_FILE = "points.png"
 
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
-"""Units other than metres, in m."""
-
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}  # units other than metres, in m
 _MISREAD = 0.01  # prior probability of each way to write the table wrongly
 _SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
 _ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles
@@ -129,8 +127,7 @@ def calibrate_from_points(
 def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     """The mountings that explain the points, the most likely first.
 
-    Raises:
-        DriveError: none does: they lie on a line, or the table is written otherwise than its columns say.
+    Raises DriveError where none does: they lie on a line, or the table means something else than it says.
     """
     fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
@@ -224,19 +221,13 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
         "# For drive.yaml. images: name the list of your images (docs/drive-format.md).\n" + entry,
         encoding="utf-8",
     )
-    with (folder / POINTS_FILE).open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(_COLUMNS)
-        points, off = found.points, found.residuals
-        for k, name in enumerate(points.names):
-            shift = [
-                *(f"{value:.3f}" for value in off.off_px[k]),
-                *(f"{value:.4f}" for value in off.off_m[k]),
-            ]
-            known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
-            table.writerow(
-                [name, *points.points_px[k].tolist(), *points.points_vehicle[k].tolist(), *shift, *known]
-            )
+    points, off, rows = found.points, found.residuals, []
+    for k, name in enumerate(points.names):
+        shift = [*(f"{px:.3f}" for px in off.off_px[k]), *(f"{m:.4f}" for m in off.off_m[k])]
+        known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
+        place = [*points.points_px[k].tolist(), *points.points_vehicle[k].tolist()]
+        rows.append([name, *place, *shift, *known])
+    replace_csv(folder / POINTS_FILE, [_COLUMNS, *rows])
     labels = found.points.labels
     save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
 

@@ -155,9 +155,8 @@ def _draw_residuals(
         colour = _RIGHT if is_right else _WRONG
         sign = "o" if is_right else "x"
         axes.plot(a, b, sign, ms=6 if is_right else 9, mfc="none", mec=colour, mew=1.8, path_effects=_HALO)
-        axes.annotate(
-            label, (a, b), (6, -10), textcoords="offset points", color=colour, fontsize=8, path_effects=_HALO
-        )
+        look: dict[str, Any] = {"color": colour, "fontsize": 8, "path_effects": _HALO}
+        axes.annotate(label, (a, b), (6, -10), textcoords="offset points", **look)
         if np.isfinite(tip).all():
             arrow = {"arrowstyle": "->", "color": colour, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
             axes.annotate("", (c, d), (a, b), arrowprops=arrow, annotation_clip=True)

@@ -23,8 +23,7 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import FloatArray
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-CHANCE = 1e-3
-"""Probability with which a right calibration raises a finding."""
+CHANCE = 1e-3  # probability with which a right calibration raises a finding
 
 # Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m.
 _WELL_KNOWN_M = 0.3

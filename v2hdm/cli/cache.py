@@ -20,9 +20,7 @@ def run(arguments: Sequence[str]) -> None:
     parser = parser_of("cache")
     actions = parser.add_subparsers(dest="what", required=True)
     shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
-    pruned = actions.add_parser(
-        "prune", help="remove what was not used for longest, and what killed runs left"
-    )
+    pruned = actions.add_parser("prune", help="remove what was unused for longest, and what killed runs left")
     pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
     for action in (shown, pruned):
         action.add_argument("--cache", default=Path("cache"), type=Path, help="the folder (default: cache)")

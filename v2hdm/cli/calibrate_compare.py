@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.cli.main import parser_of
-from v2hdm.errors import EXIT_FAILED_VERDICT, MapFileError
+from v2hdm.errors import EXIT_FAILED_VERDICT
 
 if TYPE_CHECKING:
     from v2hdm.calibration.compare import Movement
 
-_LEAST = 1e-12
-"""Smaller probabilities are all the same."""
+_LEAST = 1e-12  # smaller probabilities are all the same
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -26,15 +25,9 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON list instead of lines")
     parsed = parser.parse_args(arguments)
     from v2hdm.calibration.compare import compare_calibrations, turned_alike
-    from v2hdm.io.calibration import trusted_calibrations
+    from v2hdm.io.calibration.reading import trusted_calibrations
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
-    common = [name for name in before if name in after]
-    if not common:
-        raise MapFileError(
-            f"{parsed.before} has {', '.join(before)} and {parsed.after} has {', '.join(after)}: "
-            "no camera in common"
-        )
     movements = compare_calibrations(before, after)
     if parsed.json:
         print(json.dumps([_as_json(one) for one in movements]))
@@ -71,7 +64,5 @@ def _line(one: Movement) -> str:
 
 
 def _as_json(one: Movement) -> dict[str, object]:
-    arrays = {
-        name: getattr(one, name).tolist() for name in ("shift_m", "turn_rad", "covariance", "detectable")
-    }
+    arrays = {key: getattr(one, key).tolist() for key in ("shift_m", "turn_rad", "covariance", "detectable")}
     return {"camera": one.camera, "moved": one.moved, "probability": one.probability, **arrays}

@@ -6,11 +6,10 @@ needed.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of
+from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of, steps_of
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -23,11 +22,7 @@ def run(arguments: Sequence[str]) -> int:
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
     with result_of(folder, {"drive": str(parsed.drive), "cameras": list(drive.cameras)}) as unfinished:
-        found = calibrate_from_ground(drive, workers=parsed.workers, progress=_show)
+        found = calibrate_from_ground(drive, workers=parsed.workers, progress=steps_of("match ground"))
         write_ground_calibration(found, unfinished)
     print(*summary_lines(found), f"results in {folder}", sep="\n")
     return exit_code(found.verdict)
-
-
-def _show(done: int, total: int) -> None:
-    print(f"matched the ground of {done} of {total} cameras", file=sys.stderr, flush=True)

@@ -15,12 +15,8 @@ def run(arguments: Sequence[str]) -> int:
     """Check a drive; 0 for PASS and WARN, 3 for FAIL."""
     parser = parser_of("check")
     add_drive(parser, "check")
-    parser.add_argument(
-        "--no-ground", dest="ground", action="store_false", help="do not match bare ground: faster, says less"
-    )
-    parser.add_argument(
-        "--list-topics", action="store_true", help="only list a bag's topics, and the drive.yaml for it"
-    )
+    parser.add_argument("--no-ground", dest="ground", action="store_false", help="match no ground: faster")
+    parser.add_argument("--list-topics", action="store_true", help="only list a bag's topics and drive.yaml")
     parser.add_argument("--all", action="store_true", help="also print the checks that passed")
     parsed = parser.parse_args(arguments)
     if parsed.list_topics:

@@ -46,13 +46,9 @@ def register(name: str, schema: type[Any]) -> None:
 
 @dataclass(frozen=True)
 class Job:
-    """One configuration to work on.
+    """One configuration to work on: ``settings``, and the same as text with all references resolved.
 
-    Attributes:
-        settings: the dataclass of the command.
-        yaml: the same as text, all references resolved, to be kept beside the results.
-        label: of a sweep (``--multirun``) the job's number and what it sets, as part of a file's name; None
-            where there is one job only.
+    ``label`` is, of a sweep (``--multirun``), the job's number and what it sets, as part of a file's name.
     """
 
     settings: Any
@@ -64,10 +60,7 @@ class Job:
         if self.label is None:
             return output
         if "://" in output:
-            raise ConfigError(
-                f"output={output}: a sweep writes to folders of this machine; give one, or map with one "
-                "setting at a time"
-            )
+            raise ConfigError(f"output={output}: a sweep writes to folders of this machine; give one")
         return str(Path(output) / self.label)
 
 
@@ -153,8 +146,7 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
     """Compose ``conf/<name>.yaml`` with a run file, as ``--config-dir`` and ``+run=`` do, and overrides.
 
     What the run file names in a ``defaults`` list of its own is looked for beside it, where its folder is
-    called ``run``, and among the shipped ones. Raises ConfigError where the file is missing or damaged, or a
-    key or value is wrong.
+    called ``run``, and among the shipped ones. Raises ConfigError where the file, a key or a value is wrong.
     """
     if not isinstance(read_yaml(path, ConfigError), dict):  # OmegaConf would expand whatever aliases repeat
         raise ConfigError(f"{path}: expected 'key: value' entries; write it as conf/run/*.yaml are")
@@ -230,9 +222,7 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     if "missing EQUAL" in message:
         bare = [one for one in overrides if "=" not in one and not one.startswith(("-", "~"))]
         named = " ".join(bare[:1]) or "an argument"
-        return ConfigError(
-            f"configuration: '{named}' is no key=value; write drive.path={named}, or see --help"
-        )
+        return ConfigError(f"configuration: '{named}' is no key=value; write drive.path={named}, see --help")
     # Of a long command line only what the message is about: the override that has the key it names.
     about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
     where = f" (in {' '.join(about or overrides)})" if 0 < len(about or overrides) <= _FEW_OVERRIDES else ""
@@ -250,7 +240,6 @@ _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous
 
 
 def _advice(message: str, schema: type[Any]) -> str:
-    """Advice on an error of Hydra."""
     if _UNQUOTED.search(message):
         return "a value with signs or letters of its own wants quotes: \"drive.path='müll (1)'\""
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)

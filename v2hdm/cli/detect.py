@@ -21,24 +21,19 @@ from v2hdm.errors import ConfigError, DriveError
 if TYPE_CHECKING:
     from v2hdm.detection.stopwatch import Stopwatch
 
-_FIRST = b'{"source": '
-"""The beginning of every line of detections."""
-
+_FIRST = b'{"source": '  # the beginning of every line of detections
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
 
 
 def run(arguments: Sequence[str]) -> None:
     """Detect in every image of a source."""
     parser = parser_of("detect")
-    parser.add_argument(
-        "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"
-    )
+    parser.add_argument("source", help="an image, a folder, a drive, a video, or a camera's index")
     parser.add_argument(
         "--camera",
         type=Path,
         metavar="FILE",
-        help="the camera's calibration: gives metres; or its intrinsics, as written by Kalibr, OpenCV, ROS "
-        "or COLMAP",
+        help="the camera's calibration: gives metres; or its intrinsics, by Kalibr, OpenCV, ROS, COLMAP",
     )
     parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
     parser.add_argument(
@@ -50,16 +45,12 @@ def run(arguments: Sequence[str]) -> None:
         "field of view (default: 1.6 5 60, of which the images correct the second); intrinsics of --camera "
         "overrule the last",
     )
-    parser.add_argument(
-        "--linear", action="store_true", help="grey values are proportional to light, not sRGB"
-    )
+    parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
     parser.add_argument("--model", help="ONNX file of the detector (default: the one that is shipped)")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network (default: 1)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     parser.add_argument("--output", type=Path, help="file for the JSON lines (default: stdout)")
-    parser.add_argument(
-        "--draw", type=Path, metavar="DIR", help="folder for the images with detections drawn"
-    )
+    parser.add_argument("--draw", type=Path, metavar="DIR", help="folder of the images with detections drawn")
     _detect(parser.parse_args(arguments))
 
 
@@ -129,9 +120,7 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
         if output.is_file():
             with output.open("rb") as earlier:
                 if earlier.read(len(_FIRST)) not in (b"", _FIRST):
-                    raise ConfigError(
-                        f"{output}: is there already and holds no detections; give another --output"
-                    )
+                    raise ConfigError(f"{output}: is there and holds no detections; give another --output")
         is_special = output.exists() and not output.is_file()  # a pipe, or /dev/null
         place = nullcontext(output) if is_special else whole_file(output)
         with place as partial, partial.open("w", encoding="utf-8") as stream:
@@ -147,7 +136,6 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
 
 
 def _report(stopwatch: Stopwatch) -> None:
-    """How long it took, on stderr."""
     import numpy as np
 
     from v2hdm.detection.stopwatch import TOTAL

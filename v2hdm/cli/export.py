@@ -18,9 +18,7 @@ from v2hdm.errors import ConfigError, MapFileError
 def run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
     parser = parser_of("export")
-    parser.add_argument(
-        "source", type=Path, metavar="MAP", help="map.geojson, map.gpkg or calibration_<camera>.yaml"
-    )
+    parser.add_argument("source", type=Path, metavar="MAP", help="map.geojson, .gpkg, or calibration_*.yaml")
     parser.add_argument(
         "--format",
         action="append",
@@ -29,14 +27,11 @@ def run(arguments: Sequence[str]) -> None:
         help="of a map: geojson, csv, gpkg, lanelet2, dxf; of a calibration: camera_info, static_transform, "
         "urdf, kalibr, opencv; may be repeated",
     )
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="folder of the files (default: that of MAP)"
-    )
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of files (default: that of MAP)")
     parser.add_argument(
         "--projector",
         metavar="NAME",
-        help="of lanelet2: Local, LocalCartesian or MGRS (default: LocalCartesian for a map with an origin, "
-        "else Local)",
+        help="of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)",
     )
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
@@ -50,9 +45,7 @@ def run(arguments: Sequence[str]) -> None:
     except BrokenPipeError:  # the reader of our output has had enough
         raise
     except OSError as error:
-        raise MapFileError(
-            f"{error.filename}: cannot be written ({error.strerror}); set another --output"
-        ) from None
+        raise MapFileError(f"{error.filename}: cannot be written ({error.strerror}); set --output") from None
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:

@@ -16,14 +16,10 @@ from v2hdm.errors import ConfigError
 def run(arguments: Sequence[str]) -> int:
     """Map a fleet; 0, 2 where a drive gave no result, or 3 where a verdict is FAIL."""
     parser = parser_of("fleet")
+    parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
+    parser.add_argument("--workers", type=int, default=0, help="cores of this machine; 0 (default): all")
     parser.add_argument(
-        "drives", nargs="+", help="run files, as for v2hdm map; or key=value, for all of them"
-    )
-    parser.add_argument(
-        "--workers", type=int, default=0, help="cores of this machine to use; 0, the default, takes all"
-    )
-    parser.add_argument(
-        "--address", default="local", help="of a running Ray cluster, or auto; without it one is started here"
+        "--address", default="local", help="of a running Ray cluster, or auto (default: a new one)"
     )
     parser.add_argument(
         "--table",
@@ -32,9 +28,7 @@ def run(arguments: Sequence[str]) -> int:
         metavar="FOLDER",
         help="takes the table of verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
     )
-    parser.add_argument(
-        "--site", metavar="NAME", help="map all the drives together, as one site of that name"
-    )
+    parser.add_argument("--site", metavar="NAME", help="map all drives together, as one site of that name")
     parser.add_argument("--again", action="store_true", help="do what is finished again")
     parsed = parser.parse_intermixed_args(arguments)
     import ray  # noqa: F401  # its absence is reported before that of what is built on it

@@ -17,12 +17,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm import __version__
 from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, describe, one_line
+from v2hdm.progress import Steps, progress_lines
 
 if TYPE_CHECKING:
     from v2hdm.records import Drive
@@ -159,13 +161,9 @@ def parser_of(name: str) -> argparse.ArgumentParser:
 def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     """Add what commands that read a drive have in common; ``result`` ends the name of the default folder."""
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
-    parser.add_argument(
-        "--camera", action="append", default=[], metavar="NAME", help="only this camera; may be repeated"
-    )
+    parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
     parser.add_argument("--format", default="auto", help="of the drive, as folder or kitti (default: auto)")
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help=f"folder of results (default: outputs/<drive>-{result})"
-    )
+    parser.add_argument("--output", type=Path, metavar="DIR", help=f"results (outputs/<drive>-{result})")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
 
 
@@ -191,6 +189,11 @@ def result_of(folder: Path, settings: Mapping[str, object]) -> Iterator[Path]:
     with result_folder(folder, "--output") as unfinished:
         (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
         yield unfinished
+
+
+def steps_of(task: str) -> Steps:
+    """Progress of a task as lines on stderr."""
+    return partial(progress_lines(partial(print, file=sys.stderr, flush=True)), task)
 
 
 def exit_code(verdict: Verdict) -> int:

@@ -24,7 +24,6 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _map(job: Job) -> int:
-    """Run the pipeline and show what it does and found."""
     from rich.console import Console
     from rich.logging import RichHandler
 

@@ -6,11 +6,10 @@ docs/mosaic.md describes it.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import parser_of
+from v2hdm.cli.main import parser_of, steps_of
 from v2hdm.errors import DriveError, MapFileError
 
 
@@ -18,12 +17,8 @@ def run(arguments: Sequence[str]) -> None:
     """Add the mosaic to a result."""
     parser = parser_of("mosaic")
     parser.add_argument("result", type=Path, help="result folder of v2hdm map")
-    parser.add_argument(
-        "--drive", type=Path, help="the drive's folder (default: where it was when it was mapped)"
-    )
-    parser.add_argument(
-        "--resolution", type=float, metavar="M", default=0.02, help="side of a pixel on the ground (0.02 m)"
-    )
+    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="side of a pixel (0.02)")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it
@@ -39,15 +34,12 @@ def run(arguments: Sequence[str]) -> None:
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
     drive = drive_of(parsed.result, parsed.drive)
     if drive is None:
-        raise DriveError(
-            f"{parsed.result}: its drive is not where it was; give its folder with --drive, or map it anew"
-        )
+        raise DriveError(f"{parsed.result}: its drive is not where it was; give its folder with --drive")
     if drive.joined:
-        raise MapFileError(
-            f"{parsed.result} is of several drives; a mosaic shows one: map them one by one for it"
-        )
+        raise MapFileError(f"{parsed.result} is of several drives; a mosaic shows one: map them one by one")
     with added_to(parsed.result, "RESULT") as folder:
-        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, _show)["sharpness"]
+        steps = steps_of("put images on the ground")
+        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)["sharpness"]
     if found["edges"]:
         print(
             f"paint edges {100 * found['edge_width_before_m']:.1f} cm wide before, "
@@ -55,8 +47,3 @@ def run(arguments: Sequence[str]) -> None:
             f"{found['after_over_before']:.1f} times as sharp (median of {found['edges']} sides)"
         )
     print(f"mosaic in {parsed.result}")
-
-
-def _show(done: int, total: int) -> None:
-    if done == total or done % 200 == 0:
-        print(f"put {done} of {total} images on the ground", file=sys.stderr, flush=True)

@@ -15,9 +15,7 @@ def run(arguments: Sequence[str]) -> None:
     """Write ``report.html``."""
     parser = parser_of("report")
     parser.add_argument("folder", type=Path, help="result folder of v2hdm map")
-    parser.add_argument(
-        "--drive", type=Path, help="the drive that it mapped (default: where it was then, if still there)"
-    )
+    parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive.of_result import drive_of
     from v2hdm.report.page.document import write_page

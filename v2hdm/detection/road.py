@@ -25,7 +25,7 @@ from v2hdm.detection.frames import Frame
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
-from v2hdm.io.calibration import read_calibration
+from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.records import (
     ARROW,
     CHEVRON,

@@ -30,11 +30,12 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.detections import detect_in_pieces
+from v2hdm.pipeline.evaluate import growth_of
 from v2hdm.pipeline.inspect import Inspection, inspect_each
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.progress import Progress
-from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
-from v2hdm.report.metrics import driven_past, extrinsic_metrics, growth_figures
+from v2hdm.records import Drive, ImageDetections, Marking, Truth
+from v2hdm.report.metrics import driven_past, extrinsic_metrics
 from v2hdm.simulate import rendered_drive, surveyed_cameras
 from v2hdm.store.cache import StageCache, code_key, key_of
 from v2hdm.store.files import file_digest, whole_file
@@ -88,10 +89,8 @@ def recipe_file(recipe: str) -> str:
 def drive_record(job: Job, workers: int, progress: Progress) -> dict[str, Any]:
     """The record of a drive and of its maps, from disk or made now and kept there.
 
-    ``workers`` are processes to render and detect in; 1 stays in this one.
-
-    Raises:
-        V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
+    ``workers`` are processes to render and detect in; 1 stays in this one. Raises V2hdmError where the drive
+    cannot be rendered, read or looked at, or has no truth.
     """
     known = _kept(job)
     if known is None:
@@ -144,7 +143,6 @@ def _find(job: Job, workers: int, progress: Progress) -> None:
 
 
 def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
-    """The drive itself: truth, route, cameras, and one image of each."""
     job.folder.mkdir(parents=True, exist_ok=True)
     sets = camera_sets(drive)
     manual = {} if job.site.simulate is None else surveyed_cameras(job.site.simulate)
@@ -208,8 +206,9 @@ def _mapped(
         }
         out["maps"][name] = {row: _plain_map(one.hd_map.markings) for row, one in rows.items()}
         out["extrinsics"][name] = _extrinsics(drive, methods, truth)
-        if last and methods["Opt"].growth:
-            out["growth"] = _growth(methods, truth)
+        if last:
+            grown = {name: methods[name] for name in ("Opt", *NAIVE_IPMS) if name in methods}
+            out["growth"] = growth_of(grown, truth)
         if last and recipe == OURS:
             out["lanes"] = {"Opt": [lane.points_map for lane in methods["Opt"].hd_map.lanes]}
             out["residuals"] = residuals(inspection.drive_as_described, detections, methods, truth)
@@ -223,17 +222,6 @@ def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
         "corners": [marking.corners_map for marking in markings],
         "sightings": [marking.sightings for marking in markings],
     }
-
-
-def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:
-    """Number of markings and corner RMSE (m) while the map grows, by method."""
-    steps = methods["Opt"].growth
-    growth = {"Opt": growth_figures([HdMap(step) for step in steps], truth)}
-    for name in NAIVE_IPMS:
-        if name in methods:
-            markings = methods[name].hd_map.markings
-            growth[name] = growth_figures([HdMap(markings[: len(step)]) for step in steps], truth)
-    return growth
 
 
 def _extrinsics(drive: Drive, methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:

@@ -23,8 +23,7 @@ from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.report import style
 from v2hdm.report.photos import project_outline
 
-Caption = Mapping[str, Any]
-"""The values in a figure's caption, by their names in the template ``figures.md``."""
+Caption = Mapping[str, Any]  # the values in a figure's caption, by their names in the template figures.md
 
 
 def save_figures(
@@ -70,12 +69,10 @@ def save_figures(
     return captions
 
 
-LINK = "#e3001b"
-"""Colour of lines between corners that belong together."""
+LINK = "#e3001b"  # colour of lines between corners that belong together
 
 
 def _drive_of(record: Mapping[str, Any]) -> str:
-    """The drive of a record in words."""
     return str(record["port"]) if record["seed"] is None else f"{record['port']}, seed {record['seed']}"
 
 
@@ -86,9 +83,7 @@ _WIDE = 1.6  # width of a site over its height above which the insets stand belo
 
 _OPT, _LANE = style.METHOD["Opt"], style.METHOD["ONI"]
 
-_NEAR_M, _FAR_M = 1.0, 6.0
-"""Half the width of an inset: of one that shows a corner's error, and of one that shows a neighbourhood."""
-
+_NEAR_M, _FAR_M = 1.0, 6.0  # half the width, m, of an inset on a corner's error, and on a neighbourhood
 _LETTERS = {"a": (2, (3, 1)), "b": (0, (-9, -9)), "c": (3, (-9, 1))}
 """Corner of each inset's square that its letter stands at, and how far from it (pt)."""
 
@@ -170,8 +165,7 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
     return {"drive": _drive_of(record), "cameras": cameras, "markings": len(common), **errors}
 
 
-_Place = tuple[FloatArray, float, str]
-"""An inset: its centre (2,) and half its width, m, and its title."""
+_Place = tuple[FloatArray, float, str]  # an inset: its centre (2,) and half its width, m, and its title
 
 
 def _true_corners(record: Mapping[str, Any]) -> FloatArray:
@@ -179,7 +173,6 @@ def _true_corners(record: Mapping[str, Any]) -> FloatArray:
 
 
 def _mapped(record: Mapping[str, Any], found: Matched) -> FloatArray:
-    """The mapped corners (M, 4, 2) of matched markings."""
     return np.asarray(_true_corners(record)[found.true] + found.errors_m)
 
 
@@ -245,7 +238,6 @@ _ARROW_SHARE = 0.8  # share of a cell's width that the longest arrow of a field 
 
 
 def _save_calibration(path: Path, record: Mapping[str, Any], pictures: Path) -> Caption | None:
-    """Draw the clicked and surveyed points and the region of interest."""
     cameras = record["cameras"]
     with style.figure(path, 13.0, 4.3 * len(cameras)) as fig:
         panels = fig.subplots(len(cameras), 2, squeeze=False, width_ratios=[1.5, 1])
@@ -335,9 +327,7 @@ def _draw_field(axes: Axes, field: Mapping[str, Any], size_px: tuple[int, int]) 
 
 
 _BOX = "#7fb8b4"
-_TOP_PERCENTILE = 99.5
-"""Percentile of the corner errors at which a panel of boxes ends: one bad corner would flatten the rest."""
-
+_TOP_PERCENTILE = 99.5  # of the corner errors, where a panel ends: one bad corner would flatten the rest
 _EQUAL_CM = (0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
@@ -386,7 +376,6 @@ def _draw_boxes(axes: Axes, found: Matched) -> int:
 
 
 def _save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> Caption | None:
-    """Draw the error against the size of the map that grows marking by marking."""
     ports = list(dict.fromkeys(record["port"] for record in records))
     if not any(record["growth"] for record in records):
         return None
@@ -408,7 +397,6 @@ def _save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> Caption | 
 
 
 def _save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> Caption | None:
-    """Draw the error of single sightings against their range."""
     known = [record for record in records if record.get("residuals")]
     if not known:
         return None
@@ -443,7 +431,6 @@ def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _save_balance(path: Path, measured: Sequence[Measured]) -> Caption | None:
-    """Draw bias against spread of every map."""
     ports = by_port(measured)
     sets = list(dict.fromkeys(cameras for one in measured for cameras in one.rows))
     shown = ("CNI", "ENI", "Opt", "ONI", f"Opt, {PAPER}")

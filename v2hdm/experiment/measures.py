@@ -147,15 +147,9 @@ def _row(
     )
 
 
-SAME_SHARE = 0.5
-"""A sighting is of the marking whose image lies within this share of its own diameter of it."""
-
-CELLS = (8, 5)
-"""Cells of a field of residuals, across and down the image."""
-
-RANGE_STEP_M = 1.0
-"""Width of a bin of ranges."""
-
+SAME_SHARE = 0.5  # a sighting is of the marking whose image lies within this share of its own diameter of it
+CELLS = (8, 5)  # cells of a field of residuals, across and down the image
+RANGE_STEP_M = 1.0  # width of a bin of ranges
 _FARTHEST_M = 22.0
 _FEWEST = 20  # corners below which neither a cell nor a bin has figures
 
@@ -182,10 +176,8 @@ def residuals(
         except MappingError:
             continue  # a camera that saw nothing has no residuals
         seen = _Seen.of(drive, sightings, name, best)
-        out[name] = {
-            "field": _field(drive, seen, name, best),
-            "range": _by_range(drive, seen, name, methods, truth),
-        }
+        field, ranges = _field(drive, seen, name, best), _by_range(drive, seen, name, methods, truth)
+        out[name] = {"field": field, "range": ranges}
     return out
 
 

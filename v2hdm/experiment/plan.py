@@ -94,18 +94,15 @@ class Job:
 def jobs(config: ExperimentConfig) -> list[Job]:
     """The drives of an experiment, seed by seed, so that what is finished first compares all ports.
 
-    Raises:
-        ConfigError: a setting cannot work; the message names the key.
-        DetectorError: ``detector.model`` cannot be used.
+    Raises ConfigError, which names the key, where a setting cannot work, DetectorError where
+    ``detector.model`` cannot be used.
     """
     _check(config)
     changed: dict[str, dict[str, Any]] = {
         OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}
     }  # fmt: skip
-    options = {
-        name: replace(deepcopy(config.mapping), **changed[name])
-        for name in dict.fromkeys([OURS, *config.recipes])
-    }
+    recipes = dict.fromkeys([OURS, *config.recipes])
+    options = {name: replace(deepcopy(config.mapping), **changed[name]) for name in recipes}
     folder = Path(config.output) / config.name / "drives"
     found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:

@@ -39,9 +39,7 @@ def run_experiment(
 
     Drives that an earlier run has finished under the same settings are taken from there. ``config_yaml`` is
     the configuration as text, kept beside the results. Returns the folder, and the figures of every drive.
-
-    Raises:
-        V2hdmError: a setting or a drive is at fault, or the folder holds something that is not ours.
+    Raises V2hdmError where a setting or a drive is at fault, or the folder holds something that is not ours.
     """
     todo = jobs(config)
     folder = Path(config.output) / config.name
@@ -55,9 +53,7 @@ def run_experiment(
             write_tables(folder, measured)
             write_words(folder, measured, captions, config)
     except OSError as failure:
-        raise ConfigError(
-            f"output folder {folder} cannot be written: {failure.strerror}; set output="
-        ) from failure
+        raise ConfigError(f"{folder}: cannot be written ({failure.strerror}); set output=") from failure
     return folder, measured
 
 
@@ -104,8 +100,7 @@ def _work(job: Job) -> dict[str, Any]:
         return drive_record(job, 1, report)
 
 
-_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")
-"""Columns of the main table that the terminal shows."""
+_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")  # columns on the terminal
 
 
 def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:

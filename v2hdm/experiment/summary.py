@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ import numpy as np
 from v2hdm import __version__
 from v2hdm.experiment.measures import ROWS, Measured, Row
 from v2hdm.experiment.plan import OURS, PAPER, RECIPES, ExperimentConfig
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_csv, replace_text
 
 _CM = 100.0
 
@@ -52,9 +50,7 @@ def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
         ("results", ("cameras", "method", *COLUMNS), results_table, results),
         ("calibrations", ("camera", "extrinsic of", *_EXTRINSICS), calibrations_table, calibrations),
     ):
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([["port", "seed", *keys], *rows])
-        replace_text(folder / f"{name}.csv", text.getvalue())
+        replace_csv(folder / f"{name}.csv", [["port", "seed", *keys], *rows])
         heads, lines = table(measured)
         replace_text(folder / f"{name}.md", markdown(heads, lines))
         replace_text(folder / f"{name}.tex", _latex(heads, lines))
@@ -235,10 +231,8 @@ def write_words(
 def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
     """The text in Markdown."""
     tested = claims(measured)
-    lines = [
-        [c.text, c.where, c.limit, c.figure, _with_range(c.shared), "yes" if c.holds else "**no**"]
-        for c in tested
-    ]
+    holds = ("**no**", "yes")
+    lines = [[c.text, c.where, c.limit, c.figure, _with_range(c.shared), holds[c.holds]] for c in tested]
     return _filled(
         "experiment.md",
         config=config,

@@ -15,12 +15,8 @@ from v2hdm.errors import ConfigError
 from v2hdm.extras import need
 from v2hdm.pipeline.config import RunConfig
 
-LOCAL = "local"
-"""The address of a Ray of our own on this machine."""
-
-RETRIES = 3
-"""How often work is begun anew whose worker died."""
-
+LOCAL = "local"  # the address of a Ray of our own on this machine
+RETRIES = 3  # how often work is begun anew whose worker died
 _OBJECT_STORE_BYTES = 1 << 30
 
 _QUIET = {
@@ -35,8 +31,7 @@ _QUIET = {
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Workers share the cores among them; linear algebra of one takes one."""
 
-DETECTORS_A_GPU = 8
-"""Actors that detect on one GPU: each takes memory there, and most of an image's time is the CPU's."""
+DETECTORS_A_GPU = 8  # actors on one GPU: each takes memory there, and most of an image's time is the CPU's
 
 NO_GPU = (
     "device=cuda or detector.device=cuda is set, and none of Ray's machines has a GPU: set them to cpu, or "
@@ -48,10 +43,8 @@ NO_GPU = (
 def cluster(address: str, workers: int) -> Iterator[Any]:
     """The module ``ray``, connected to a running cluster (``auto`` finds that of this machine).
 
-    ``local`` starts one here of so many cores, 0 for all; it ends with the block or the process.
-
-    Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
+    ``local`` starts one here of so many cores, 0 for all; it ends with the block or the process. Raises
+    ConfigError where Ray is not installed, or there is no cluster at the address.
     """
     with ExitStack() as stack:
         for name in _ONE_THREAD:

@@ -21,9 +21,7 @@ from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.report.terminal import new_table
 from v2hdm.store.remote import place_of
 
-ERROR = "ERROR"
-"""Status of a drive of which there is no result."""
-
+ERROR = "ERROR"  # status of a drive of which there is no result
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
 
 
@@ -132,8 +130,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
             place = job.place
             if place in taken:
                 raise ConfigError(
-                    f"{file}: its results go to {place}, as those of {taken[place]} do; give one of "
-                    "them another name"
+                    f"{file}: its results go to {place}, as those of {taken[place]}; name one otherwise"
                 )
             taken[place] = file
             jobs.append(job)
@@ -145,8 +142,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
 def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Plan:
     """All drives of run files, whose other settings are equal, as the one site of that name.
 
-    Raises:
-        ConfigError: the site's name cannot be that of a folder.
+    Raises ConfigError where the site's name cannot be that of a folder.
     """
     take_name(site, "--site", ConfigError)
     source = ", ".join(map(str, files))
@@ -186,10 +182,8 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
 def _differences(settings: RunConfig, config: RunConfig) -> Iterator[tuple[str, Any, Any]]:
     """Every setting besides name and path that is another in the second: its key, and both values."""
     without = [replace(one, name=None, drive=replace(one.drive, path=None)) for one in (settings, config)]
-    mine, other = (dict(_leaves(asdict(one))) for one in without)
-    return (
-        (key, mine.get(key), other.get(key)) for key in [*mine, *other] if mine.get(key) != other.get(key)
-    )
+    mine, its = (dict(_leaves(asdict(one))) for one in without)
+    return ((key, mine.get(key), its.get(key)) for key in [*mine, *its] if mine.get(key) != its.get(key))
 
 
 def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

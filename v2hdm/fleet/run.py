@@ -15,9 +15,7 @@ from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, 
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.results import GrowingFolder, growing_folder
 
-ALL = "fleet"
-"""In place of a drive's name, for the progress of the fleet."""
-
+ALL = "fleet"  # in place of a drive's name, for the progress of the fleet
 _LOOK_EVERY_S = 0.3
 
 
@@ -55,10 +53,7 @@ def run_fleet(
 ) -> list[Row]:
     """Map the drives of run files: a row for each file, in their order, or one for a site.
 
-    The table is written anew whenever a drive is done.
-
-    Raises:
-        V2hdmError: the table cannot be written, or there is no Ray.
+    The table is written anew whenever a drive is done. Raises V2hdmError where it cannot, or without Ray.
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)
@@ -96,7 +91,6 @@ class _Table:
 
 
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, progress: DriveProgress) -> None:
-    """Map the drives, as many at a time as there are cores."""
     from v2hdm.fleet.workers import ProgressActor, map_drive, open_detectors
 
     cores, gpus = (int(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))

@@ -31,13 +31,10 @@ from v2hdm.store.cache import Line, StageCache, log_again, recorded
 
 _Result = TypeVar("_Result")
 
-IMAGES_A_BATCH = 8
-"""Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
-
+IMAGES_A_BATCH = 8  # images of one call: seconds of work against a millisecond of Ray's
 _BATCHES_AHEAD = 2  # calls that wait at each actor, so that it is never idle between them
 _DRIVES_KEPT = 4
-_CORES_EACH = 0.5
-"""Booked for a task: the other half of its core is an actor's that detects, which then has nothing to do."""
+_CORES_EACH = 0.5  # of a task: the other half is of an actor that detects, which has nothing to do meanwhile
 _REPORT_EVERY_S = 0.5
 
 
@@ -137,8 +134,7 @@ def detect_by(
 ) -> None:
     """:func:`v2hdm.detection.batch.detect_images` by actors, with the same detections and errors.
 
-    Raises:
-        WorkerError: an actor died again and again.
+    Raises WorkerError where an actor died again and again.
     """
     reference = ray.put(drive)
     batches = [images[begin : begin + IMAGES_A_BATCH] for begin in range(0, len(images), IMAGES_A_BATCH)]

@@ -161,15 +161,6 @@ def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     return tangent, normal, length
 
 
-def long_axis(corners: FloatArray) -> FloatArray:
-    """Unit direction (2,) of the longer sides of a quadrilateral (4, 2), pointing to positive x (or y)."""
-    sides = following(corners) - corners
-    first, second = sides[0] - sides[2], sides[1] - sides[3]
-    axis = max(first, second, key=lambda side: float(side @ side))
-    axis = axis / np.linalg.norm(axis)
-    return np.asarray(axis if (axis[0], axis[1]) > (0.0, 0.0) else -axis)
-
-
 def is_convex(corners_map: FloatArray) -> BoolArray:
     """Whether quadrilaterals (..., 4, 2) of the map are convex and counter-clockwise."""
     return np.asarray((_turns(corners_map) > 0).all(axis=-1))

@@ -48,8 +48,7 @@ def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, wher
     """Refuse poses off the earth, or far from the map's ``origin`` on it."""
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
-        problem = f"a position is {farthest_m:.3g} m from zero, off the earth"
-        raise DriveError(f"{where}: {problem}; mend the poses")
+        raise DriveError(f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend it")
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
@@ -77,7 +76,7 @@ def read_tum(path: Path) -> Trajectory:
         where, parts = f"{path}: line {number}", line.replace(",", " ").split()
         if len(parts) != 8:
             raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
-        rows[number] = [_parse_float(part, where) for part in parts]
+        rows[number] = [parse_number(part, where) for part in parts]
     numbers, table = list(rows), np.array(list(rows.values()))
     _check_rising(table[:, 0], numbers, path)
     advice = "normalise it, order qx qy qz qw"
@@ -102,7 +101,7 @@ def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
         where, parts = f"{path}: line {number}", line.split(maxsplit=1)
         if len(parts) != 2:
             raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
-        stamps[number] = _parse_float(parts[0], where)
+        stamps[number] = parse_number(parts[0], where)
         names.append(parts[1])
     stamp_s = np.array(list(stamps.values()))
     _check_rising(stamp_s, list(stamps), path)
@@ -124,11 +123,13 @@ def _content_lines(path: Path, problem: str, expected: str) -> list[tuple[int, s
     return content
 
 
-def _parse_float(text: str, where: str) -> float:
+def parse_number(text: str, where: str) -> float:
+    """The finite number that a cell of a text file holds; raises DriveError, which names ``where``."""
     try:
         value = float(text)
     except ValueError:
-        raise DriveError(f"{where}: '{text}' is not a number; mend that line") from None
+        comma = "; write a decimal point" if "," in text else ""
+        raise DriveError(f"{where}: '{text}' is not a number{comma}; mend that line") from None
     if not np.isfinite(value):
         raise DriveError(f"{where}: '{text}' is not a finite number; drop or mend that line")
     return value

@@ -41,9 +41,7 @@ _SETTLED = 1e-3
 X, Y, HEADING, SPEED, TURN, ROLL, PITCH = range(7)
 """The states: place, m, heading, rad, speed, m/s, yaw rate, rad/s; roll and pitch of one frame, rad."""
 
-POSE = [X, Y, HEADING, ROLL, PITCH]
-"""The states that an image depends on."""
-
+POSE = [X, Y, HEADING, ROLL, PITCH]  # the states that an image depends on
 _STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])  # steps of the differences by POSE: m and rad
 # Rows (4, 8) of the stacked corners of a detection, for each corner that may be the marking's first.
 _SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)

@@ -151,9 +151,8 @@ def localize(
     drive, workers = as_drive(drive), workers or os.cpu_count() or 1
     check_together(hd_map, calibrations, drive)
     if detections is None:
-        detections = detect_all(
-            drive, DetectorOptions.for_mapping(), workers, progress or (lambda done, total: None)
-        )
+        report = progress or (lambda done, total: None)
+        detections = detect_all(drive, DetectorOptions.for_mapping(), workers, report)
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)
     attitude_rad = drive.pose_noise.roll_pitch_rad
@@ -252,8 +251,7 @@ def summary_lines(found: Localised) -> list[str]:
     if not found.explained:
         lines.append(
             f"FAIL: the map explains {figures['matched_share']:.0%} of the detections, so that the figures "
-            "above cannot be relied on: is it of this site, as it is painted today, and does the drive begin "
-            "where its first pose says?"
+            "above cannot be relied on: is it of this site, as painted today, and is the first pose right?"
         )
     return lines
 

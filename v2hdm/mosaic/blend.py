@@ -36,12 +36,8 @@ from v2hdm.records import FloatArray
 TILES_PX = (128, 64, 32, 16)
 """Sides that a tile may have, px of the canvas: as large as :data:`WARP_ERROR_PX` allows."""
 
-SHEET_PX = 2048
-"""Side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen."""
-
-WARP_ERROR_PX = 0.02
-"""By so much of an image's pixels may interpolated positions be off."""
-
+SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
+WARP_ERROR_PX = 0.02  # by so much of an image's pixels may interpolated positions be off
 _NODES = 8  # Chebyshev nodes along a tile's side
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
@@ -79,10 +75,8 @@ def blend(
 ) -> Iterator[Sheet]:
     """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
 
-    ``shots`` are in driving order; ``progress`` counts images put onto sheets.
-
-    Raises:
-        DriveError: an image is missing, damaged or of the wrong size.
+    ``shots`` are in driving order; ``progress`` counts images put onto sheets. Raises DriveError where an
+    image is missing, damaged or of the wrong size.
     """
     tiling = Tiling.of(canvas, shots, lenses)
     plan = _plan(canvas, shots, lenses, tiling.side_px)
@@ -138,8 +132,7 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
 def _tiles_under(polygon: FloatArray, limit: np.ndarray, side_px: int) -> np.ndarray:
     """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels.
 
-    Two convex shapes are apart if a side of either parts them; the box around the polygon is that of the
-    tiles' sides.
+    Two convex shapes are apart if a side of either parts them; the polygon's box is the tiles' sides.
     """
     low = np.maximum(np.floor((polygon.min(axis=0) - 1) / side_px).astype(int), 0)
     high = np.minimum(np.floor((polygon.max(axis=0) + 1) / side_px).astype(int) + 1, limit)
@@ -167,9 +160,7 @@ def _sources(
 ) -> Iterator[_Source]:
     """The images of shots in some order; the next is decoded meanwhile, the last used stay decoded."""
     boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
-    trusts = {
-        name: torch.from_numpy(lenses[name].trust[box].copy()).to(device) for name, box in boxes.items()
-    }
+    trusts = {key: torch.from_numpy(lenses[key].trust[box].copy()).to(device) for key, box in boxes.items()}
 
     @lru_cache(maxsize=_KEPT_IMAGES)
     def decoded(path: Path, camera: str) -> np.ndarray:
@@ -211,8 +202,7 @@ class Tiling:
     def of(cls, canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> Tiling:
         """The largest tiles in which the first image of each camera lies as exactly as it has to.
 
-        Raises:
-            ConfigError: not even the smallest do; the canvas is too coarse for the cameras.
+        Raises ConfigError where not even the smallest do; the canvas is too coarse for the cameras.
         """
         first = {shot.camera: shot for shot in reversed(shots)}
         for side_px in TILES_PX:
@@ -221,8 +211,7 @@ class Tiling:
             if max(errors, default=0.0) <= WARP_ERROR_PX:
                 return tiling
         raise ConfigError(
-            f"a resolution of {canvas.cell_m:g} m a pixel is too coarse for what the cameras show close by; "
-            "give a finer one"
+            f"resolution of {canvas.cell_m:g} m is too coarse for these cameras; choose a finer"
         )
 
     def error_px(self, cell_m: float, shot: Shot, lens: Lens) -> float:

@@ -16,7 +16,7 @@ from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.extras import need
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
 from v2hdm.mosaic.sharpness import (
@@ -35,12 +35,8 @@ from v2hdm.report.outputs import write_json
 from v2hdm.report.page.facts import read_cameras
 from v2hdm.store.files import whole_file
 
-LARGEST_PICTURE_PX = 8192
-"""Limit of either side of the picture, which graphics cards of computers and phones alike can draw."""
-
-MULTIPLE_PX = 256
-"""Sides of a canvas are multiples of it, so that pictures reduced by up to that factor fit it exactly."""
-
+LARGEST_PICTURE_PX = 8192  # of either side of the picture: graphics cards of computers and phones draw that
+MULTIPLE_PX = 256  # divides sides of a canvas, so that pictures reduced by up to that factor fit it exactly
 _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
 _SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
@@ -75,8 +71,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
     """Put sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
 
-    Raises:
-        ConfigError: rasterio is not installed.
+    Raises ConfigError where rasterio is not installed.
     """
     rasterio = need("rasterio", "gis", path.name, ConfigError)
     west, _, _, north = canvas.bounds_m
@@ -128,9 +123,8 @@ class Picture:
         reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
         seen = reduced[..., 3:]
         colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
-        self._rgba[row : row + rows, column : column + columns] = np.round(
-            np.concatenate([colours, 255 * seen], axis=2)
-        )
+        drawn = np.round(np.concatenate([colours, 255 * seen], axis=2))
+        self._rgba[row : row + rows, column : column + columns] = drawn
 
     def write(self, path: Path) -> None:
         """Write it as WebP, transparent where nothing was seen; whole or not at all."""
@@ -142,9 +136,7 @@ class Picture:
 
 _log = logging.getLogger(__name__)
 
-RESOLUTION_M = 0.02
-"""Side of a pixel of the mosaic unless another is asked for."""
-
+RESOLUTION_M = 0.02  # side of a pixel of the mosaic unless another is asked for
 TIFF, PICTURE, EXTENT, COMPARISON = "mosaic.tif", "mosaic.webp", "mosaic.json", "mosaic_before_after.png"
 
 
@@ -169,11 +161,8 @@ def write_mosaic(
 
     ``folder`` holds the run's map, calibrations and adjusted trajectory, ``drive`` is what it has mapped.
     ``resolution_m`` is the side of a pixel on the ground; ``progress`` counts images put onto the ground.
-
-    Raises:
-        MapFileError: the folder is no result, or not one of this drive.
-        DriveError: an image is missing or damaged.
-        ConfigError: the resolution makes no mosaic.
+    Raises MapFileError where the folder is no result, or not one of this drive, DriveError where an image is
+    missing or damaged, ConfigError where the resolution makes no mosaic.
     """
     if not resolution_m > 0:
         raise ConfigError(f"a resolution of {resolution_m:g} m a pixel makes no mosaic; give a positive one")
@@ -250,8 +239,7 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     taken_s = np.array([image.taken_s for image in drive.images])
     if adjusted.stamp_s[0] > taken_s.max() or adjusted.stamp_s[-1] < taken_s.min():
         raise MapFileError(
-            f"{folder / 'trajectory.tum'} and drive {drive.name} share no time: give the drive that this "
-            "result is of"
+            f"{folder / 'trajectory.tum'} and drive {drive.name} share no time: give the drive of this result"
         )
     drive = with_own_vehicle(drive, Detector.load())
     lenses = {

@@ -26,9 +26,7 @@ from v2hdm.mosaic.shots import Canvas, Lens, Shot
 from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report import style
 
-REACH_M = 0.75
-"""Half of the length of a profile, m: misplaced paint is found within it."""
-
+REACH_M = 0.75  # half of the length of a profile, m: misplaced paint is found within it
 _MIDDLE = (0.2, 0.8)  # part of a side over which its profile is averaged: without its corners
 _SAMPLES = 12  # places along a side's middle part
 _LEAST_SIDE_M = 0.4  # shorter sides have no middle part that pixels of some centimetres would resolve, m
@@ -113,9 +111,7 @@ def _profiles(sides: FloatArray, step_m: float) -> FloatArray:
     return np.asarray(middle[:, :, None] + across[:, None] * normal[:, None, None])
 
 
-AHEAD_M, ACROSS_M = 12.0, 8.0
-"""Length and width of the ground that is compared."""
-
+AHEAD_M, ACROSS_M = 12.0, 8.0  # length and width of the ground that is compared
 _CELL_M = 0.01
 _PANEL_IN = 5.2
 _BAR_M = 2.0

@@ -27,8 +27,7 @@ class Canvas:
     """``rows`` x ``columns`` square pixels of ``cell_m`` on the ground, seen from above.
 
     ``corner_map`` (2,) m is the outer corner of the first pixel, ``right_map`` (2,) the unit vector along
-    which columns rise; rows rise at a right angle to it, clockwise. A canvas whose columns rise to the east
-    has north above.
+    which columns rise; rows rise at a right angle to it, clockwise. North is above where columns rise east.
     """
 
     corner_map: FloatArray
@@ -77,9 +76,7 @@ class Canvas:
         return west, north - self.rows * self.cell_m, west + self.columns * self.cell_m, north
 
 
-FEATHER = 1 / 15
-"""Band at the edge of what is trusted over which the weight rises from 0 to 1, in heights of the image."""
-
+FEATHER = 1 / 15  # band at the edge of what is trusted where the weight rises to 1, in heights of the image
 _OUTLINE_STEP_PX = 16  # distance of the points by which the outline of what is trusted is laid on the ground
 
 

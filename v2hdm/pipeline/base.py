@@ -14,29 +14,24 @@ from scipy.spatial import cKDTree
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.maps import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
+from v2hdm.io.maps.evidence import read_exclusions
+from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
+from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.figures import save_changes
 from v2hdm.site.changes import Base
-from v2hdm.store.files import load_json, take_array
 
-_SITE_M = 40.0
-"""A marking farther from all of a drive's route is not seen from it, m: twice what a camera reaches."""
-
-_POSITION_SIGMA_M = 0.02
-"""Sigma of a written pose's height by which its road is laid flat, m."""
-
-LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)
-"""Fates that are changes of the site, and no want of images."""
+_SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
+_POSITION_SIGMA_M = 0.02  # sigma of a written pose's height by which its road is laid flat, m
+LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
 
 
 def read_base(path: Path) -> Base:
     """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
 
-    Raises MapFileError where it is missing, damaged, of an older version or another method, or its verdict is
-    FAIL.
+    Raises MapFileError where it is missing, damaged, of an older version, of another method, or FAIL.
     """
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
@@ -54,7 +49,9 @@ def read_base(path: Path) -> Base:
             "naive methods; map its drive anew"
         )
     poses = [lay_flat(read_tum(one), _POSITION_SIGMA_M).trajectory.map_from_vehicle for one in trajectories]
-    return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), _left_out(excluded))
+    left_out = read_exclusions(excluded) if excluded.is_file() else []
+    candidates = tuple((one.kind, one.position_map, one.sightings) for one in left_out)
+    return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), candidates)
 
 
 def check_together(base: Base, drive: Drive, path: str) -> None:
@@ -81,19 +78,6 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
         return np.asarray(read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32))
 
     return grey
-
-
-def _left_out(path: Path) -> tuple[tuple[str, FloatArray, int], ...]:
-    """Class, place (2,) and sightings of the candidates that an earlier map left out."""
-    if not path.is_file():
-        return ()
-    out = []
-    for feature in load_json(path, MapFileError).get("features", []):
-        properties = feature.get("properties", {})
-        if "position_map" in properties:
-            place = take_array(properties["position_map"], (2,), f"{path}: position_map", MapFileError)
-            out.append((str(properties.get("class")), place, int(properties.get("sightings", 0))))
-    return tuple(out)
 
 
 def changes_json(changes: Changes) -> dict[str, Any]:

@@ -20,9 +20,7 @@ from v2hdm.site.changes import Base
 
 _log = logging.getLogger(__name__)
 
-BEST = "Opt"
-"""The method whose map and calibration are the result."""
-
+BEST = "Opt"  # the method whose map and calibration are the result
 STAGE = "map"
 
 
@@ -87,10 +85,8 @@ def _map_set(
     last: bool,
     executor: Executor,
 ) -> MappedSet:
-    log_step, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(
-        drive, detections, cameras, survey.mapping, log_step, base, grey_reader(drive), executor
-    )
+    log, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
+    methods = run_methods(drive, detections, cameras, survey.mapping, log, base, grey_reader(drive), executor)
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None
     # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.

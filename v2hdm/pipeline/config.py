@@ -16,8 +16,7 @@ from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig
 
-ACCURACY_GOAL_CM = 5.0
-"""The 95 % radius, cm, that is asked of a map where nobody states another."""
+ACCURACY_GOAL_CM = 5.0  # the 95 % radius, cm, that is asked of a map where nobody states another
 
 NO_DRIVE = (
     "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, "
@@ -42,9 +41,7 @@ class DriveConfig(ReadOptions):
         listed = self.path if isinstance(self.path, list) else [self.path]
         wrong = [one for one in listed if not isinstance(one, str | Path) or not str(one)]
         if wrong:
-            raise ConfigError(
-                f"drive.path: {wrong[0]!r} is no path; give one, or a list as in [monday,friday]"
-            )
+            raise ConfigError(f"drive.path: {wrong[0]!r} is no path; give one, or a list: [monday,friday]")
         return tuple(Path(one) for one in listed)
 
 
@@ -168,9 +165,7 @@ def admit(config: RunConfig) -> str:
     table_of(config.mapping.survey)
     check_formats(config.export, "export")
     if config.mosaic and len(config.drive.paths) > 1:
-        raise ConfigError(
-            "mosaic=true puts the images of one drive on the ground; map the drives one by one for it"
-        )
+        raise ConfigError("mosaic=true shows the ground of one drive; map the drives one by one for it")
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name
@@ -183,10 +178,7 @@ def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: 
     if has_base and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if drives > 1 and options.mode == INCREMENTAL:
-        raise ConfigError(
-            "mode=incremental maps one drive as the vehicle would; map several with mode=batch, or one by "
-            "one with map.base"
-        )
+        raise ConfigError("mode=incremental maps one drive as the vehicle would; map several with mode=batch")
     check_device(options.device)
 
 
@@ -197,6 +189,4 @@ def check_device(device: str) -> None:
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"device is {shown(device)}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(
-            "device is 'cuda' but torch sees no GPU: check the driver and torch build, or set device=cpu"
-        )
+        raise ConfigError("device is 'cuda' but torch sees no GPU: check driver and torch, or set device=cpu")

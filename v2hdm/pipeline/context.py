@@ -53,15 +53,8 @@ class Unwatched:
 class Context:
     """Surroundings of a run.
 
-    Attributes:
-        cache: keeps what stages have found; as it is here, nothing.
-        progress: shows how far the long steps are.
-        viewer: is shown images, detections and maps as they come.
-        detect: detects in images; None does so in processes of this machine.
-        executor: works on what can be parted of a run.
-        workers: processes; 0 takes one per core.
-        folder: takes what the viewer keeps of the run.
-        seconds: how long each step took, s.
+    By itself the ``cache`` keeps nothing, and detection (``detect``) is by processes of this machine, one per
+    core where ``workers`` is 0. ``folder`` takes what the viewer keeps, ``seconds`` how long each step took.
     """
 
     cache: StageCache = field(default_factory=lambda: StageCache(None))

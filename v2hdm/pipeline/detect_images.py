@@ -32,9 +32,7 @@ from v2hdm.io.drive import READERS, read_drive
 from v2hdm.records import CameraInfo
 from v2hdm.store.inputs import note_input
 
-ROUGH_MOUNTING = (1.6, 5.0, 60.0)
-"""Height (m), pitch (deg) and horizontal field of view (deg) of a camera of which nothing is known."""
-
+ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known
 _UNKNOWN_PITCH_DEG, _STATED_PITCH_DEG, _ROLL_DEG, _LOG_FOCAL = 8.0, 4.0, 1.5, 0.3
 """Standard deviations of an assumed and of a stated pitch, of the roll, and of the logarithm of an assumed
 focal length: within one are lenses of 46 to 76 degrees."""
@@ -45,8 +43,7 @@ within 6 px."""
 
 _KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard deviation is this
 
-_ROUGH_RANGE_M = 40.0
-"""Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
+_ROUGH_RANGE_M = 40.0  # distances may be wrong by two without a calibration: none is too far
 
 _Frames = Iterator[tuple[Frame, RoadDetector | None]]
 """Frames to look at, and the detector for each as far as it is known before the first."""
@@ -124,9 +121,7 @@ def _lens(
     if camera_name is not None:
         raise ConfigError(f"--camera-name: {camera} is the calibration of one camera; drop it")
     if mounting is not None:
-        raise ConfigError(
-            "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
-        )
+        raise ConfigError("--camera and --mounting exclude each other: drop one, a calibration has both")
     return None
 
 
@@ -267,9 +262,7 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
-            raise DriveError(
-                f"{path}: no camera '{name}', as the calibration calls it; this drive has {', '.join(roads)}"
-            )
+            raise DriveError(f"{path}: no camera '{name}' of the calibration, but {', '.join(roads)}")
         roads = {name: road}
     return (
         (replace(frame, name=f"{image.camera}_{frame.name}", stamp_s=image.stamp_s), roads[image.camera])

@@ -24,9 +24,7 @@ from v2hdm.store.cache import key_of
 _log = logging.getLogger(__name__)
 
 STAGE = "detect"
-PIECE = 16
-"""Images of a piece: a second or two of work."""
-
+PIECE = 16  # images of a piece: a second or two of work
 _Masks = dict[str, NDArray[np.bool_]]
 _Piece = list[ImageDetections]
 
@@ -83,9 +81,7 @@ def detect_in_pieces(
 
 def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
     """The known pieces, by their first images, under the drive's numbers of images."""
-    return [
-        replace(found, image=start + found.image) for start, piece in pieces.items() for found in piece or ()
-    ]
+    return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
 
 
 def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]:

@@ -18,8 +18,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_figures, growth_figures, headline, map_figures
 
-CameraSets = Mapping[str, Mapping[str, MethodResult]]
-"""Results by camera set (``front``, ``rear``, ``both``), then by method."""
+CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def evaluate(
             ideal = run_naive("true extrinsic", Inputs(drive, detections, cameras, options), ipms)
             reference[name] = {"naive_true_extrinsic": map_figures(ideal.hd_map, truth, expected)}
     progress(len(methods), len(methods))
-    growth = {} if truth is None else _growth(list(methods.values())[-1], truth)
+    growth = {} if truth is None else growth_of(list(methods.values())[-1], truth)
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
         metrics |= {"reference": reference, "disturbances": truth.disturbances, "growth": growth}
@@ -94,7 +93,7 @@ def _own_figures(result: MethodResult) -> dict[str, Any]:
     return figures
 
 
-def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
+def growth_of(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
     """Corner RMSE (m) over the first n markings per method, in the incremental mode; else empty.
 
     The naive methods keep a marking as it is once it has been passed, so their first n will do.

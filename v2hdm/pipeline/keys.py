@@ -8,7 +8,6 @@ from pathlib import Path
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
-from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.records import Drive, Image
 from v2hdm.store.cache import key_of
@@ -65,11 +64,5 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     files += [path for truth in truths for path in sorted(truth.rglob("*"))]
     read = [(str(path), file_digest(path)) for path in files if path.is_file()]
     of_drives = [contents.key(drive) for drive in drives]
-    return key_of(
-        code, asked, model_key(config.detector), [drive.root.resolve() for drive in drives], of_drives, read
-    )
-
-
-def read_drives(config: RunConfig, paths: Sequence[Path]) -> list[Drive]:
-    """The drives of a run; raises DriveError where one cannot be read."""
-    return [read_drive(path, config.drive) for path in paths]
+    roots = [drive.root.resolve() for drive in drives]
+    return key_of(code, asked, model_key(config.detector), roots, of_drives, read)

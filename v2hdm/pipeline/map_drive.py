@@ -114,9 +114,8 @@ def map_drive(
         checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
     paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
     about = describe_run(name or read.whole.name, read.whole, paths, reading)
-    unjudged = Result(
-        about, read.drives, read.contents, checked.drive_as_described, context.seconds, options.device
-    )
+    described, seconds = checked.drive_as_described, context.seconds
+    unjudged = Result(about, read.drives, read.contents, described, seconds, options.device)
     try:
         with closing(context.viewer):
             detections = _detect(checked.drive, read.contents, settings, context)
@@ -138,9 +137,7 @@ def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) 
         begun = [context.executor.begin(partial(_read_one, one, options)) for one in sources]
         found = [wait() for wait in begun]
     for drive, _ in found:
-        _log.info(
-            "drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras)
-        )
+        _log.info("drive %s: %d images of %s", drive.name, len(drive.images), ", ".join(drive.cameras))
     drives = tuple(drive for drive, _ in found)
     digests = {path: digest for _, contents in found for path, digest in contents.digests.items()}
     return Read(drives, join_drives(drives), Contents(digests))
@@ -162,9 +159,7 @@ def _detect(
         detections = detect_in_pieces(drive, contents, options, context, context.detect or detect_images)
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)
-    _log.info(
-        "detected %d markings and %d pieces of lane paint in %d images", markings, lanes, len(detections)
-    )
+    _log.info("detected %d markings, %d pieces of lane paint in %d images", markings, lanes, len(detections))
     return detections
 
 

@@ -211,7 +211,6 @@ class Result:
 
 
 def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: Judgement) -> None:
-    """Write map, calibrations, trajectory and pictures."""
     drive, best, verdict = result.drive, result.best, result.verdict.as_json()
     write_map(result.map, folder, "map", formats, verdict)
     about = Provenance.today(drive.name, verdict)

@@ -18,10 +18,11 @@ from typing import Any
 
 from v2hdm import __version__
 from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.io.drive import read_drive
 from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit, run_name
 from v2hdm.pipeline.context import Context, Unwatched, Viewer, log_file, logging_to
-from v2hdm.pipeline.keys import Contents, read_drives, result_key
+from v2hdm.pipeline.keys import Contents, result_key
 from v2hdm.progress import Progress, silent
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
@@ -36,11 +37,8 @@ from v2hdm.verdict.verdict import Verdict
 _log = logging.getLogger(__name__)
 
 _STAGE = "finished"
-_UPLOADS = "uploads"
-"""Folder in the cache of results that are not uploaded yet."""
-
-_RECORD = ".v2hdm-finished"
-"""Object beside a result at a store, which says what it was made of."""
+_UPLOADS = "uploads"  # folder in the cache of results that are not uploaded yet
+_RECORD = ".v2hdm-finished"  # object beside a result at a store, which says what it was made of
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ def _is_of(config: RunConfig, key: str) -> bool:
     if config.simulate is not None:
         paths = (folder_of_port(config.simulate, Path(config.cache)),)
         note_use(paths[0])
-    drives = read_drives(config, paths)
+    drives = [read_drive(path, config.drive) for path in paths]
     return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
 
 
@@ -166,9 +164,8 @@ def _take_or_upload(
         if there is None:
             entry = _noted(made.folder, cache)
             record = {} if entry is None else {_RECORD: encode(entry)}
-            remote.upload(
-                place, {**remote.contents_of(made.folder), **record}, writer, partial(progress, "upload")
-            )
+            contents = remote.contents_of(made.folder) | record
+            remote.upload(place, contents, writer, partial(progress, "upload"))
         drop_result(made.folder)
     with suppress(OSError):  # other results wait there for their upload
         folder.rmdir()
@@ -251,9 +248,7 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
             raise ConfigError(NO_DRIVE)
         return config.drive.paths
     if config.drive.paths:
-        raise ConfigError(
-            "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
-        )
+        raise ConfigError("both simulate and drive.path are set: a run takes one, remove the other")
     from v2hdm.simulate import rendered_drive
 
     with context.timed("render"):

@@ -22,19 +22,15 @@ from v2hdm.verdict.results.survey import check_frame, check_points
 
 _log = logging.getLogger(__name__)
 
-_NAMED = 5
-"""Points that a line of the log names."""
-
-_NEAR_M = 22.0
-"""How far from the route, m, images may show a point: as far as the detector looks by default."""
+_NAMED = 5  # points that a line of the log names
+_NEAR_M = 22.0  # how far from the route, m, images may show a point: as far as the detector looks by default
 
 
 @dataclass(frozen=True)
 class Survey:
     """A survey as a run uses it: settings of the mapping with its control points, and its check points.
 
-    ``points`` are all of the file, ``elsewhere`` where they would lie, had it meant something else, by what
-    (N, 2).
+    ``points`` are all of the file, ``elsewhere`` where they would lie, had it meant something else (N, 2).
     """
 
     mapping: MappingOptions

@@ -11,8 +11,6 @@ as they say. T over these is the normalised estimation error squared (NEES), 1 o
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,13 +24,12 @@ from v2hdm.io.drive.survey import SurveyedPoint
 from v2hdm.io.maps.features import features_of
 from v2hdm.io.maps.surveyed import match
 from v2hdm.records import FloatArray, HdMap, IntArray
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_csv
 
 JointCovariance = Callable[[IntArray, IntArray], FloatArray]
 """Joint covariance (2N, 2N), m^2, of the corners (N,) of markings (N,) of a map, stacked x0, y0, x1, ..."""
 
-INSIDE = 0.95
-"""Probability of the ellipse that a point is reported to lie in or not."""
+INSIDE = 0.95  # probability of the ellipse that a point is reported to lie in or not
 
 COLUMNS: tuple[str, ...] = (
     *("id", "description", "x_map_m", "y_map_m", "marking", "class", "corner"),
@@ -210,9 +207,7 @@ def compare(
 
 def write_check_points(table: CheckTable, path: Path) -> None:
     """Write the table as CSV to ``path``: one row per check point, compared ones first."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(COLUMNS)
+    rows: list[Sequence[object]] = [COLUMNS]
     for one in table.compared:
         point = one.point
         sigma, own_sigma = (np.sqrt(np.diag(of)) for of in (one.covariance_m2, one.map_covariance_m2))
@@ -221,11 +216,11 @@ def write_check_points(table: CheckTable, path: Path) -> None:
         cells += _metres([*one.off_m, one.distance_m, *sigma, *own_sigma])
         cells += [f"{one.normalised:.3f}", "yes" if one.is_inside else "no"]
         height = [] if one.off_height_m is None else [one.off_height_m]
-        rows.writerow([*cells, *(_metres(height) or [""]), ""])
+        rows.append([*cells, *(_metres(height) or [""]), ""])
     for point, why in table.unmatched:
         empty = [""] * (len(COLUMNS) - 5)
-        rows.writerow([point.id, point.description, *_metres(point.position_map), *empty, why])
-    replace_text(path, text.getvalue())
+        rows.append([point.id, point.description, *_metres(point.position_map), *empty, why])
+    replace_csv(path, rows)
 
 
 def _metres(values: Sequence[float] | FloatArray) -> list[str]:

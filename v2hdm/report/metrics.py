@@ -17,18 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex
-from v2hdm.geometry.quadrilateral import long_axis
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
-from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
+from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
 
-MATCH_GATE_M = 2.0
-"""A mapped marking farther than this from every true one of its class is false."""
-
-MIN_SIGHTINGS = 3
-"""A marking was driven past when this many images show all of it inside the region of interest."""
-
-FULLY_VISIBLE = 0.99
-"""Visible fraction from which a marking counts as unoccluded."""
+MATCH_GATE_M = 2.0  # a mapped marking farther than this from every true one of its class is false
+MIN_SIGHTINGS = 3  # images that show all of a marking in the region of interest, for it to be driven past
+FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unoccluded
 
 
 @dataclass(frozen=True)
@@ -134,11 +128,8 @@ def rms(errors: FloatArray) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else float("nan")
 
 
-SAMPLE_STEP_M = 0.1
-"""Polylines are compared at points this far apart."""
-
-LATERAL_GATE_M = 0.3
-"""A mapped lane this near to a true one maps it."""
+SAMPLE_STEP_M = 0.1  # polylines are compared at points this far apart
+LATERAL_GATE_M = 0.3  # a mapped lane this near to a true one maps it
 
 
 @dataclass(frozen=True)
@@ -232,51 +223,11 @@ def _stack(pieces: Iterable[FloatArray]) -> FloatArray:
     return np.concatenate(arrays) if arrays else np.empty((0, 2))
 
 
-MAX_CYCLE_M = 15.0
-"""Successors farther away belong to another row of dashes."""
-
-MAX_OFFSET_M = 0.5
-"""A successor lies at most this far beside the axis of its dash."""
-
-
-@dataclass(frozen=True)
-class DashSpacing:
-    """Distance from dash to next dash of the same line, centre to centre."""
-
-    pairs: int
-    median_m: float
-    deviation_m: float
-
-
-def dash_spacing(hd_map: HdMap) -> DashSpacing:
-    """Measure the cycle of all dashed lines of a map; nan where no dash has a successor."""
-    dashes = [m.corners_map for m in hd_map.markings if m.kind == LANE_DASH]
-    gaps = _successor_distances(np.array(dashes).reshape(-1, 4, 2))
-    if not len(gaps):
-        return DashSpacing(0, float("nan"), float("nan"))
-    median = float(np.median(gaps))
-    # 1.4826 makes the median absolute deviation the sigma of a Gaussian.
-    return DashSpacing(len(gaps), median, float(1.4826 * np.median(np.abs(gaps - median))))
-
-
-def _successor_distances(dashes: FloatArray) -> FloatArray:
-    """Distance (P,) from each dash (J, 4, 2) to the nearest one ahead of it along its own axis."""
-    if len(dashes) < 2:
-        return np.empty(0)
-    centres, axes = dashes.mean(axis=1), np.array([long_axis(corners) for corners in dashes])
-    offset = centres[None] - centres[:, None]
-    along = (offset * axes[:, None]).sum(axis=2)
-    across = offset[..., 0] * axes[:, None, 1] - offset[..., 1] * axes[:, None, 0]
-    ahead = (along > 0.5) & (along <= MAX_CYCLE_M) & (np.abs(across) <= MAX_OFFSET_M)
-    nearest = np.where(ahead, along, np.inf).min(axis=1)
-    return np.asarray(nearest[np.isfinite(nearest)])
-
-
 _MAIN_REASONS = 3  # reasons of exclusion that a headline names
 
 
 def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
-    """Figures of one map: against the truth where there is one, counts and dash spacing always.
+    """Figures of one map: against the truth where there is one, counts always.
 
     Counts and errors are of markings of all classes; ``recall`` and ``expected`` are those of the
     diamonds, the site's landmarks, where it has any. ``by_class`` holds every figure of each class.
@@ -295,7 +246,6 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
     else:
         length = float(sum(length_m(lane.points_map) for lane in hd_map.lanes))
         figures["lanes"] = {"lanes": len(hd_map.lanes), "length_m": length}
-    figures["dash_spacing"] = asdict(dash_spacing(hd_map))
     return figures
 
 

@@ -215,8 +215,7 @@ _OVERLAY_RANGE_M = 30.0
 
 _BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # how the map is drawn by what a run began with
 
-OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}
-"""How it is drawn by what the run found."""
+OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}  # how it is drawn by what the run found
 
 
 def save_overlay(

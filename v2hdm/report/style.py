@@ -27,9 +27,7 @@ OKABE_ITO = {
 }
 """Colours that colour-blind people tell apart: Okabe and Ito, Color Universal Design, 2008."""
 
-PAINT = "#dfe4e8"
-"""Filling of true markings."""
-
+PAINT = "#dfe4e8"  # filling of true markings
 GRID = "#e6eaed"
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
@@ -44,8 +42,7 @@ METHOD = {
 LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
 """Line style of each method: they differ without colour, too."""
 
-MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
-"""Marker of each method."""
+MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}  # marker of each method
 
 
 def line_of(method: str) -> dict[str, Any]:

@@ -26,13 +26,13 @@ METHODS: Mapping[str, str] = {
 
 
 _Column = tuple[str, int, float]  # key in metrics.json, digits behind the point, factor
-_AGAINST_TRUTH: Mapping[str, _Column] = {
+AGAINST_TRUTH: Mapping[str, _Column] = {
     "recall": ("recall", 3, 1.0),
     "false": ("false_markings", 0, 1.0),
     "corner RMSE (cm)": ("corner_rmse_m", 1, 100.0),
     "bias (cm)": ("corner_bias_m", 1, 100.0),
 }
-_WITHOUT_TRUTH: Mapping[str, _Column] = {
+WITHOUT_TRUTH: Mapping[str, _Column] = {
     "sigma (cm)": ("median_sigma_m", 1, 100.0),
     "reprojection (px)": ("reprojection_rmse_px", 2, 1.0),
 }
@@ -41,7 +41,7 @@ _WITHOUT_TRUTH: Mapping[str, _Column] = {
 def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
     """Method x camera set: markings, recall and corner errors, from ``metrics.json``'s ``results``."""
     has_truth = any("recall" in row for rows in results.values() for row in rows.values())
-    columns = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
+    columns = AGAINST_TRUTH if has_truth else WITHOUT_TRUTH
     table = new_table(title, ("method", "cameras"), ("markings", *columns))
     others = sorted({method for rows in results.values() for method in rows} - set(METHODS))
     for method in (*METHODS, *others):
@@ -98,9 +98,7 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
         lines = progress_lines(lambda line: plain(console, line))
         yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
         return
-    texts = [
-        TextColumn(text, markup=False) for text in ("{task.description:<20}", "{task.fields[stage]:<16}")
-    ]
+    texts = [TextColumn(one, markup=False) for one in ("{task.description:<20}", "{task.fields[stage]:<16}")]
     bar = (BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*texts, *bar, console=console) as bars:
         tasks: dict[str, TaskID] = {}

@@ -29,11 +29,8 @@ from v2hdm.store.lock import HOST, STAGES, in_use
 
 _log = logging.getLogger(__name__)
 _Value = TypeVar("_Value")
-Line = tuple[str, int, str]
-"""Name of a logger, level, message."""
-
-ENDING = ".v2hdm"
-"""Of an entry's name, after its key."""
+Line = tuple[str, int, str]  # name of a logger, level, message
+ENDING = ".v2hdm"  # of an entry's name, after its key
 
 LIBRARIES = (
     "torch", "kornia", "numpy", "scipy", "onnxruntime", "onnxruntime-gpu", "opencv-python-headless", "numba",
@@ -46,8 +43,7 @@ _PACKAGE = Path(__file__).parents[1]
 _CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
 """Files of the package that decide what comes out: sources, catalogue, weights, templates."""
 
-_NUMBERS = "biufc"
-"""Kinds of numpy's element types that are numbers; objects are none."""
+_NUMBERS = "biufc"  # kinds of numpy's element types that are numbers; objects are none
 
 
 class CodecError(ValueError):
@@ -134,11 +130,8 @@ class StageCache:
     """The entries of a cache folder.
 
     The results of a stage have always been through the codec, and the log lines of their making are logged
-    again: a run that goes on with entries cannot tell them from results of its own.
-
-    Args:
-        folder: of the cache; None keeps nothing.
-        resume: whether entries are taken; otherwise everything is made anew, and kept.
+    again: a run that goes on with entries cannot tell them from results of its own. No ``folder`` keeps
+    nothing; without ``resume`` everything is made anew, and kept.
     """
 
     def __init__(self, folder: Path | None, resume: bool = True) -> None:
@@ -226,8 +219,7 @@ class StageCache:
         except OSError as failure:
             self._can_write = False
             _log.warning(
-                "%s: nothing can be kept there (%s), so that a later run begins anew; free space or set "
-                "another cache=",
+                "%s: nothing can be kept there (%s): later runs begin anew; free space or set cache=",
                 path.parents[1], failure.strerror,
             )  # fmt: skip
         return decode(content, kind)

@@ -6,12 +6,14 @@ map report as what they are; ``where`` names the place in its message. Writers n
 
 from __future__ import annotations
 
+import csv
 import difflib
 import hashlib
+import io
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -87,6 +89,13 @@ def replace_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def replace_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
+    """Write ``rows`` to ``path`` as CSV, as :func:`whole_file` does."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    replace_text(path, text.getvalue())
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's content, in hexadecimal."""
     with path.open("rb") as stream:
@@ -101,9 +110,7 @@ def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     """
     content = read_yaml(path, error)
     if not isinstance(content, dict):
-        raise error(
-            f"{path}: expected 'key: value' entries, got {shown(content)}; see the format's description"
-        )
+        raise error(f"{path}: expected 'key: value' entries, got {shown(content)}; see its description")
     return content
 
 

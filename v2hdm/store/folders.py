@@ -23,18 +23,13 @@ from v2hdm.io.safe.texts import read_json
 from v2hdm.store.files import file_digest
 from v2hdm.store.lock import HOST, use_until_exit
 
-LIST = ".v2hdm-cache.json"
-"""Name of the list in a folder."""
-
+LIST = ".v2hdm-cache.json"  # name of the list in a folder
 _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
 
-_VERSION = 3
-"""Raised whenever an import comes out as other files."""
-
+_VERSION = 3  # raised whenever an import comes out as other files
 _IMAGES = (".png", ".jpg", ".jpeg")
 _WRITER = f"{HOST}-{secrets.token_hex(4)}"
-_STALE_S = 3600.0
-"""A folder that nothing was written to for so long was left by a process that was killed."""
+_STALE_S = 3600.0  # a folder that nothing was written to for so long was left by a process that was killed
 
 
 def note_use(folder: Path) -> None:
@@ -158,9 +153,7 @@ def drop_entry(folder: Path) -> None:
 
 def cannot_write(folder: Path, failure: OSError) -> DriveError:
     """The error of an import that finds no place."""
-    return DriveError(
-        f"{folder}: cannot write the import ({failure.strerror}); free space or choose another drive.cache"
-    )
+    return DriveError(f"{folder}: cannot be written ({failure.strerror}); free space or set drive.cache")
 
 
 def _partial(folder: Path) -> Path:
@@ -179,9 +172,8 @@ def _write_list(folder: Path) -> None:
     described = {path.relative_to(folder).as_posix(): _described(path) for path in files}
     size = sum(size for size, _ in described.values())
     partial = folder / f".{_WRITER}.part"
-    partial.write_text(
-        json.dumps({"about": _ABOUT, "bytes": size, "files": described}) + "\n", encoding="utf-8"
-    )
+    text = json.dumps({"about": _ABOUT, "bytes": size, "files": described})
+    partial.write_text(text + "\n", encoding="utf-8")
     partial.replace(folder / LIST)
 
 

@@ -21,9 +21,7 @@ _log = logging.getLogger(__name__)
 LIST = ".v2hdm-results.jsonl"
 """Name of the list of our files in a folder of results: a head, then a line of JSON for each file written."""
 
-_DEEPEST = 3
-"""Folders above a file that may have a list: ours lie at most two folders deep."""
-
+_DEEPEST = 3  # folders above a file that may have a list: ours lie at most two folders deep
 _noted: ContextVar[set[tuple[int, int]] | None] = ContextVar("inputs of this command", default=None)
 _reported: set[tuple[Path, str]] = set()
 
@@ -77,8 +75,5 @@ def warn_if_changed(path: Path, data: bytes) -> None:
                     written.add(str(entry["sha256"]))
         if written and digest not in written and (path, digest) not in _reported:
             _reported.add((path, digest))
-            _log.warning(
-                "%s: is not as we wrote it, so it was edited since or is damaged; if nobody edited it, "
-                "make it anew",
-                path,
-            )
+            advice = "edited since, or damaged; make it anew if nobody edited it"
+            _log.warning("%s: is not as we wrote it: %s", path, advice)

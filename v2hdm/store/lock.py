@@ -20,9 +20,7 @@ from typing import IO
 
 _log = logging.getLogger(__name__)
 
-STAGES = "stages"
-"""Folder within a cache of what runs keep, and of the locks of those in progress."""
-
+STAGES = "stages"  # folder within a cache of what runs keep, and of the locks of those in progress
 IN_USE = f"{STAGES}/in_use"
 HOST = platform.node() or "this host"
 _ENDING = ".lock"
@@ -44,9 +42,7 @@ def take_lock(stream: IO[str]) -> bool:
     except (BlockingIOError, PermissionError):
         return False
     except OSError as failure:
-        _log.warning(
-            "%s: no lock can be held here (%s); do not write it twice at a time", stream.name, failure
-        )
+        _log.warning("%s: no lock can be held here (%s); do not write it twice at once", stream.name, failure)
     return True
 
 

@@ -22,11 +22,8 @@ _log = logging.getLogger(__name__)
 _ENTRY = re.compile(rf"[0-9a-f]{{64}}{re.escape(ENDING)}")
 _PARTIAL = re.compile(r"\.[\w.-]+[.-][0-9a-f]{8,16}\.part")
 
-DRIVES = "drives and imports"
-"""Kind of the folders, beside the stages of the entries."""
-
-LEFT = "left by killed runs"
-"""Kind of what was never finished."""
+DRIVES = "drives and imports"  # kind of the folders, beside the stages of the entries
+LEFT = "left by killed runs"  # kind of what was never finished
 
 
 @dataclass(frozen=True)

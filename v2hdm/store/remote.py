@@ -26,13 +26,10 @@ from v2hdm.store.files import file_digest
 from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, finish_entry, is_whole, note_use
 from v2hdm.store.inputs import LIST
 
-Report = Callable[[int, int], None]
-"""Called as ``report(done, total)`` with numbers of objects."""
-
+Report = Callable[[int, int], None]  # called as report(done, total) with numbers of objects
 _log = logging.getLogger(__name__)
 
-_MEMORY = "memory"
-"""A store that is gone with its process: for tests."""
+_MEMORY = "memory"  # a store that is gone with its process: for tests
 
 _PACKAGES = {
     "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs",
@@ -41,12 +38,8 @@ _PACKAGES = {
 }  # fmt: skip
 """Protocols of stores that replace an object at once, and the package that speaks each."""
 
-_NOTHING = ".v2hdm-nothing"
-"""A prefix that nobody writes to: cheap to list."""
-
-_AT_ONCE = 32
-"""Objects of one call, downloaded side by side."""
-
+_NOTHING = ".v2hdm-nothing"  # a prefix that nobody writes to: cheap to list
+_AT_ONCE = 32  # objects of one call, downloaded side by side
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
 _MESSAGE_LETTERS = 200
 
@@ -148,9 +141,7 @@ class RemoteFolder:
             with self._asked():
                 self._files.get(names, [str(path) for path in places.values()])
         except FileNotFoundError as failure:
-            raise ConfigError(
-                f"{self.url}: {_first_line(failure)} went while it was copied; start again"
-            ) from None
+            raise ConfigError(f"{self.url}: {_first_line(failure)} went while copied; start again") from None
 
     def write(self, name: str, content: bytes | Path) -> None:
         """Put an object, given as bytes or as a file, in whatever one of that name has been."""
@@ -201,9 +192,7 @@ class RemoteFolder:
         except FileNotFoundError:
             if not in_bucket:
                 raise
-            raise ConfigError(
-                f"{self.url}: no such bucket or container; make it, or give another {self._option}"
-            ) from None
+            raise ConfigError(f"{self.url}: no such bucket; make it or give another {self._option}") from None
         except Exception as failure:  # each package has errors of its own
             advice = f"check the network and start again, or give another {self._option}"
             if isinstance(failure, PermissionError) or "Credential" in type(failure).__name__:
@@ -219,8 +208,7 @@ def _first_line(failure: Exception) -> str:
 def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
     """The folder in ``cache`` that holds what is below a URL now, copied once for each content it has had.
 
-    Raises DriveError where there is no drive, a name of it leads out of its folder, or the copy cannot be
-    written.
+    Raises DriveError where there is no drive, a name of it leads out of its folder, or it cannot be copied.
     """
     there = {name: one for name, one in drive.listed().items() if not name.endswith("/")}
     if not there:
@@ -305,10 +293,7 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
         known = (one for one in entries if one.file == name)
         mine = next((one for one in known if one.is_of(there[name], place)), None)
         if mine is None:
-            raise ConfigError(
-                f"{place}/{name}: was changed after we wrote it and is not replaced; move it, or "
-                "give another place"
-            )
+            raise ConfigError(f"{place}/{name}: was changed after we wrote it: move it or give another place")
         ours[name] = mine
     return ours
 
@@ -317,8 +302,7 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
     """Put a result in the place of an earlier one, whose objects that stay the same stay.
 
     ``contents`` are objects by name, as bytes or as files. The same ``writer`` may go on after it was
-    stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where another's object has a
-    name of ours.
+    stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where a name is taken.
     """
     new = {name: _Entry.of(name, content) for name, content in contents.items()}
     listing, ours = place.read(LIST), refuse_upload(place, writer)

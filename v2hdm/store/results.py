@@ -26,8 +26,7 @@ from v2hdm.store.lock import HOST, take_lock
 _log = logging.getLogger(__name__)
 
 _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
-"""The disk is at fault, whatever was being written."""
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)  # the disk is at fault
 
 
 class _Target:
@@ -129,9 +128,7 @@ class _Target:
         """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
         for left in (unfinished, previous):
             if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
-                raise ConfigError(
-                    f"{left}: is in the way of our work and not ours; move it, or give another {self.option}"
-                )
+                raise ConfigError(f"{left}: is in our way, not ours; move it, or give another {self.option}")
         if previous.exists() and not self.path.exists():
             previous.replace(self.path)
         for left in (unfinished, previous):
@@ -174,8 +171,7 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
             for name, digests in (listed or {}).items():
                 if (target / name).is_file() and file_digest(target / name) not in digests:
                     raise ConfigError(
-                        f"{folder / name}: was changed after we wrote it and is not replaced; move it, or "
-                        f"give another {option}"
+                        f"{folder / name}: was changed after we wrote it: move it, or give another {option}"
                     )
             unfinished.mkdir()
             _write_list(unfinished, [])
@@ -288,8 +284,7 @@ def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
 def files_of_result(folder: Path) -> dict[str, str]:
     """SHA-256 of our files in a result folder by their names; none where it is no result.
 
-    Raises:
-        ConfigError: its list is damaged.
+    Raises ConfigError where its list is damaged.
     """
     return {name: digests[-1] for name, digests in (_Target(folder, "output=").listed() or {}).items()}
 

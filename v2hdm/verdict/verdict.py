@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-GOAL = "coarse"
-"""The check whether map and calibrations are as good as ``accuracy_goal_cm`` asks."""
+GOAL = "coarse"  # the check whether map and calibrations are as good as accuracy_goal_cm asks
 
 
 class Status(Enum):
@@ -153,18 +152,10 @@ def judge(
     status: Status = Status.FAIL,
     least: float | None = None,
 ) -> Finding:
-    """A finding that passes where the size of ``value`` is at most ``limit``.
+    """A finding, as :class:`Finding` describes its parts, that passes where ``value`` is within +-``limit``.
 
-    Args:
-        check: name of the check.
-        about: a camera's name, ``poses``, a setting, ``map``.
-        value: the measured value, in ``unit``.
-        limit: the largest size of ``value`` that passes.
-        unit: of both.
-        fine: the sentence where it passes.
-        wrong: the sentence where it does not: cause and recovery.
-        status: the status where it does not.
-        least: if given, ``value`` itself passes from this to ``limit``, and the finding holds the nearer one.
+    It says ``fine`` then, else ``wrong``, cause and recovery, with ``status``. With ``least``, ``value``
+    passes from this to ``limit``, and the finding holds the nearer one.
     """
     inside = abs(value) <= limit
     if least is not None:

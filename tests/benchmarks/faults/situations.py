@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.calibration.site import INFO, clicked, write_table
 from tests.faults.judge import Case, Outcome
-from v2hdm.io.calibration import write_camera_info
+from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.store.inputs import LIST
 
 HERE = "work/here/"

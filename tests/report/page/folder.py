@@ -8,11 +8,11 @@ import numpy as np
 
 from tests.drive.example import looking_forward
 from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
-from v2hdm.io.calibration import write_calibration
+from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import Trajectory
 from v2hdm.io.drive.writing import write_drive
-from v2hdm.io.maps import write_geojson
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, write_exclusions, write_residuals
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
 from v2hdm.records import (
     ARROW,

@@ -70,8 +70,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     named among several, or its lens is beyond ours.
     """
     if path.suffix.lower() == ".bin":
-        advice = "write COLMAP's model as text (model_converter --output_type TXT)"
-        raise DriveError(f"{path}: is binary; {advice}")
+        raise DriveError(f"{path}: is binary; write the model as text (model_converter --output_type TXT)")
     document = _read_document(path)
     chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
     if chosen is None:
@@ -139,10 +138,7 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
     while (count := len(values)) in _BEYOND:
         first, lens = _BEYOND[count]
         if any(values[first:]):
-            raise DriveError(
-                f"{where}: a {lens} ({count} coefficients) is beyond our lens models; calibrate again with "
-                "5 or 8 coefficients"
-            )
+            raise DriveError(f"{where}: a {lens} ({count} coefficients) is beyond us; calibrate with 5 or 8")
         values = values[:first]
     if count not in _BROWN_CONRADY:
         raise DriveError(f"{where}: {count} distortion coefficients; expected 4, 5 or 8")
@@ -151,9 +147,7 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
 
 def _equidistant(coefficients: Sequence[float], where: str) -> _Lens:
     if len(coefficients) != 4:
-        raise DriveError(
-            f"{where}: a fisheye lens has 4 coefficients, got {len(coefficients)}; restore the file"
-        )
+        raise DriveError(f"{where}: a fisheye has 4 coefficients, got {len(coefficients)}; restore the file")
     return _complete("equidistant", coefficients)
 
 
@@ -218,9 +212,7 @@ def _read_colmap(document: Document, name: str) -> CameraInfo:
     _, kind, width, height, *words = line.split()
     if kind not in COLMAP_MODELS:
         known = ", ".join(COLMAP_MODELS)
-        raise DriveError(
-            f"{where}: COLMAP's {kind} is beyond our lens models; calibrate with one of: {known}"
-        )
+        raise DriveError(f"{where}: COLMAP's {kind} is beyond our lens models; choose one of: {known}")
     focals, coefficients, model = COLMAP_MODELS[kind]
     try:
         values = np.array([float(word) for word in words])
@@ -230,9 +222,8 @@ def _read_colmap(document: Document, name: str) -> CameraInfo:
         raise DriveError(f"{where}: {kind} has {focals + 2 + coefficients} parameters; restore the file")
     matrix = _matrix(values[0], values[focals - 1], *(values[focals : focals + 2] - 0.5))
     lens = _complete(model, values[focals + 2 :].tolist())
-    return _camera(
-        name, (int(width), int(height)), [f"{where}: WIDTH", f"{where}: HEIGHT"], matrix, lens, where
-    )
+    size, size_at = (int(width), int(height)), [f"{where}: WIDTH", f"{where}: HEIGHT"]
+    return _camera(name, size, size_at, matrix, lens, where)
 
 
 def _kalibr_names(document: Document) -> list[str]:

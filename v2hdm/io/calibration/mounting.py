@@ -29,8 +29,7 @@ def take_ipm(content: object, where: str) -> FloatArray:
     for axis in (1, 0) * 4 if invertible else ():
         balanced = balanced / np.linalg.norm(balanced, axis=axis, keepdims=True)
     if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
-        advice = "calibrate it again from at least 4 point pairs"
-        raise DriveError(f"{where}: IPM matrix is not invertible; {advice}")
+        raise DriveError(f"{where}: IPM matrix is not invertible; calibrate it from 4 or more point pairs")
     return np.asarray(ipm / np.linalg.norm(ipm))
 
 
@@ -77,15 +76,12 @@ def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray
     if np.linalg.det(cam_from_ground) > 0:
         cam_from_ground = -cam_from_ground
     rays = np.column_stack([points, np.ones(len(points))]) @ cam_from_ground.T
-    lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(
-        info.intrinsic, [0.5 * info.width, info.height - 1.0, 1.0]
-    )
+    below_px = [0.5 * info.width, info.height - 1.0, 1.0]
+    lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(info.intrinsic, below_px)
     if (rays[:, 2] <= 0).all() and lowest[2] > 0:
         raise DriveError(f"{where}: lies behind the camera; give ground that it sees, x forward and y left")
     if not _in_image(info, rays if (rays[:, 2] > 0).any() else -rays).any():
-        raise DriveError(
-            f"{where}: lies outside the image, as the camera is mounted by its initial IPM; mend one of them"
-        )
+        raise DriveError(f"{where}: lies outside the image, by the initial IPM; mend one of them")
 
 
 def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
@@ -118,8 +114,7 @@ def take_centre_prior(content: object, where: str) -> CentrePrior:
     sigmas = sigma if isinstance(sigma, list) else [sigma] * 3
     sigma_m = take_array(sigmas, (3,), f"{where}, sigma_m", DriveError)
     if (sigma_m <= 0).any():
-        advice = "give the survey's standard deviation in metres"
-        raise DriveError(f"{where}, sigma_m: must be positive; {advice}")
+        raise DriveError(f"{where}, sigma_m: must be positive; give the survey's standard deviation in m")
     return CentrePrior(take_array(entry["xyz"], (3,), f"{where}, xyz", DriveError), sigma_m)
 
 

@@ -81,16 +81,14 @@ def trusted_calibrations(path: Path) -> dict[str, Calibration]:
     """
     files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
     if not files:
-        advice = "give what v2hdm map or v2hdm calibrate ground wrote"
-        raise MapFileError(f"{path}: no calibration_*.yaml in it; {advice}")
+        raise MapFileError(f"{path}: no calibration_*.yaml in it; give a result of map or calibrate ground")
     found = {}
     for file in files:
         calibration = read_calibration(file)
         found[calibration.info.name] = calibration
         if read_provenance(file).verdict == "FAIL":
             raise MapFileError(
-                f"{file}: the verdict on its drive is FAIL, so that it cannot be relied on; mend that drive "
-                "first (docs/verdict.md)"
+                f"{file}: the verdict on its drive is FAIL, so that it cannot be relied on: docs/verdict.md"
             )
     return found
 
@@ -147,8 +145,7 @@ def take_matrix(content: object, where: str) -> FloatArray:
     rows, cols = (take_size_px(entry[key], f"{where}, {key}", DriveError) for key in ("rows", "cols"))
     data = take_array(entry["data"], (-1,), f"{where}, data", DriveError)
     if len(data) != rows * cols:
-        problem = f"{rows} x {cols} does not fit its {len(data)} numbers"
-        raise DriveError(f"{where}: {problem}; mend rows, cols or data")
+        raise DriveError(f"{where}: {rows} x {cols} does not fit its {len(data)} numbers; mend one of them")
     return data.reshape(rows, cols)
 
 
@@ -163,12 +160,10 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
-        problem = "its images are binned or cut to a region"
-        raise DriveError(f"{where}: {problem}; give their camera_info as a file")
+        raise DriveError(f"{where}: its images are binned or cut to a region; give camera_info as a file")
     count = _coefficients_of(model, where, "give camera_info as a file with")
     if distortion[count:].any():
-        problem = f"{model} has {count} coefficients, got {len(distortion)}"
-        raise DriveError(f"{where}: {problem}; give it as a file")
+        raise DriveError(f"{where}: {model} has {count} coefficients, got {len(distortion)}; give a file")
     # k3 and those after it are zero where they are not given.
     padded = (*distortion[:count].tolist(), *(0.0,) * (count - len(distortion)))
     info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, padded)

@@ -194,10 +194,7 @@ def _sigmas(calibration: Calibration) -> dict[str, Any]:
     if calibration.covariance is None:
         return {}
     sigma = np.sqrt(np.diag(calibration.covariance))
-    return {
-        "translation_sigma_m": sigma[:3].tolist(),
-        "rotation_sigma_deg": np.degrees(sigma[3:]).tolist(),
-    }
+    return {"translation_sigma_m": sigma[:3].tolist(), "rotation_sigma_deg": np.degrees(sigma[3:]).tolist()}
 
 
 def _matrix(values: FloatArray) -> dict[str, Any]:

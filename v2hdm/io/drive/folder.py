@@ -85,15 +85,13 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
-    truth_dir = None
+    truth = None
     if content.get("truth") is not None:
-        truth_dir = path / take_text(content["truth"], f"{where}: truth", DriveError)
-        if not truth_dir.is_dir():
-            raise DriveError(f"{where}: truth: no such folder {truth_dir}; restore it or drop the key")
+        truth = path / take_text(content["truth"], f"{where}: truth", DriveError)
+        if not truth.is_dir():
+            raise DriveError(f"{where}: truth: no such folder {truth}; restore it or drop the key")
     name = _name(content, path)
-    drive = Drive(
-        name, path, cameras, (), pose_noise, recorded.origin, truth_dir, recorded=recorded.trajectory
-    )
+    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=recorded.trajectory)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
@@ -116,11 +114,8 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         if not ipm:
             raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(mounting.IPM_NAMES)}")
     else:
-        ipm = {
-            "estimated": mounting.ipm_from_guess(
-                info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle"
-            )
-        }
+        guess_at = f"{where}, cam_from_vehicle"
+        ipm = {"estimated": mounting.ipm_from_guess(info, entry["cam_from_vehicle"], guess_at)}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
@@ -162,8 +157,7 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
         if value < 0:
             raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; mend it")
         if key.endswith("_over_m") and value == 0:
-            problem = "an error that fades over no distance is no drift"
-            raise DriveError(f"{where}, {key}: {problem}; leave it out")
+            raise DriveError(f"{where}, {key}: an error that fades over no way is no drift; leave it out")
     stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
     noise = PoseNoise.as_far_as_stated(**stated, **values)
     for total, drift in DRIFTS.items():

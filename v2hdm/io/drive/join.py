@@ -71,10 +71,8 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
     cameras: dict[str, Camera] = {}
     images, visits, roads = [], [], []
     for number, (drive, name) in enumerate(zip(drives, names, strict=True)):
-        own = {
-            camera: _name_of(camera, one, name, cameras, (number, camera) in apart)
-            for camera, one in drive.cameras.items()
-        }
+        moved = [camera for visit, camera in apart if visit == number]
+        own = {key: _name_of(key, one, name, cameras, key in moved) for key, one in drive.cameras.items()}
         for camera, joined in own.items():
             one = drive.cameras[camera]
             cameras.setdefault(joined, replace(one, info=replace(one.info, name=joined)))

@@ -69,8 +69,7 @@ class _Entries:
         except ValueError:
             values = np.empty(0)
         if values.size != rows * columns or not np.isfinite(values).all():
-            expected = f"expected {rows * columns} numbers"
-            raise DriveError(f"{self._path}: {key}: {expected}; restore KITTI's own file")
+            raise DriveError(f"{self._path}: {key}: expected {rows * columns} numbers; restore KITTI's file")
         return values.reshape(rows, columns)
 
     def rigid(self) -> FloatArray:
@@ -167,12 +166,10 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _stamps_of(paths: Sequence[Path], stamps_path: Path, thing: str) -> FloatArray:
-    """The stamps (N,) of numbered files."""
     stamps = _read_stamps(stamps_path)
     numbers = [int(path.stem) for path in paths]
     if numbers[-1] >= len(stamps):
-        problem = f"{len(stamps)} lines, but {thing} {numbers[-1]} exists"
-        raise DriveError(f"{stamps_path}: {problem}; restore the file")
+        raise DriveError(f"{stamps_path}: {len(stamps)} lines, but {thing} {numbers[-1]} exists; restore it")
     return stamps[numbers]
 
 
@@ -182,8 +179,7 @@ def _read_oxts_row(path: Path) -> FloatArray:
     except ValueError:
         raise DriveError(f"{path}: holds something that is not a number; restore KITTI's own file") from None
     if len(row) != _OXTS_COLUMNS or not np.isfinite(row[:6]).all():
-        problem = f"expected {_OXTS_COLUMNS} finite numbers, got {len(row)}"
-        raise DriveError(f"{path}: {problem}; restore KITTI's own file")
+        raise DriveError(f"{path}: expected {_OXTS_COLUMNS} finite numbers, got {len(row)}; restore the file")
     return row
 
 

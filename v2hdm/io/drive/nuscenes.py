@@ -74,7 +74,6 @@ def _tables_folder(path: Path) -> Path | None:
 
 
 def _table(path: Path) -> dict[str, Row]:
-    """The rows of a table by their tokens."""
     rows = read_json(path, DriveError)
     if not isinstance(rows, list) or not all(isinstance(row, dict) and "token" in row for row in rows):
         raise DriveError(f"{path}: expected a list of rows with a 'token' each; restore the table")
@@ -96,8 +95,7 @@ def _camera(name: str, rows: list[Row], calibrated: dict[str, Row], folder: Path
     where = f"{folder}: camera {name}"
     tokens = {str(row["calibrated_sensor_token"]) for row in rows}
     if len(tokens) > 1:
-        problem = f"{len(tokens)} calibrations: these are several recordings"
-        raise DriveError(f"{where}: {problem}; give one of them")
+        raise DriveError(f"{where}: {len(tokens)} calibrations: these are several recordings; give one")
     row = calibrated[tokens.pop()]
     intrinsic = take_array(row.get("camera_intrinsic"), (3, 3), f"{where}, camera_intrinsic", DriveError)
     size = [take_size_px(rows[0].get(key), f"{where}, {key}", DriveError) for key in ("width", "height")]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import join_drives, read_drive
-from v2hdm.io.drive.images import KittiOptions, ReadOptions
+from v2hdm.io.drive.images import ReadOptions
 from v2hdm.records import Drive
 from v2hdm.store.files import load_json
 
@@ -32,8 +34,7 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
 def drive_of(folder: Path, path: Path | None) -> Drive | None:
     """The drive of the result in ``folder``: at ``path``, else where it was; None where it is gone.
 
-    Raises MapFileError when the folder is no result of a run, DriveError when the drive cannot be read or is
-    another one.
+    Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that.
     """
     if not (folder / METRICS).is_file():
         raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm map")
@@ -57,15 +58,8 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
 
 
 def _options(stated: Mapping[str, Any]) -> ReadOptions:
-    limit, end_s = stated.get("limit"), stated.get("end_s")
-    kitti = dict(stated.get("kitti") or {})
-    return ReadOptions(
-        format=str(stated.get("format", "auto")),
-        cameras=[str(name) for name in stated.get("cameras") or []],
-        max_gap_s=float(stated.get("max_gap_s", ReadOptions.max_gap_s)),
-        limit=None if limit is None else int(limit),
-        start_s=float(stated.get("start_s") or 0.0),
-        end_s=None if end_s is None else float(end_s),
-        cache=str(stated.get("cache", ReadOptions.cache)),
-        kitti=KittiOptions(**{str(key): float(value) for key, value in kitti.items()}),
-    )
+    known = {one.name: stated[one.name] for one in fields(ReadOptions) if one.name in stated}
+    try:
+        return msgspec.convert(known, ReadOptions)
+    except msgspec.ValidationError as failure:
+        raise ValueError(str(failure)) from None

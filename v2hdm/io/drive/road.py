@@ -108,8 +108,7 @@ def log_road(laid: Laid, where: Path) -> None:
         return
     percent = 100.0 * np.linalg.norm(laid.road.slope, axis=1)
     _log.info(
-        "%s: the road is laid flat; recorded were heights of %.2f to %.2f m and slopes of %.1f %% (median) "
-        "to %.1f %%",
+        "%s: the road is laid flat; recorded heights %.2f to %.2f m, slopes %.1f %% (median) to %.1f %%",
         where, laid.road.height_m.min(), laid.road.height_m.max(), np.median(percent), percent.max(),
     )  # fmt: skip
     if np.abs(laid.mount_rad).max() > _REPORTED_RAD:
@@ -279,8 +278,7 @@ class Unevenness:
 def unevenness(road: Road, reach_m: float) -> Unevenness:
     """The worst deviation of the ground, over distance, between half of ``reach_m`` and all of it.
 
-    The ground is known along the path by its heights, beside it by its slope, so that a change of cross-fall
-    deviates, too.
+    The ground is known along the path by its heights, beside it by its slope, so that its cross-fall counts.
     """
     steps_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
     station_m = np.concatenate([[0.0], np.cumsum(steps_m)])

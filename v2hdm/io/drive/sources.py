@@ -113,14 +113,11 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
             if key not in content:
-                advice = "frame of the map, vehicle of the vehicle"
-                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: {advice}")
+                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: frame the map's, vehicle the vehicle's")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
-        transforms = streams.TfStream(True, where)
-        tf_folder = sources.want(transforms)
-        return lambda: readings_of_poses(
-            transforms.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where)
-        )
+        tf = streams.TfStream(True, where)
+        tf_folder = sources.want(tf)
+        return lambda: readings_of_poses(tf.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where))
     for key in ("frame", "vehicle"):
         if key in content:
             raise DriveError(f"{where}, {key}: only for {TF_TOPIC}; drop it")
@@ -158,16 +155,14 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
         if not paths:
             raise DriveError(f"{where}: {folder}: no image ({', '.join(_SUFFIXES)}) in this folder")
         if "stamps" in entry:
-            stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
-            if len(stamp_s) != len(paths):
-                raise DriveError(f"{where}: {len(paths)} images in {folder}, but {len(stamp_s)} stamps")
+            stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
+            stamp_s = read_stamps(stamps, len(paths), f"images in {folder}")
         else:
             try:
                 stamp_s = np.array([float(path.stem) for path in paths])
             except ValueError:
                 raise DriveError(
-                    f"{where}: the images of {folder} are not named by their times; add stamps, a file with "
-                    "one time a line"
+                    f"{where}: the images of {folder} are not named by their times; add stamps, one a line"
                 ) from None
             order = np.argsort(stamp_s, kind="stable")
             stamp_s, paths = stamp_s[order], [paths[n] for n in order.tolist()]
@@ -206,8 +201,7 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
                     (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
-            problem = f"not readable as a video ({reason})"
-            raise DriveError(f"{path}: {problem}; convert or copy it again") from None
+            raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
         write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
@@ -227,10 +221,10 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         if "start_s" in entry:
             return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
         listed = _of_list(camera, frames)
-        stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
-        if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
-            problem = f"{len(listed.paths)} frames in {path} and {len(stamp_s)} stamps"
-            raise DriveError(f"{where}: {problem}; give one a frame, rising")
+        stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
+        stamp_s = read_stamps(stamps, len(listed.paths), f"frames of {path}")
+        if (np.diff(stamp_s) <= 0).any():
+            raise DriveError(f"{stamps}: times do not rise strictly; mend them")
         return replace(listed, stamp_s=stamp_s)
 
     return images

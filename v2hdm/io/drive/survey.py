@@ -19,6 +19,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic
 from v2hdm.io.importers.tables import read_rows
+from v2hdm.io.trajectory import parse_number
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 _log = logging.getLogger(__name__)
@@ -100,8 +101,7 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
 
     ``crs`` is the projected system of eastings and northings, such as ``EPSG:32632``, ``geoid_m`` the height
     of the geoid above the ellipsoid, where heights count from the sea, and ``sigma_m`` that of points without
-    one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell does
-    not parse.
+    one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell wrong.
     """
     header, lines = read_rows(path, ";\t,", "point")
     names = _columns(header, path)
@@ -228,15 +228,7 @@ class _Row:
 
     def number(self, name: str, missing: float | None = None) -> float:
         cell = self.text(name)
-        if not cell and missing is not None:
-            return missing
-        try:
-            value = float(cell)
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
-            raise DriveError(f"{self.where}: {name} '{cell}' is not a number such as 12.345; mend that line")
-        return value
+        return missing if missing is not None and not cell else parse_number(cell, f"{self.where}: {name}")
 
     def sigmas(self, usual_m: float) -> tuple[float, float]:
         both_m = self.number("sigma_m", usual_m)

@@ -120,8 +120,7 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
         except ValueError:
             raise DriveError(f"{where}: not '{','.join(SIGHTINGS)}'; mend that line") from None
         if not 0 <= j < markings or not 0.0 <= value <= 1.0:
-            problem = f"marking must be below {markings} and visible_fraction within 0 to 1"
-            raise DriveError(f"{where}: {problem}; mend it")
+            raise DriveError(f"{where}: marking must be below {markings}, visible_fraction in 0 to 1; mend")
         if key in row_of:
             visibility[row_of[key], j] = value
     return visibility

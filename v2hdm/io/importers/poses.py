@@ -137,20 +137,17 @@ def assemble(
     if readings.antenna and settings.lever_arm_m is None:
         raise DriveError(
             f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], where the antenna sits in "
-            "the vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle, on the "
-            "ground"
+            "the vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle"
         )
     if readings.attitudes is None:
         raise DriveError(
             f"{where}: holds positions without a heading, and the course over ground is none where a vehicle "
-            "turns, stands or reverses; add a heading (HDT, THS, PASHR, an Imu or dual-antenna topic, a "
-            "column)"
+            "turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic)"
         )
     heading_sigma_rad = readings.attitudes.sigma_rad
     sure = _sure_enough(readings, settings.max_sigma_m, where)
-    readings = replace(
-        readings, stamp_s=readings.stamp_s[sure], points=readings.points[sure], sigma_m=readings.sigma_m[sure]
-    )
+    kept = {key: getattr(readings, key)[sure] for key in ("stamp_s", "points", "sigma_m")}
+    readings = replace(readings, **kept)
     rotation, known = _rotation_at(readings, max_gap_s, where)
     points, sigma_m = readings.points[known], readings.sigma_m[known]
     rotation = rotation @ settings.vehicle_from_sensor.T

@@ -18,7 +18,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import make_transform, rotation_from_euler
-from v2hdm.io.trajectory import UNITS, checked_rotations, in_order
+from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
 
@@ -93,9 +93,8 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
         raise DriveError(f"{where}: KITTI's rows have no times: add stamps, a file with one time in s a line")
     axes = take_choice(entry.get("axes", "vehicle"), ("vehicle", "camera"), f"{where}, axes", DriveError)
     poses = _numbers(path, 12).reshape(-1, 3, 4)
-    stamp_s = read_stamps(root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
-    if len(stamp_s) != len(poses):
-        raise DriveError(f"{path}: {len(poses)} poses, but {len(stamp_s)} times; give one time a pose")
+    stamps = root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
+    stamp_s = read_stamps(stamps, len(poses), f"poses of {path}")
     rotation, points = poses[:, :, :3], poses[:, :, 3]
     wrong = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
     if wrong.any():
@@ -104,15 +103,17 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
         turn = _VEHICLE_FROM_CAMERA_AXES
         rotation, points = turn @ rotation @ turn.T, points @ turn.T
     elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
-        advice = "say axes: camera if they are KITTI's own"
-        raise DriveError(f"{path}: the poses' z axis does not point up; {advice}")
+        raise DriveError(f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's")
     rows = in_order(stamp_s, str(path))
     return readings_of_poses(Trajectory(stamp_s[rows], make_transform(rotation[rows], points[rows])))
 
 
-def read_stamps(path: Path) -> FloatArray:
-    """Times (N,) in s, one per line."""
-    return _numbers(path, 1)[:, 0]
+def read_stamps(path: Path, count: int, things: str) -> FloatArray:
+    """Times (``count``,) in s, one per line; raises DriveError where there are not as many as ``things``."""
+    stamp_s = _numbers(path, 1)[:, 0]
+    if len(stamp_s) != count:
+        raise DriveError(f"{path}: {len(stamp_s)} times of {count} {things}; give one of each")
+    return stamp_s
 
 
 def _numbers(path: Path, columns: int) -> FloatArray:
@@ -225,13 +226,12 @@ def _parse(name: str, cell: str, where: str) -> float:
         if name == "utc":
             moment = datetime.fromisoformat(cell)
             return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
-        value = float(cell) if cell or name not in _SURENESS else np.nan
+        if name in _SURENESS:
+            return float(cell or "nan")
     except ValueError:
         kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number"
         raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None
-    if not np.isfinite(value) and name not in _SURENESS:
-        raise DriveError(f"{where}: '{cell}' is not a finite number; drop or mend that line")
-    return value
+    return parse_number(cell, where)
 
 
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:

@@ -32,8 +32,7 @@ def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
     """The lanes between polylines (N, 2) m, in the order of their first line.
 
     A lane lies between a line and the nearest one across it, at a lane's width, for longer than it is wide.
-    Where one ends, those beside it are cut, too: neighbours share a bound from end to end, as lane changes
-    need.
+    Where one ends, those beside it are cut, too: for lane changes neighbours share all of a bound.
     """
     runs = _runs(lines_map)
     cuts = [_Cuts(line) for line in lines_map]
@@ -132,10 +131,8 @@ class _Segments:
     @classmethod
     def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
         none, counts = np.empty((0, 2)), [max(len(line) - 1, 0) for line in lines_map]
-        start, end = (
-            np.concatenate([none, *(line[part] for line in lines_map)])
-            for part in (slice(None, -1), slice(1, None))
-        )
+        start = np.concatenate([none, *(line[:-1] for line in lines_map)])
+        end = np.concatenate([none, *(line[1:] for line in lines_map)])
         index = np.concatenate([np.arange(0), *map(np.arange, counts)])
         return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
 

@@ -59,18 +59,16 @@ class Residuals:
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write ``residuals`` to ``path``, atomically, a row an observation."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
+    rows: list[Sequence[object]] = [COLUMNS]
     for k, i in enumerate(residuals.row_image.tolist()):
         u, v = residuals.observed_px[k]
         du, dv = residuals.residual_px[k]
-        table.writerow([
+        rows.append([
             residuals.image[i], residuals.camera[i], f"{residuals.taken_s[i]:.6f}",
             residuals.marking[k] or "", residuals.corner[k] + 1, int(residuals.is_point[k]),
             f"{u:.3f}", f"{v:.3f}", f"{du:.4f}", f"{dv:.4f}", f"{residuals.distance_sigma[k]:.3f}",
         ])  # fmt: skip
-    files.replace_text(path, text.getvalue())
+    files.replace_csv(path, rows)
 
 
 def read_residuals(path: Path) -> Residuals:

@@ -7,8 +7,6 @@ strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m`` 
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +25,7 @@ from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.lanelet2 import write_lanelet2
 from v2hdm.io.maps.reading import Verdict
 from v2hdm.records import GeodeticOrigin, HdMap
-from v2hdm.store.files import replace_text, whole_file
+from v2hdm.store.files import replace_csv, whole_file
 
 _log = logging.getLogger(__name__)
 
@@ -79,10 +77,8 @@ def write_csv(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
 
     A CSV has no place for the ``verdict``.
     """
-    text = io.StringIO()
     rows = (row for feature in features_of(hd_map) for row in _rows(feature, hd_map.origin))
-    csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
-    replace_text(path, text.getvalue())
+    replace_csv(path, [COLUMNS, *rows])
 
 
 def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:

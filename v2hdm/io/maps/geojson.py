@@ -58,9 +58,8 @@ def write_features(
         frame["origin"] = asdict(origin)
     decimals = (_DEGREE_DECIMALS, _HEIGHT_DECIMALS)
     resolution = {} if origin is None else {k: 10.0**-n for k, n in zip(RESOLUTION, decimals, strict=True)}
-    head = json.dumps(
-        {"type": "FeatureCollection", **resolution, "v2hdm": frame | dict(about)}, allow_nan=False
-    )
+    members = {"type": "FeatureCollection", **resolution, "v2hdm": frame | dict(about)}
+    head = json.dumps(members, allow_nan=False)
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
     replace_text(path, f'{head[:-1]}, "features": [\n{lines}\n]}}\n')
 

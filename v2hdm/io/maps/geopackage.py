@@ -73,10 +73,7 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
         def write(
             layer: str, columns: Mapping[str, Any], shapes: AnyArray | None = None, **options: Any
         ) -> None:
-            texts = {
-                key: np.array(one, dtype=object) for key, one in columns.items() if isinstance(one, list)
-            }
-            values = [texts.get(key, one) for key, one in columns.items()]
+            values = [np.array(v, dtype=object) if isinstance(v, list) else v for v in columns.values()]
             raw.write(str(unfinished), shapes, values, list(columns), layer=layer, driver="GPKG", **options)
 
         try:

@@ -79,10 +79,8 @@ def write_lanelet2(
     replace_text(path, document.text())
     info: dict[str, Any] = {"projector_type": projector}
     if projector != LOCAL and hd_map.origin is not None:
-        place = zip(
-            ("latitude", "longitude", "altitude"), position_of(hd_map.origin)[0].tolist(), strict=True
-        )
-        where = {"map_origin": dict(place)} if square is None else {"mgrs_grid": square}
+        at = zip(("latitude", "longitude", "altitude"), position_of(hd_map.origin)[0].tolist(), strict=True)
+        where = {"map_origin": dict(at)} if square is None else {"mgrs_grid": square}
         info |= {"vertical_datum": "WGS84"} | where
     replace_text(path.with_name("map_projector_info.yaml"), dump_yaml(info))
 
@@ -180,9 +178,7 @@ def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> tuple[st
     Returns the square, and the points (N, 2), m east and north of its south-west corner. Raises ConfigError
     when they lie in several squares or beyond the grid, or ``mgrs`` or ``pyproj`` is missing.
     """
-    pyproj, mgrs = (
-        need(one, "gis", "the format lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs")
-    )
+    pyproj, mgrs = (need(one, "gis", "lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs"))
     if np.min(latitude_deg) < -80 or np.max(latitude_deg) >= 84:
         raise ConfigError("MGRS ends at 80 degrees south and 84 north: choose the projector LocalCartesian")
     grid = mgrs.MGRS()
@@ -255,7 +251,6 @@ class _Document:
 
 
 def _part(owner: Feature, number: int) -> int:
-    """The id of a part of a feature."""
     return _FIRST_PART + owner.id * _PARTS + number
 
 

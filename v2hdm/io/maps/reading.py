@@ -41,9 +41,7 @@ _TEXT_ROUNDING, _BINARY_ROUNDING, _LOCAL_ROUNDING_M = (1e-9, 1e-9, 1e-4), (1e-11
 RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
 """Members of GeoJSON that state how coordinates are rounded, m or degrees, for GDAL since 3.9."""
 
-EXACT = ("heights_m", "covariance_m2")
-"""Columns of a GeoPackage that hold JSON, beside that of the coordinates."""
-
+EXACT = ("heights_m", "covariance_m2")  # columns of a GeoPackage with JSON, beside the coordinates
 LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 """Layers of a GeoPackage by the property that holds the coordinates of their features."""
 
@@ -60,7 +58,7 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
     if reader is None:
         endings = " or ".join(_READERS)
         raise MapFileError(f"{path}: no map that can be read; give a file that ends in {endings}")
-    return reader[0](path), reader[1](path)
+    return reader(path), read_verdict(path)
 
 
 def read_geojson(path: Path) -> HdMap:
@@ -95,9 +93,12 @@ def read_geojson(path: Path) -> HdMap:
 
 
 def read_verdict(path: Path) -> Verdict:
-    """The verdict beside a map in GeoJSON, None where there is none."""
-    about = load_json(path, MapFileError).get("v2hdm")
-    verdict = about.get("verdict") if isinstance(about, dict) else None
+    """The verdict beside a map, None where there is none; errors as :func:`read_map`."""
+    if path.suffix.lower() == ".gpkg":
+        verdict = _about(path, "verdict")
+    else:
+        about = load_json(path, MapFileError).get("v2hdm")
+        verdict = about.get("verdict") if isinstance(about, dict) else None
     return verdict if isinstance(verdict, dict) else None
 
 
@@ -114,16 +115,7 @@ def read_geopackage(path: Path) -> HdMap:
     return reader.map()
 
 
-def read_geopackage_verdict(path: Path) -> Verdict:
-    """The verdict beside a map in a GeoPackage, None where there is none."""
-    verdict = _about(path, "verdict")
-    return verdict if isinstance(verdict, dict) else None
-
-
-_READERS: Mapping[str, tuple[Callable[[Path], HdMap], Callable[[Path], Verdict]]] = {
-    ".geojson": (read_geojson, read_verdict),
-    ".gpkg": (read_geopackage, read_geopackage_verdict),
-}
+_READERS: Mapping[str, Callable[[Path], HdMap]] = {".geojson": read_geojson, ".gpkg": read_geopackage}
 
 
 @dataclass(frozen=True)
@@ -147,9 +139,7 @@ class _Reader:
 
     def add(self, properties: Mapping[str, Any], geometry: Geometry | None, where: str) -> None:
         if geometry is None and not properties.keys() & set(LAYERS):
-            raise MapFileError(
-                f"{where}: has neither a geometry nor '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it"
-            )
+            raise MapFileError(f"{where}: has no geometry, '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it")
         if geometry is not None and geometry.closed and len(geometry.positions) < 3:
             raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
         geodetic = geometry is not None and self._origin is not None
@@ -159,9 +149,7 @@ class _Reader:
         stored = _stored(properties, closed, where)
         feature = stored if geometry is None else _believed(stored, geometry, self._origin, self._rounding)
         if closed and not feature.symbol and len(feature.points_map) != 4:
-            raise MapFileError(
-                f"{where}: a marking has four corners, this has {len(feature.points_map)}; mend its outline"
-            )
+            raise MapFileError(f"{where}: a marking has four corners, not {len(feature.points_map)}; mend it")
         if feature is not stored and len(stored.points_map):
             self._edited.append(len(self._features))
         self._features.append(feature)
@@ -263,8 +251,7 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     kind, parts = entry.get("type"), entry.get("coordinates")
     closed = kind in ("Polygon", "MultiPolygon")
     if not closed and kind not in ("LineString", "MultiLineString"):
-        advice = "draw markings as Polygons, lanes as LineStrings"
-        raise MapFileError(f"{where}: its geometry is a {kind}; {advice}")
+        raise MapFileError(f"{where}: its geometry is a {kind}; draw Polygons (markings) or LineStrings")
     for _ in range({"Polygon": 1, "MultiPolygon": 2, "MultiLineString": 1}.get(str(kind), 0)):
         if not isinstance(parts, list) or len(parts) != 1:
             raise MapFileError(f"{where}: its {kind} has holes or several parts; split it")

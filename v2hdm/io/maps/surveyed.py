@@ -47,8 +47,7 @@ def match(
     return out
 
 
-_Choice = tuple[int, int, bool]
-"""A point, which of its corners, and whether this is likelier than chance."""
+_Choice = tuple[int, int, bool]  # a point, which of its corners, and whether this is likelier than chance
 
 
 def _first(corner: IntArray, off_m: FloatArray, covariance: FloatArray, chance: float) -> _Choice | None:

@@ -88,10 +88,7 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     # where 6 p r reaches 1; every real lens is below a tenth of that.
     tangential = np.hypot(k[2], k[3]) if info.distortion_model != "equidistant" and len(k) > 3 else 0.0
     if 6 * tangential * min(max(across, down), _MIDDLE) >= 1:
-        raise error(
-            f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} turn the image over; their order is k1 k2 p1 p2 k3, "
-            "mend them"
-        )
+        raise error(f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} turn the image over; order k1 k2 p1 p2 k3")
     reach, scale_px = lens_reach(info), (fx + fy) / 2
     if reach >= np.hypot(across, down):
         return

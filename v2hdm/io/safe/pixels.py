@@ -98,8 +98,7 @@ def png(pixels: np.ndarray) -> bytes:
 @lru_cache
 def _warn_turned(folder: Path, orientation: int) -> None:
     _log.warning(
-        "%s: images are turned upright, as their EXIF orientation %d says; their calibration must be of the "
-        "turned ones",
+        "%s: images are turned upright, by their EXIF orientation %d; calibrate the turned ones",
         folder, orientation,
     )  # fmt: skip
 

@@ -156,8 +156,7 @@ def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> st
     """``content`` as the name of a camera, which none of :data:`ALL_CAMERAS` is."""
     name = take_name(content, where, error)
     if name.lower() in ALL_CAMERAS:
-        problem = f"a camera is called {shown(name)}, as results of all of them are"
-        raise error(f"{where}: {problem}; choose another")
+        raise error(f"{where}: a camera is called {shown(name)}, as results of all are; choose another")
     return name
 
 

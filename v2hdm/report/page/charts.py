@@ -26,11 +26,8 @@ _ORDER = ("blue", "vermillion", "green", "purple", "orange", "sky")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), "-", "--")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
-CELLS = (9, 16)
-"""Rows and columns that an image is divided into for the mean residual of each."""
-
-_LEAST_IN_CELL = 10
-"""Observations of a cell from which its mean is drawn: its error is a third of one observation's."""
+CELLS = (9, 16)  # rows and columns that an image is divided into for the mean residual of each
+_LEAST_IN_CELL = 10  # observations from which a mean is drawn: its error is a third of one's
 
 _RC: dict[Any, Any] = RC | {
     "axes.titleweight": "normal",
@@ -236,9 +233,8 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
             moved_cm = 100 * (np.linalg.inv(route.recorded) @ route.map_from_vehicle)[:, :2, 3]
             for axis, name in enumerate(("forward", "left")):
                 shift, band, look = moved_cm[:, axis], SIGMAS_95 * 100 * route.sigma[:, axis], _look(axis)
-                panels[1].fill_between(
-                    way_m, shift - band, shift + band, color=look["color"], alpha=0.15, lw=0
-                )
+                shade = {"color": look["color"], "alpha": 0.15, "lw": 0}
+                panels[1].fill_between(way_m, shift - band, shift + band, **shade)
                 panels[1].plot(way_m, shift, label=name, lw=1.1, **look)
             panels[1].axhline(0, color=MUTED, lw=0.6)
             panels[1].set_ylabel("correction (cm)")

@@ -23,8 +23,7 @@ from v2hdm.store.files import replace_text
 def document(facts: Facts) -> SimpleNamespace:
     """The content of the page by the names of its templates; parts that a run lacks are None or empty.
 
-    Raises:
-        DriveError: an image of the drive cannot be read.
+    Raises DriveError where an image of the drive cannot be read.
     """
     metrics, verdict = facts.metrics, facts.metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
@@ -60,7 +59,6 @@ def document(facts: Facts) -> SimpleNamespace:
 
 
 def _summary(facts: Facts) -> str:
-    """The contents of the map in a sentence."""
     hd_map = facts.hd_map
     if hd_map is None:
         return "No map came of this drive."
@@ -84,17 +82,12 @@ def _site(facts: Facts) -> str:
 
 def _ellipses(facts: Facts) -> str:
     markings = facts.hd_map.markings if facts.hd_map else ()
-    half_axes_m = {
-        "relative to neighbours": tables.relative_m(markings),
-        "absolute": tables.half_axes_m(markings),
-    }
-    series = {name: 100 * values for name, values in half_axes_m.items() if len(values)}
+    both = {"relative to neighbours": tables.relative_m, "absolute": tables.half_axes_m}
+    series = {name: 100 * values for name, of in both.items() if len(values := of(markings))}
     return charts.ellipse_chart(series) if series else ""
 
 
-FILE = "report.html"
-"""Name of the page in a result folder."""
-
+FILE = "report.html"  # name of the page in a result folder
 _ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templates", "map.js": "templates"}
 """Scripts and styles that stand in the page as they are, by the folder that holds them."""
 
@@ -102,11 +95,9 @@ _ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templat
 def write_page(folder: Path, drive: Drive | None) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
-    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand.
-
-    Raises:
-        MapFileError: the folder is no result, or a file in it is damaged.
-        DriveError: an image or the truth of the drive is damaged.
+    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand. Raises
+    MapFileError where the folder is no result, or a file in it is damaged, DriveError where an image or the
+    truth of the drive is damaged.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
@@ -138,17 +129,11 @@ def _suspicious(facts: Facts) -> dict[str, list[str]]:
     kinds = {one.id: one.kind for one in facts.hd_map.markings} if facts.hd_map else {}
     rows = {}
     for one in facts.best.get("suspicious") or []:
-        number, tests = (
-            one["marking"],
-            {name: one[f"p_{name}"] for name in ("shape", "residuals", "sightings")},
-        )
+        number = one["marking"]
+        tests = {name: one[f"p_{name}"] for name in ("shape", "residuals", "sightings")}
         if number in kinds:
-            cells = [
-                str(number),
-                tables.name_of(kinds[number]),
-                f"{one['p']:.2g}",
-                min(tests, key=tests.__getitem__),
-            ]
+            cells = [str(number), tables.name_of(kinds[number]), f"{one['p']:.2g}"]
+            cells.append(min(tests, key=tests.__getitem__))
             cells += [*(f"{p:.2g}" for p in tests.values()), f"{100 * one['disputed']:.0f}"]
             rows[f"m{number}"] = cells
     return rows

@@ -15,19 +15,18 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.io.calibration import read_calibration
+from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps import read_geojson
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
 from v2hdm.report.metrics import way_along
 from v2hdm.store.files import load_json, load_yaml, read_text, take_number
 
-BEST = "Opt"
-"""The method whose map is the run's result, as ``metrics.json`` names it."""
+BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
 
 
 @dataclass(frozen=True)
@@ -91,9 +90,8 @@ class Facts:
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read the result folder of a run; ``drive`` is the one that it mapped, if it is at hand.
 
-    Raises:
-        MapFileError: the folder is no result, or a file in it is damaged.
-        DriveError: the drive's truth is damaged.
+    Raises MapFileError where the folder is no result, or a file in it is damaged, DriveError where the
+    drive's truth is damaged.
     """
     if not (folder / "metrics.json").is_file():
         raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
@@ -122,8 +120,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     """The calibrations of a result folder by camera.
 
-    Raises:
-        MapFileError: a file is damaged.
+    Raises MapFileError where a file is damaged.
     """
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
@@ -210,9 +207,8 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     map_from_px, foot_map = np.full((len(of_image), 3, 3), np.nan), np.full((len(of_image), 2), np.nan)
     map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
     foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
-    seen, projected = (
-        apply_in_front(map_from_px[row_image], px[:, None])[:, 0] for px in (observed, observed + off)
-    )
+    ground = map_from_px[row_image]
+    seen, projected = (apply_in_front(ground, px[:, None])[:, 0] for px in (observed, observed + off))
     return GroundResiduals(
         cameras=names,
         camera=of_image[row_image],

@@ -34,9 +34,7 @@ def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
 
 EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 
-LARGEST_BYTES = 3_500_000
-"""Budget of the mosaic, as text in the page."""
-
+LARGEST_BYTES = 3_500_000  # budget of the mosaic, as text in the page
 _QUALITY = 72
 _COMPARISON_WIDTH_PX = 1400
 
@@ -51,8 +49,7 @@ class GroundPage(NamedTuple):
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     """The mosaic for the map: WebP in base64 and its bounds (west, south, east, north), m; None without one.
 
-    Raises:
-        MapFileError: ``mosaic.json`` is damaged, or the picture that it names is missing.
+    Raises MapFileError where ``mosaic.json`` is damaged, or the picture that it names is missing.
     """
     if not (folder / EXTENT).is_file():
         return None

@@ -16,20 +16,15 @@ from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, shrunk
 
-BUDGET_BYTES = 8_000_000
-"""Budget of all pictures together, as text in the page: a report stays below 15 MB."""
-
-PER_CAMERA = 2
-"""Pictures of a marking by one camera: the nearest one, and one from the middle of its sightings."""
-
+BUDGET_BYTES = 8_000_000  # budget of all pictures together, as text in the page: a report stays below 15 MB
+PER_CAMERA = 2  # pictures of a marking: the nearest one, and one from the middle of its sightings
 _USUAL_BYTES = 5_000  # of one picture; no more are cut than could fit
 _LONGEST_PX = 320
 _LEAST_PX = 96
 _MARGIN = 0.45  # share of a marking's size that is shown around it
 _QUALITY = 72
 
-_NEAR_M, _FAR_M = 3.0, 14.0
-"""Where something that is no marking is looked for in the images: in front of the camera, this far away."""
+_NEAR_M, _FAR_M = 3.0, 14.0  # how far ahead of a camera something that is no marking is looked for
 
 
 @dataclass(frozen=True)
@@ -50,10 +45,8 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     Empty without the drive.
 
     Each has ``src`` (JPEG as base64), ``size``, ``camera``, ``image``, ``t`` (s), the shape as the map puts
-    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture.
-
-    Raises:
-        DriveError: an image of the drive cannot be read.
+    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture. Raises
+    DriveError where an image of the drive cannot be read.
     """
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}

@@ -14,7 +14,7 @@ from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, length_m, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
 from v2hdm.report.page.layers import SIGMAS_95, ellipses
-from v2hdm.report.terminal import METHODS
+from v2hdm.report.terminal import AGAINST_TRUTH, METHODS, WITHOUT_TRUTH
 
 
 class Table(NamedTuple):
@@ -84,9 +84,7 @@ def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
 
 def relative_m(markings: Iterable[Marking]) -> FloatArray:
     """The 95 % radius (M,), m, of what a marking adds to the error of a distance to its neighbours."""
-    return np.array(
-        [SIGMAS_95 * one.relative_sigma_m for one in markings if one.relative_sigma_m is not None]
-    )
+    return np.array([SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None])
 
 
 def key_figures(facts: Facts) -> tuple[Figure, ...]:
@@ -218,24 +216,12 @@ def content_table(facts: Facts) -> Table | None:
     return table(("class", "as", "count", "length (m)", "sightings"), rows, words=2)
 
 
-_AGAINST_TRUTH = {
-    "recall (%)": ("recall", 1, 100.0),
-    "false": ("false_markings", 0, 1.0),
-    "RMSE (cm)": ("corner_rmse_m", 1, 100.0),
-    "bias (cm)": ("corner_bias_m", 1, 100.0),
-}
-_WITHOUT_TRUTH = {
-    "sigma (cm)": ("median_sigma_m", 1, 100.0),
-    "reprojection (px)": ("reprojection_rmse_px", 2, 1.0),
-}
-
-
 def method_table(facts: Facts) -> Table | None:
     """The methods of the paper beside each other, for all cameras together."""
     if not facts.results:
         return None
     has_truth = any("recall" in row for row in facts.results.values())
-    columns = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
+    columns = AGAINST_TRUTH if has_truth else WITHOUT_TRUTH
     rows = [
         [name, METHODS[name], str(row.get("markings", "–"))]
         + [number(row.get(key), digits, factor) for key, digits, factor in columns.values()]

@@ -108,10 +108,8 @@ def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[F
     if area < _ROI_AREA_M2:
         says = f"roi_vehicle covers {area:.2g} m2, less than a marking; enlarge it (metres, not kilometres)"
         return failed(area, _ROI_AREA_M2, "m2", says)
-    return [
-        passed("roi", name, "the ROI is in the image", seen),
-        _farthest(name, camera, cam_from_vehicle, grid[depth > 0]),
-    ]
+    farthest = _farthest(name, camera, cam_from_vehicle, grid[depth > 0])
+    return [passed("roi", name, "the ROI is in the image", seen), farthest]
 
 
 def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> Finding:
@@ -142,13 +140,11 @@ def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
 
 
 def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
-    """Height, tilt and direction of the guess."""
     height = float(camera_centre(cam_from_vehicle)[2])
     yield judge(
         "camera height", name, height, _HIGHEST_M, "m", least=_LOWEST_M,
         fine="the guess puts the camera at the height of a vehicle",
-        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres) or the "
-        "guess",
+        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres)",
     )  # fmt: skip
     tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-cam_from_vehicle[0, 2], -1, 1))))
     if cam_from_vehicle[1, 2] > 0:  # upside down
@@ -168,9 +164,7 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
     lengths = np.linalg.norm(first), np.linalg.norm(second)
     ratio = float(lengths[0] / lengths[1] - 1)
     cosine = float(first @ second / (lengths[0] * lengths[1]))
-    value, part = (
-        (abs(ratio), "the focal length") if abs(ratio) > abs(cosine) else (abs(cosine), "the principal point")
-    )
+    value, part = max((abs(ratio), "the focal length"), (abs(cosine), "the principal point"))
     return judge(
         "ipm against camera matrix", name, value, _MISSHAPEN, "",
         fine="the IPM is a homography of this camera matrix",
@@ -185,12 +179,8 @@ def _lens(name: str, info: CameraInfo) -> Finding:
     corners = np.array([[0.0, info.height / 2], [info.width - 1.0, info.height / 2]])
     pinhole = (undistort_points(info, corners) - info.intrinsic[:2, 2]) / np.diag(info.intrinsic)[:2]
     width_deg = float(np.rad2deg(np.arctan(np.abs(pinhole[:, 0])).sum()))
-    says = (
-        "the lens is undistorted by its coefficients"
-        if has_distortion(info)
-        else "the images count as free of distortion"
-    )
-    return passed("field of view", name, f"{width_deg:.0f} deg wide; {says}", width_deg, "deg")
+    bends = "the lens is undistorted by its coefficients" if has_distortion(info) else "it has no distortion"
+    return passed("field of view", name, f"{width_deg:.0f} deg wide; {bends}", width_deg, "deg")
 
 
 def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: FloatArray) -> Finding:
@@ -202,8 +192,7 @@ def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: Flo
     return judge(
         "roi range", name, float(coarse), _COARSEST_M, "m/px",
         fine="a pixel shows little ground at the ROI's far end",
-        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m of ground; end it "
-        "nearer",
+        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m; end it nearer",
         status=Status.WARN,
     )  # fmt: skip
 

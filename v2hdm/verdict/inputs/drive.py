@@ -96,12 +96,8 @@ def check_drive(
 def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None) -> list[Finding]:
     """The findings of :func:`check_drive`; causes without their consequences.
 
-    Args:
-        drive: the drive.
-        ground: estimates of bare ground by camera; cameras that it leaves out are checked without.
-
-    Raises:
-        DriveError: a sampled image cannot be decoded.
+    Cameras that ``ground``, the estimates by camera, leaves out are checked without. Raises DriveError where
+    a sampled image cannot be decoded.
     """
     ground = ground or {}
     motion = Motion.of(drive)
@@ -128,9 +124,7 @@ def check_road(drive: Drive) -> Iterator[Finding]:
     if drive.road is None or len(drive.road.points_map) < 2:
         yield passed("road", "poses", "the ground was recorded as the plane z = 0", 0.0, "deg")
         return
-    reach_m = max(
-        float(np.linalg.norm(camera.roi_vehicle, axis=1).max()) for camera in drive.cameras.values()
-    )
+    reach_m = max(float(np.linalg.norm(one.roi_vehicle, axis=1).max()) for one in drive.cameras.values())
     worst = unevenness(drive.road, reach_m)
     lean_rad = worst.value_m / worst.distance_m
     sigma_rad = max(drive.pose_noise.roll_pitch_rad, _LEAST_SWAY_RAD)

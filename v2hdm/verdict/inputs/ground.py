@@ -78,8 +78,7 @@ _UNTOLD = {
 class _Check:
     """The check of one parameter: its limit in the parameter's own unit, ``scale`` to ``unit``.
 
-    ``wrong`` is filled with the ``{size}`` and with one of the ``ways`` that a value can be positive or
-    negative.
+    ``wrong`` is filled with the ``{size}`` and with one of the ``ways`` for a positive and a negative value.
     """
 
     name: str
@@ -96,8 +95,7 @@ _CHECKS: Mapping[str, _Check] = {
     "focal_scale": _Check(
         "focal length from ground", _FOCAL, "%", 100.0, Status.FAIL, ("too short", "too long"),
         "the ground fits the focal length",
-        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate the "
-        "camera anew",
+        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate anew",
     ),
     "distortion_k1": _Check(
         "distortion", _DISTORTION, "", 1.0, Status.FAIL, ("larger", "smaller"),
@@ -180,19 +178,11 @@ def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
 def check_ground(
     drive: Drive, ground: Mapping[str, GroundEstimate], cause: str | None = None
 ) -> list[Finding]:
-    """All findings from the cameras' ground.
-
-    Args:
-        drive: the drive.
-        ground: by camera.
-        cause: the sentence that says why no ground matches, where that is known.
-    """
+    """All findings from the cameras' ground; ``cause`` says why none matches, where that is known."""
     rival = rival_of(ground)
     if rival is not None:
         return [_read_as(name, estimate, rival) for name, estimate in ground.items()]
-    findings = [
-        finding for name, estimate in ground.items() for finding in _camera(drive, name, estimate, cause)
-    ]
+    findings = [finding for name, one in ground.items() for finding in _camera(drive, name, one, cause)]
     return [*findings, *_clocks(ground)]
 
 
@@ -286,7 +276,6 @@ def _asked_clocks(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
 
 
 def _is_off(clock: Parameter | None) -> bool:
-    """Whether a clock is off beyond doubt."""
     return clock is not None and clock.observable and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
 
 
@@ -315,10 +304,7 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
 def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None:
     """The usual mistake after whose undoing the ground of a camera that never matched does.
 
-    None where a camera matches, or no mistake explains it.
-
-    Raises:
-        DriveError: an image cannot be read.
+    None where a camera matches, or no mistake explains it. Raises DriveError where an image cannot be read.
     """
     lost = [
         name
@@ -379,7 +365,6 @@ _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     ),
     (
         upside_down,
-        "the ground matches once the images are turned by 180 deg: they are upside down; turn them, or the "
-        "calibration",
+        "the ground matches once the images are turned by 180 deg: they are upside down; turn them",
     ),
 )

@@ -8,7 +8,6 @@ is the cause.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -33,14 +32,6 @@ _CURVED_PER_M = 0.02  # curvature of a turn that shows where the origin sits
 
 Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """Takes positions (P, 3) and rotations (P, 3, 3) to what they should be."""
-
-
-@dataclass(frozen=True)
-class Convention:
-    """A usual mistake, how to undo it and what to write instead."""
-
-    undo: Undo
-    says: str
 
 
 def _turned(sign: float, offset_deg: float) -> Undo:
@@ -69,31 +60,30 @@ def _axes(matrix: list[list[float]]) -> Undo:
     return lambda position, rotation: (position, np.asarray(rotation @ np.array(matrix)))
 
 
-# The usual mistakes, the likelier first.
-_CONVENTIONS: Mapping[str, Convention] = {
-    "quaternion order": Convention(
-        _reordered, "the quaternions are in the order qw qx qy qz; write them as qx qy qz qw"
+# The usual mistakes, the likelier first: how to undo each, and what to write instead.
+_CONVENTIONS: Mapping[str, tuple[Undo, str]] = {
+    "quaternion order": (
+        _reordered,
+        "the quaternions are in the order qw qx qy qz; write them as qx qy qz qw",
     ),
-    "z down": Convention(
+    "z down": (
         _axes([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
         "the vehicle's z axis points down (x forward, y right); turn the attitude to x forward, y left, z up",
     ),
-    "optical frame": Convention(
+    "optical frame": (
         _axes([[0, -1, 0], [0, 0, -1], [1, 0, 0]]),
         "the poses are those of a camera (z forward); give those of the vehicle (x forward, y left, z up)",
     ),
-    "from north": Convention(
+    "from north": (
         _turned(-1, 90),
         "yaw counts clockwise from north; write yaw = 90 deg - it, counter-clockwise from east",
     ),
-    "clockwise": Convention(_turned(-1, 0), "yaw counts clockwise; write it with the other sign"),
-    "90 ahead": Convention(_turned(1, -90), "yaw is 90 deg too large, as if y were forward; subtract 90 deg"),
-    "90 behind": Convention(_turned(1, 90), "yaw is 90 deg too small, counted from north; add 90 deg"),
-    "inverse": Convention(
-        _inverted, "the poses are vehicle_from_map; write their inverse, the vehicle in the map"
-    ),
-    "south": Convention(_turned(-1, 180), "yaw counts clockwise from west; write yaw = 180 deg - it"),
-    "from south": Convention(_turned(-1, -90), "yaw counts clockwise from south; write yaw = -90 deg - it"),
+    "clockwise": (_turned(-1, 0), "yaw counts clockwise; write it with the other sign"),
+    "90 ahead": (_turned(1, -90), "yaw is 90 deg too large, as if y were forward; subtract 90 deg"),
+    "90 behind": (_turned(1, 90), "yaw is 90 deg too small, counted from north; add 90 deg"),
+    "inverse": (_inverted, "the poses are vehicle_from_map; write their inverse, the vehicle in the map"),
+    "south": (_turned(-1, 180), "yaw counts clockwise from west; write yaw = 180 deg - it"),
+    "from south": (_turned(-1, -90), "yaw counts clockwise from south; write yaw = -90 deg - it"),
 }
 
 # Conventions of yaw under which poses alone look like a path whose axes are swapped.
@@ -116,9 +106,7 @@ class Path(Enum):
 def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
     """Whether the recorded poses drive where they point, z up.
 
-    Args:
-        motion: the recorded poses.
-        path: the verdict of the images' ground on the path; None where it was not asked or has none.
+    ``path`` is the verdict of the images' ground; None where it was not asked or has none.
     """
     if not len(motion.chords):
         return []  # the check of the path's length says so
@@ -204,9 +192,9 @@ def _cause(motion: Motion, path: Path | None) -> str | None:
     """The sentence that names what is wrong; None where it is not the heading."""
     if path is Path.MIRRORED:
         return AXES_SWAPPED
-    fitting = [name for name, one in _CONVENTIONS.items() if _agreement(motion, one.undo)[0] >= _FITS]
+    fitting = [name for name, (undo, _) in _CONVENTIONS.items() if _agreement(motion, undo)[0] >= _FITS]
     if fitting:
-        says = [_CONVENTIONS[name].says for name in fitting[:2]]
+        says = [_CONVENTIONS[name][1] for name in fitting[:2]]
         if path is None and fitting[0] in _REFLECTED:
             says.insert(1, AXES_SWAPPED)
         return "; or ".join(says)
@@ -221,9 +209,7 @@ def _cause(motion: Motion, path: Path | None) -> str | None:
             "the heading's antennas from yaw"
         )
     if _turns_too_fast(motion):
-        return (
-            "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
-        )
+        return "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw"
     return "heading and path have nothing to do with each other; check that both are of one drive"
 
 

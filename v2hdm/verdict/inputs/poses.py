@@ -17,8 +17,7 @@ _CHORD_M = 2.0
 # A vehicle that takes longer for a chord counts as standing: its path is then mostly noise.
 _SLOWEST_MPS = 0.5
 
-STEEPEST_DEG = 15.0
-"""No road that is mapped is steeper, nor rolls a vehicle farther."""
+STEEPEST_DEG = 15.0  # no road that is mapped is steeper, nor rolls a vehicle farther
 
 # Chords per drive: enough for medians to a hundredth of a degree, and a tenth of a second of work.
 _MOST_STARTS = 4000
@@ -76,11 +75,8 @@ class Motion:
     def chords(self) -> Chords:
         """The chords of the stretches on which the vehicle moves."""
         stride = -(-len(self.stamp_s) // _MOST_STARTS)
-        pairs = [
-            (start, end)
-            for start in range(0, len(self.stamp_s), stride)
-            if (end := self._reached(start)) is not None
-        ]
+        starts = range(0, len(self.stamp_s), stride)
+        pairs = [(start, end) for start in starts if (end := self._reached(start)) is not None]
         first, last = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
         return Chords(first, last)
 
@@ -144,8 +140,7 @@ def check_path(motion: Motion) -> list[Finding]:
         judge(
             "speed", "poses", speed, _FASTEST_MPS, "m/s",
             fine="the vehicle's speed is one of a road vehicle",
-            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; convert "
-            "them",
+            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; mend it",
         )
     ]  # fmt: skip
 

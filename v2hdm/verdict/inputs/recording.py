@@ -41,9 +41,7 @@ def check_clocks(drive: Drive, motion: Motion) -> Iterator[Finding]:
     if motion.moving.any():
         yield from _pose_rate(drive, motion)
         yield _held(motion)
-    stamps = {
-        name: [image.stamp_s for image in drive.images if image.camera == name] for name in drive.cameras
-    }
+    stamps = {name: [one.stamp_s for one in drive.images if one.camera == name] for name in drive.cameras}
     spans = {name: (own[0], own[-1]) for name, own in stamps.items() if own}
     for name, own in stamps.items():
         yield _posed(drive, name, len(own))
@@ -136,8 +134,7 @@ def _spacing(drive: Drive, motion: Motion, name: str) -> Iterator[Finding]:
 def check_images(drive: Drive) -> list[Finding]:
     """Whether the images are those of a moving camera each, and show road.
 
-    Raises:
-        DriveError: a sampled image cannot be decoded.
+    Raises DriveError where a sampled image cannot be decoded.
     """
     findings = _shared(drive)
     for name, camera in drive.cameras.items():
@@ -259,5 +256,4 @@ def _roi_mask(camera: Camera, grey: np.ndarray) -> np.ndarray:
 
 
 def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
-    """At most ``count`` items, evenly spread."""
     return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, count).astype(int))]

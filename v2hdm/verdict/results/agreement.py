@@ -16,9 +16,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, judge
 
-SAME_M = 1.0
-"""Centres of one marking in the maps of two cameras lie closer than this."""
-
+SAME_M = 1.0  # centres of one marking in the maps of two cameras lie closer than this
 _LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
 # Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3.
 _OFFSET_LIMIT_SIGMAS = 5.0
@@ -58,9 +56,7 @@ def _difference(one: Calibration, other: Calibration) -> FloatArray:
 def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
     """Single cameras against one another and against all of them.
 
-    Args:
-        results: the optimised results by camera set; the last one is that of all cameras.
-        drive: for the driving direction.
+    ``results`` are the optimised ones by camera set, that of all cameras last.
     """
     together = list(results.values())[-1]
     alone = {name: one for name, one in results.items() if len(one.cameras) == 1}
@@ -97,10 +93,7 @@ def _offset(
     sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
-    cause = (
-        "their clocks or the forward survey of a centre disagree",
-        "a heading or a lateral survey disagrees",
-    )[axis]
+    cause = ("clocks or forward surveys of a centre disagree", "headings or lateral surveys disagree")[axis]
     return judge(
         "cameras apart", f"{first}, {second}", float(sigmas[axis]), _OFFSET_LIMIT_SIGMAS, "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
@@ -181,8 +174,7 @@ def check_doubles(best: MethodResult) -> list[Finding]:
         judge(
             "double markings", "map", len(pairs) / len(markings), _DOUBLES_LIMIT, "",
             fine=says,
-            wrong=f"{says}{where}: laps or cameras do not agree; check clocks, the receiver's fix and the "
-            "mountings",
+            wrong=f"{says}{where}: laps or cameras do not agree; check clocks, fix and mountings",
         )
     ]  # fmt: skip
 

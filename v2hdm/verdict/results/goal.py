@@ -34,9 +34,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         reached_m = _radius_of_all_m(radius_m.ravel())
         corners = f"95 % of the corners of {len(markings)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
-        relative_m = [
-            _CIRCLE_95 * one.relative_sigma_m for one in markings if one.relative_sigma_m is not None
-        ]
+        relative_m = [_CIRCLE_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
         if relative_m:
             says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"
         # The map's own limit on sigmas leaves the worst out, so that the share alone would flatter.

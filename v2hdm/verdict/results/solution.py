@@ -30,8 +30,7 @@ from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-BEST = "Opt"
-"""The method whose map is the result."""
+BEST = "Opt"  # the method whose map is the result
 
 # Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5.
 _HELD_OUT_LIMIT = 4.0
@@ -88,14 +87,9 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
 }  # fmt: skip
 
 # How an input was corrected, where it was not just left out.
-_CORRECTED_BY = {
-    Fault.CLOCK: "the images were posed anew",
-    Fault.SIZE: "all known sizes were left out of the result",
-}
+_CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no known size was used"}
 
-_RIVAL_LOG_ODDS = float(np.log(10.0))
-"""A cause that is up to ten times less likely than the likeliest is named beside it."""
-
+_RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 _MAP_AXES = ("east", "north")
 
@@ -107,10 +101,8 @@ def check_result(
 ) -> list[Finding]:
     """The checks after the solve, and the mapper's mountings against those of bare ground.
 
-    Args:
-        drive: the mapped drive.
-        methods: results by camera set, the one of all cameras last, then by method.
-        ground: of each session, by camera, the estimates of bare ground; empty where it was not asked.
+    ``methods`` are results by camera set, that of all cameras last, then by method, ``ground`` the estimates
+    of each session, by camera; empty where it was not asked.
     """
     best = list(methods.values())[-1][BEST]
     findings = check_solution(drive, methods)
@@ -170,9 +162,8 @@ def _observable(tested: list[Contradiction]) -> list[Contradiction]:
 
 def _corrected(one: Contradiction) -> Finding:
     done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
-    return _input(
-        one, Status.WARN, f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
-    )
+    says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
+    return _input(one, Status.WARN, says)
 
 
 def _unknown(one: Contradiction) -> Finding:
@@ -191,7 +182,6 @@ def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
 
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
-    """The finding on a tested input."""
     check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
     return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
 
@@ -215,10 +205,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     loosest_s = max((one.sigma for one in clocks), default=0.0)
     if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
-        says = (
-            f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, or change the "
-            "speed"
-        )
+        says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
         yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
     axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M})
@@ -260,15 +247,13 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         yield judge(
             "rejected", name, fit.rejected_share, _REJECTED_LIMIT, "",
             fine=f"{percent:.1f} % of its corners contradict the rest",
-            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is not "
-            "as stated",
+            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is wrong",
         )  # fmt: skip
     if evidence.held_out_loss is not None:
         yield judge(
             "held out", "map", evidence.held_out_loss, _HELD_OUT_LIMIT, "",
             fine="the map predicts corners that it has not seen as well as the noise allows",
-            wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
-            "left",
+            wrong="the map mispredicts corners that it has not seen: poses, clocks or lens still err",
         )  # fmt: skip
     if evidence.pose_noise:
         yield from _poses(evidence)
@@ -330,10 +315,7 @@ def _words(one: Contradiction) -> str:
         case Fault.CLOCK:
             late = "later" if one.value > 0 else "earlier"
             where = f" {one.about}" if one.about else ""
-            return (
-                f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than stamped: their "
-                "clock is off"
-            )
+            return f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than their stamps say"
         case Fault.CLOCK_DRIFT:
             return (
                 f"the clock of the images of {whose} runs {'slow' if one.value > 0 else 'fast'}: by "

@@ -17,8 +17,7 @@ from v2hdm.verdict.verdict import Finding, Status, passed
 
 CHECK = "check points"
 FRAME = "survey frame"
-SIGNIFICANCE = 1e-3
-"""Share of maps as good as they state that are contradicted by chance."""
+SIGNIFICANCE = 1e-3  # share of maps as good as they state that are contradicted by chance
 
 
 def check_points(table: CheckTable) -> Finding:
@@ -49,8 +48,7 @@ def check_points(table: CheckTable) -> Finding:
 def check_frame(found: Mapping[str, int]) -> list[Finding]:
     """A survey that fits the map not at all, or better when it is read in another way than stated.
 
-    Args:
-        found: corners that have a point within reach, as stated ("") and by other ways to read the file.
+    ``found`` counts corners that have a point within reach, as stated ("") and by other readings of the file.
     """
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
@@ -62,10 +60,7 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
         "mend the file or mapping.survey.crs"
     )
     if not stated and not most:
-        says = (
-            "no corner of the map has a surveyed point within reach: mind datum, zone and units, and "
-            "mapping.survey.reach_m"
-        )
+        says = "no corner of the map has a surveyed point within reach: mind datum, zone, units, reach_m"
     return [Finding(FRAME, Status.WARN, float(stated), None, "", says, "survey")]
 
 
@@ -103,7 +98,6 @@ def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Fault:
 
 
 def _without(table: CheckTable, k: int) -> _Fault:
-    """The point ``k`` left out."""
     kept = np.delete(np.arange(2 * len(table.compared)), [2 * k, 2 * k + 1])
     one = table.compared[k]
     says = (

@@ -92,12 +92,8 @@ class _Description:
         self._vehicle = next((name for name in _VEHICLES if name in self._frames.names), None)
         poses = self._poses(position, heading)
         cameras = {name: self._camera(name, topic, infos[name]) for name, topic in images.items()}
-        self.content: dict[str, Any] = {
-            "name": path.stem,
-            "bag": path.name,
-            "poses": poses,
-            "cameras": cameras,
-        }
+        about: dict[str, Any] = {"name": path.stem, "bag": path.name}
+        self.content = about | {"poses": poses, "cameras": cameras}
         self.missing = list(dict.fromkeys(self._missing))
 
     def _poses(self, position: Topic | None, heading: Topic | None) -> dict[str, Any]:
@@ -173,9 +169,7 @@ def _cameras(bag: Bag) -> dict[str, Topic]:
     by_base: dict[str, Topic] = {}
     for topic in sorted(topics, key=lambda topic: topic.kind != kinds.COMPRESSED):
         by_base.setdefault(topic.name.removesuffix("/compressed"), topic)
-    words = {
-        base: [word for word in base.split("/") if word and word not in _IMAGE_WORDS] for base in by_base
-    }
+    words = {base: [one for one in base.split("/") if one and one not in _IMAGE_WORDS] for base in by_base}
     names = {base: own[-1] if own else "camera" for base, own in words.items()}
     if len(set(names.values())) < len(names):
         names = {base: base.strip("/").replace("/", "_") for base in by_base}

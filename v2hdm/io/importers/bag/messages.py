@@ -51,9 +51,7 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
         return ".jpg", data
     if data.startswith(_PNG_SIGNATURE):
         return ".png", data
-    raise DriveError(
-        f"{where}: compressed as '{fields.format}', neither JPEG nor PNG; record JPEG, PNG or raw images"
-    )
+    raise DriveError(f"{where}: compressed as '{fields.format}'; record JPEG, PNG or raw images")
 
 
 def _pixels(fields: Any, where: str) -> np.ndarray:

@@ -64,8 +64,7 @@ def _parts(path: Path) -> list[Path]:
 class Bag:
     """An open bag: a reader for each of its files, in the order of time.
 
-    Types are taken from the bag when needed: unknown definitions, such as services', do not concern other
-    topics.
+    Types are taken from the bag when needed: unknown definitions, such as services', matter to no other.
     """
 
     def __init__(self, path: Path, readers: Sequence[Any]) -> None:
@@ -187,8 +186,7 @@ def _check_database(path: Path) -> None:
         header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
-        problem = f"was not closed, {journal.name} holds its end"
-        raise DriveError(f"{path}: {problem}; mend it with 'ros2 bag reindex'")
+        raise DriveError(f"{path}: was not closed, {journal.name} holds its end; run 'ros2 bag reindex'")
     if len(header) < 100:
         return
     page_bytes = int.from_bytes(header[16:18], "big")

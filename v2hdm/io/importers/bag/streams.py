@@ -35,15 +35,12 @@ from v2hdm.store.folders import entry_folder, is_whole
 
 _log = logging.getLogger(__name__)
 
-STAMPS = ("header", "received")
-"""Times that count: those of the messages' headers, or those at which the recorder received them."""
-
+STAMPS = ("header", "received")  # times that count: the headers', or when the recorder received the message
 INFO_KIND = "sensor_msgs/msg/CameraInfo"
 IMAGE_LIST, INFO_FILE = "images.txt", "camera_info.yaml"
 _POSES, _HEADINGS, _KIND, _TRANSFORMS = "positions.txt", "headings.txt", "kind.txt", "transforms.txt"
 
-Writer = Generator[None, Message | None, None]
-"""Is sent the messages of a stream, then None; closing it earlier closes its files."""
+Writer = Generator[None, Message | None, None]  # is sent its messages, then None; closing closes its files
 
 
 class Stream(ABC):
@@ -211,9 +208,7 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     """
     files = bag_files(path)
     folders = [entry_folder(cache, files, stream.label, stream.settings) for stream in streams]
-    missing = {
-        folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
-    }
+    missing = {folder: one for folder, one in zip(folders, streams, strict=True) if not is_whole(folder)}
     if not missing:
         return folders
     size_mb = sum(file.stat().st_size for file in files) / 1e6

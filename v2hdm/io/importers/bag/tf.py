@@ -14,9 +14,7 @@ from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray, Trajectory
 
-Edge = tuple[str, str]
-"""Parent and child."""
-
+Edge = tuple[str, str]  # parent and child
 TF_TOPIC, TF_STATIC = "/tf", "/tf_static"
 
 _FIXED = 1e-9  # elements of a transform, m or 1, that change by less do so by rounding
@@ -68,8 +66,7 @@ class Frames:
         tracks = [(self._edges[edge], forward) for edge, forward in path]
         busiest = max((track for track, _ in tracks), key=lambda track: len(track.stamp_s), default=None)
         if busiest is None or len(busiest.stamp_s) < 2:
-            advice = "name the frame of the map and the vehicle's"
-            raise DriveError(f"{where}: {src} does not move in {dst}; {advice}")
+            raise DriveError(f"{where}: {src} does not move in {dst}; name the map's frame and the vehicle's")
         stamp_s = busiest.stamp_s
         inside = np.ones(len(stamp_s), dtype=bool)
         out = np.tile(np.eye(4), (len(stamp_s), 1, 1))
