@@ -246,6 +246,7 @@ class IncrementalMapper:
             pinhole_px=sightings.corners_pinhole_px[row, own],
             covariance_px=model.variance_factor
             * (sightings.covariance_px[row, own] + model.floor_px**2 * np.eye(2)),
+            row_share=sightings.row_share[row, own],
         )
         corners = np.full((4, 2), np.nan)
         try:
@@ -289,4 +290,4 @@ class IncrementalMapper:
 
     def _present_rig(self) -> Rig:
         """The extrinsics, and the poses as they were last solved for."""
-        return Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, self._rig.map_from_vehicle)
+        return replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)

@@ -1,0 +1,66 @@
+"""A drive by cameras with rolling shutters, mapped from detections on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.mapping.scene import MATCH_M, SceneOptions, make_scene, match
+from v2hdm.association.ground import locate
+from v2hdm.association.sightings import collect_sightings
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.optimise import initial_rig, rolling
+from v2hdm.mapping.options import MappingOptions
+
+READ_OUT_S = 0.03
+CAMERAS = ("front",)
+SCENE = SceneOptions(cameras=CAMERAS, length_m=120.0, step_m=2.0, rtk_m=0.005, wild_rate=0.0, false_rate=0.0)
+"""10 m/s."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(replace(SCENE, read_out_s=READ_OUT_S))
+
+
+def mapped(drive, detections, **options):
+    return run_methods(drive, detections, CAMERAS, MappingOptions(pose_model="heave", **options))["Opt"]
+
+
+def unstated(drive):
+    return replace(drive, cameras={name: replace(one, read_out_s=0.0) for name, one in drive.cameras.items()})
+
+
+def test_sightings_lie_where_the_pose_of_their_row_puts_them(scene):
+    """By the true extrinsic and exact poses: what is left of 30 ms at 10 m/s is below a centimetre."""
+    exact = make_scene(
+        replace(SCENE, read_out_s=READ_OUT_S, pixel_sigma=1e-6, jitter_deg=0.0, rtk_m=0.0, heading_deg=0.0)
+    )
+    sightings = collect_sightings(exact.drive, exact.detections, CAMERAS)
+    truth = np.stack([exact.cam_from_vehicle[name] for name in CAMERAS])
+    rig = replace(initial_rig(exact.drive.cameras, sightings.map_from_vehicle), cam_from_vehicle=truth)
+    corners = np.concatenate([one.corners_map for one in exact.markings])
+
+    def off_m(some):
+        located = locate(sightings, some)
+        near = located.valid & (located.range_m < 10.0)
+        away = np.linalg.norm(located.corners_map[near][:, None] - corners, axis=2).min(axis=1)
+        return np.quantile(away, 0.95)
+
+    moving = rolling(rig, exact.drive.cameras.values(), sightings, estimate=False)
+    assert off_m(moving) < 0.01
+    assert off_m(rig) > 0.05
+
+
+def test_a_stated_read_out_time_makes_as_good_a_map_as_a_global_shutter(scene):
+    still = make_scene(SCENE)
+    _, expected_m = match(mapped(still.drive, still.detections).hd_map, still.markings, MATCH_M)
+    pairs, known_m = match(mapped(scene.drive, scene.detections).hd_map, scene.markings, MATCH_M)
+    assert known_m < 1.1 * expected_m
+    assert len(pairs) > 0.9 * len(scene.markings)
+
+
+def test_an_estimated_read_out_time_is_the_true_one(scene):
+    result = mapped(unstated(scene.drive), scene.detections, estimate_read_out=True)
+    read_out_s, sigma_s = result.evidence.read_out_s["front"]
+    assert read_out_s == pytest.approx(READ_OUT_S, abs=min(0.001, 3 * sigma_s))
