@@ -27,8 +27,8 @@ def share_of(row: np.ndarray) -> np.ndarray:
 def rolling(read_out_s: np.ndarray, speed_mps: float = 10.0, noise: float = PIXEL_SIGMA, **street) -> Scene:
     """A street as cameras with ``read_out_s`` (C,) see it: every corner by the pose at which its row is read.
 
-    The row is found by brute force: the pixel gives the row, the row the time, the time the pose, and that the
-    pixel, until nothing changes.
+    The row is found by brute force: the pixel gives the row, the row the time, the time the pose, and that
+    the pixel, until nothing changes.
     """
     scene = with_late_clocks(make_scene(**street), np.zeros(2))
     problem, seen = scene.problem, scene.problem.observations
@@ -95,7 +95,7 @@ def test_engines_agree_on_a_rolling_shutter(pose_states):
     corners, fixed = one.back_project(cameras)
     expected, fixed_too = other.back_project(cameras)
     torch.testing.assert_close(corners, expected, rtol=1e-9, atol=1e-9)
-    assert bool(fixed.all()) and bool(fixed_too.all())
+    assert bool((fixed & fixed_too).all())
     estimate = Estimate(cameras, state, corners, torch.tensor([[0.01, 0.003], [-0.01, 0.002]]).double())
     plan = replace(other.plan(), most_tiles=one.plan().most_tiles)
     made = [factorise(engine, plan, estimate, Loss("cauchy", 3.0)) for engine in (one, other)]

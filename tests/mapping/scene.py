@@ -94,7 +94,8 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
     for j in range(len(recorded)):
         for name in sorted(options.cameras):
             images.append(Image(name, FRAME_S * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
-            seen = _look(cameras[name].info, truth[name], true_poses[j], markings, lanes, options, rng, twist[j])
+            at = truth[name], true_poses[j], twist[j]
+            seen = _look(cameras[name].info, *at, markings, lanes, options, rng)
             detections.append(ImageDetections(len(images) - 1, *seen))
     heading_rad, jitter_rad = (max(np.deg2rad(a), 2e-4) for a in (options.heading_deg, options.jitter_deg))
     none = dict.fromkeys(("position_drift_m", "heading_drift_rad", "roll_pitch_drift_rad"), 0.0)
@@ -222,11 +223,11 @@ def _look(
     info: CameraInfo,
     cam_from_vehicle: FloatArray,
     map_from_vehicle: FloatArray,
+    twist: FloatArray,
     markings: list[Marking],
     lanes: list[Lane],
     options: SceneOptions,
     rng: np.random.Generator,
-    twist: FloatArray,
 ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
     project = _project_rows(info, cam_from_vehicle, map_from_vehicle, twist, options.read_out_s)
     found = []

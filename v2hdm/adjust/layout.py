@@ -228,7 +228,7 @@ def _sorted_observations(
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:
-    """(J, 6, Q), Q visits if clock offsets are estimated: a frame moves with that of its own visit; sigmas."""
+    """(J, 6, Q), Q visits if clock offsets are estimated: a frame moves with that of its visit; sigmas."""
     if not clock_offset or problem.twist_vehicle is None:
         return np.zeros((len(problem.map_from_vehicle), 6, 0)), []
     own = problem.visit_of_frame[:, None] == np.arange(problem.visit_count)

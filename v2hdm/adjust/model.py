@@ -9,8 +9,8 @@ camera c in frame j has the whitened residual
 
 which is the paper's for s = 0 and q = 0. Beyond it, frames have states s (what the recorded pose is off,
 some of it drifting) and cameras clock offsets q (images are late, and the vehicle moves with the twist v).
-A camera with a rolling shutter reads the first row r / 2 before the image's stamp and the last r / 2 after it:
-for q_c there stands q_c + r_c rho_k, with rho_k from -1/2 to 1/2 by the row of the observation.
+A rolling shutter reads the first row r / 2 before the image's stamp and the last r / 2 after it: for q_c
+there stands q_c + r_c rho_k, with rho_k from -1/2 to 1/2 by the row of the observation.
 The cost is half the sum of all squares, where a robust loss takes the squares of the observations.
 
 Tangents are (translation, rotation), as kornia's ``Se3`` has them, and act from the left: exp(x) T.
@@ -40,8 +40,8 @@ MIN_DEPRESSION_SINE = 0.01
 class Estimate:
     """A point in the space of unknowns.
 
-    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s, the last of which may
-    be what a read-out time is longer than stated.
+    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s, where the read-out
+    time is estimated what it is longer than stated in the last column.
     """
 
     cam_from_vehicle: Tensor
@@ -109,7 +109,7 @@ def cam_from_map(arrays: Arrays, cam_from_vehicle: Tensor, frame_state: Tensor, 
 
 
 def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
-    """Tangents (C, M, 6) by which the vehicle has moved on since the stamps, by offsets (C, Q) or (C, M, Q)."""
+    """Tangents (C, M, 6) by which the vehicle has moved since the stamps, by offsets (C, Q) or (C, M, Q)."""
     late = clock_s if clock_s.ndim == 3 else clock_s[:, None]
     by_clock: Tensor = (arrays.clock_twist @ late[..., None])[..., 0]
     return by_clock if arrays.read_out is None else by_clock + arrays.read_out

@@ -43,8 +43,8 @@ LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
 """Squared trace over determinant of a covariance from which an observation is one of a line."""
 
 READ_OUT_SIGMA_S = 0.03
-"""How far a read-out time may be from the stated one, s: a global shutter's is 0, those of the CMOS cameras that
-Ringaby and Forssen measured are about 30 ms (International Journal of Computer Vision 96, 2012, table 1)."""
+"""How far a read-out time may be from the stated one, s: a global shutter's is 0, that of CMOS cameras in
+phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
@@ -120,8 +120,9 @@ class CameraPrior:
     """A prior on the cameras by earlier markings: a quadratic in their tangents and clock offsets.
 
     With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where they are
-    estimated, clock offsets and read-out time beyond the stated one, s, are ``mean`` (C, 6 + Q), with the joint ``information``
-    (C (6 + Q), C (6 + Q)). What the priors on centres and clocks say is part of it; do not state them again.
+    estimated, clock offsets and the read-out time beyond the stated one, s, are ``mean`` (C, 6 + Q), with the
+    joint ``information`` (C (6 + Q), C (6 + Q)). What the priors on centres and clocks say is part of it; do
+    not state them again.
     """
 
     base: FloatArray
@@ -166,10 +167,11 @@ class Problem:
     ``centre_sigma_m`` (C, 3) are the surveyed camera centres, or None. ``corners_start`` (N, 2), if
     given, replaces the start by weighted back-projection. ``twist_vehicle`` (J, 6) is how the vehicle
     moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
-    is held near zero by ``clock_sigma_s``. ``read_out_s`` (C,) are the cameras' read-out times as stated, None
-    for global shutters; estimated ones are held near them by ``read_out_sigma_s``. ``control``, if given, ties corners to a survey: the only thing
-    that can tell a shift of the whole map from the drift of the receiver. ``lengths``, if given, are known
-    distances between corners. ``camera_prior``, if given, is what markings outside this problem say of the
+    is held near zero by ``clock_sigma_s``. ``read_out_s`` (C,) are the cameras' read-out times as stated,
+    None for global shutters; estimated ones are held near them by ``read_out_sigma_s``. ``control``, if
+    given, ties corners to a survey: the only thing that can tell a shift of the whole map from the drift of
+    the receiver. ``lengths``, if given, are known distances between corners. ``camera_prior``, if given, is
+    what markings outside this problem say of the
     cameras. ``visit`` (J,), if given, numbers the visit that each frame is of, from 0 and rising; there is
     then one ``pose_sigma`` for all visits or one for each.
 

@@ -34,7 +34,7 @@ class Rig:
     def cam_from_map(
         self, camera: IntArray, frame: IntArray, row_share: FloatArray | None = None
     ) -> FloatArray:
-        """The poses (..., 4, 4) of cameras (...) at frames (...), when rows at ``row_share`` (...) are read."""
+        """The poses (..., 4, 4) of cameras (...) at frames (...), when rows ``row_share`` (...) are read."""
         cam_from_vehicle, poses = self.cam_from_vehicle[camera], self.map_from_vehicle[frame]
         if row_share is not None and self.read_out_s is not None and self.twist_vehicle is not None:
             late_s = self.read_out_s[camera] * np.nan_to_num(row_share)
@@ -102,8 +102,8 @@ class Sightings:
     F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
     images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
-    says which of them are points, small in every direction. ``row_share`` (S, 4) is when in the read-out of the
-    image their rows were taken (:func:`row_shares`). ``symbols`` are those of the same images.
+    says which of them are points, small in every direction. ``row_share`` (S, 4) is when in the read-out
+    their rows were taken (:func:`row_shares`). ``symbols`` are those of the same images.
     ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
     """
 
@@ -133,7 +133,8 @@ class Sightings:
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
-        of_rows = "image camera frame kind corners_pinhole_px covariance_px valid row_share".split()
+        of_rows = ["image", "camera", "frame", "kind"]
+        of_rows += ["corners_pinhole_px", "covariance_px", "valid", "row_share"]
         return replace(self, **{name: getattr(self, name)[rows] for name in of_rows})
 
 

@@ -142,7 +142,7 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
 
 
 def _take_read_out(entry: Mapping[str, Any], stamp_s: FloatArray, where: str) -> float:
-    """The time from an image's first row to its last, which is over before the next image begins; 0 without."""
+    """The time from an image's first row to its last, over before the next image begins; 0 without."""
     read_out_s = take_number(entry.get("read_out_s", 0.0), where, DriveError)
     period_s = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else np.inf
     if not 0 <= read_out_s <= period_s:

@@ -6,7 +6,7 @@ forces and of their moments p x force. Extrinsics, frame states and clock offset
 
 - a left perturbation of ``cam_from_vehicle`` is one of every pair of the camera;
 - ds in ``exp(-s)`` perturbs the pair by -Ad(cam_from_vehicle exp(-q v)) J_l(-s) ds;
-- dq in ``exp(-q v)`` perturbs the pair by -Ad(cam_from_vehicle) v dq; a read-out time is such a q, its v by row.
+- dq in ``exp(-q v)`` perturbs the pair by -Ad(cam_from_vehicle) v dq; so does a read-out time, its v by row.
 """
 
 from __future__ import annotations
