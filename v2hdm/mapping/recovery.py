@@ -294,7 +294,7 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     offset_s = bundle.solution.clock_offset_s.T.tolist()
     if not bundle.model.solver.clock_offset:
         return tuple({} for _ in offset_s)
-    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()
+    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()[: len(offset_s)]
     index, visits = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
     return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in visits)
 
