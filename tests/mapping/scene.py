@@ -15,6 +15,7 @@ from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import exp
+from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.records import (
     Camera,
     CameraInfo,
@@ -182,10 +183,10 @@ def _poses(
 
 def _twists(route: FloatArray) -> FloatArray:
     """Twists (J, 6) of the vehicle along a route of poses (J, 3) that are a frame apart."""
-    step = np.gradient(route, FRAME_S, axis=0)
-    out = np.zeros((len(route), 6))
-    out[:, 0], out[:, 5] = np.hypot(step[:, 0], step[:, 1]), step[:, 2]
-    return out
+    poses = np.tile(np.eye(4), (len(route), 1, 1))
+    poses[:, :2, 3] = route[:, :2]
+    poses[:, :3, :3] = Rotation.from_euler("Z", route[:, 2:]).as_matrix()
+    return vehicle_twists(poses, FRAME_S * np.arange(len(route)))
 
 
 def _project_rows(

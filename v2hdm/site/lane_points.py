@@ -93,8 +93,13 @@ class ImageGround:
         out.map_from_pinhole_px[rows], out.centre_map[rows] = homographies, centre
         return out
 
-    def rolling(self, rows: IntArray, poses: FloatArray, moved: FloatArray) -> ImageGround:
-        """With the images at ``rows`` read while the vehicle, at ``poses``, moved by tangents (R, 6)."""
+    def rolling(
+        self, rows: IntArray, camera: IntArray, frame: IntArray, poses: FloatArray, rig: Rig
+    ) -> ImageGround:
+        """With the images at ``rows`` read row by row, as ``rig`` has it, while the vehicle was at ``poses``."""
+        if rig.read_out_s is None or rig.twist_vehicle is None:
+            return self
+        moved = rig.twist_vehicle[frame] * rig.read_out_s[camera, None]
         out = np.zeros((len(self.centre_map), 2, 3))
         turn = moved[:, 5, None, None] * np.array([[0.0, -1.0], [1.0, 0.0]])
         out[rows, :, :2] = turn
@@ -102,27 +107,31 @@ class ImageGround:
         return replace(self, moved_map=out)
 
     def at_rows(self, points_map: FloatArray, image: IntArray, row_share: FloatArray) -> FloatArray:
-        """Points (P, 2) that the images (P,) show at rows (P,), each moved to where it was when its was read.
+        """Points (..., 2) that images (...) show at rows (...), by the poses at which these were read.
 
         To first order in the motion: the second is under a millimetre.
         """
         if self.moved_map is None:
             return points_map
         motion = self.moved_map[image]
-        moved = motion[..., :2] @ points_map[..., None] + motion[..., 2:]
-        return np.asarray(points_map + row_share[:, None] * moved[..., 0])
+        moved = (motion[..., :2] @ points_map[..., None])[..., 0] + motion[..., 2]
+        return np.asarray(points_map + row_share[..., None] * moved)
 
 
 def ground_by_ipm(
-    drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray]
+    drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray], rig: Rig
 ) -> ImageGround:
-    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are."""
+    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are.
+
+    Of ``rig``, over the same cameras, only the read-out times and twists are looked at.
+    """
     rows, camera = _rows(drive, list(ipm))
     poses = np.stack([drive.images[i].map_from_vehicle for i in rows])
     forward = [facing_ipm(ipm[name], drive.cameras[name].roi_vehicle.mean(axis=0)) for name in ipm]
     extrinsic = np.stack([cam_from_vehicle[name] for name in ipm])[camera]
     homographies = flat_motion(poses) @ np.stack(forward)[camera]
-    return ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    ground = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    return ground.rolling(rows, camera, frames_of(drive).frame_of_image[rows], poses, rig)
 
 
 def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround:
@@ -133,10 +142,7 @@ def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround
     extrinsic = rig.cam_from_vehicle[camera]
     homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
     ground = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
-    if rig.read_out_s is None or rig.twist_vehicle is None:
-        return ground
-    moved = rig.twist_vehicle[frame] * rig.read_out_s[camera, None]
-    return ground.rolling(rows, poses, moved)
+    return ground.rolling(rows, camera, frame, poses, rig)
 
 
 def collect_lane_points(
