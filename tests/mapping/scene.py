@@ -198,17 +198,18 @@ def _project_rows(
         px, depth = _project(info, cam_from_vehicle @ np.linalg.inv(pose), points)
         for _ in range(6 if read_out_s else 0):
             late_s = read_out_s * (np.clip(px[:, 1] / (info.height - 1), 0, 1) - 0.5)
-            then = [cam_from_vehicle @ np.linalg.inv(pose @ exp(twist * one)) for one in late_s]
-            each = [_project(info, one, point[None]) for one, point in zip(then, points, strict=True)]
-            px, depth = (np.concatenate(part) for part in zip(*each, strict=True))
+            px, depth = _project(
+                info, cam_from_vehicle @ np.linalg.inv(pose @ exp(twist * late_s[:, None])), points
+            )
         return px, depth
 
     return project
 
 
 def _project(info: CameraInfo, cam_from_map: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Recorded pixels (N, 2) and depths (N,) of ground points (N, 2)."""
-    cam = np.column_stack([points, np.zeros(len(points)), np.ones(len(points))]) @ cam_from_map[:3].T
+    """Recorded pixels (N, 2) and depths (N,) of ground points (N, 2), by one pose or each by its own."""
+    ground = np.column_stack([points, np.zeros(len(points)), np.ones(len(points))])
+    cam = (cam_from_map[..., :3, :] @ ground[..., None])[..., 0]
     depth = np.maximum(cam[:, 2], 1e-3)
     pinhole = cam[:, :2] / depth[:, None] * [900.0, 900.0] + [640.0, 350.0]
     seen = (cam[:, 2] > 1) & (np.abs(pinhole - [640, 350]) < [900, 600]).all(axis=1)

@@ -96,7 +96,7 @@ class ImageGround:
     def rolling(
         self, rows: IntArray, camera: IntArray, frame: IntArray, poses: FloatArray, rig: Rig
     ) -> ImageGround:
-        """With the images at ``rows`` read row by row, as ``rig`` has it, while the vehicle was at ``poses``."""
+        """With the images at ``rows`` read row by row, as ``rig`` has it, the vehicle being at ``poses``."""
         if rig.read_out_s is None or rig.twist_vehicle is None:
             return self
         moved = rig.twist_vehicle[frame] * rig.read_out_s[camera, None]
