@@ -242,7 +242,7 @@ class IncrementalMap:
         solution = _sound(solve(problem, options), "the map")
         information = solution.covariance.camera_information()
         at = np.zeros((len(cameras), len(information) // len(cameras)))
-        at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu()
+        at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu().numpy()
         self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
         self._adjusted_count = len(every)
         gain, end = solution.covariance.gain(), 0
@@ -277,7 +277,7 @@ class IncrementalMap:
             part = slice(c * at.shape[1], (c + 1) * at.shape[1])
             chart[part, part] = np.eye(at.shape[1])
             chart[part, part][:6, :6] = turn
-        clock_s = solution.covariance.descent.estimate.clock_s.cpu()
+        clock_s = solution.covariance.descent.estimate.clock_s.cpu().numpy()
         reached = np.column_stack([tangents, clock_s]).ravel()
         information = chart.T @ solution.covariance.camera_information() @ chart - marginal
         vector = information @ reached + marginal @ (reached - mean[rows])

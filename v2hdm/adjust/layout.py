@@ -142,7 +142,8 @@ def make_arrays(
         control[problem.control.corner] = problem.control.points_map
         control_information[problem.control.corner] = 1 / problem.control.sigma_m**2
     clock_twist, sigma_s = _clock_twist(problem, clock_offset)
-    moments, motion = None, None
+    moments: IntArray | None = None
+    motion: FloatArray | None = None
     if read_out or problem.read_out_s is not None:
         moments, own, twist = _moments(problem)
         pair = (pair // len(clock_twist) * len(moments) + own[order]).astype(np.int32)
@@ -242,6 +243,7 @@ def _moments(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
     Lastly how the vehicle has moved at them since its frame's stamp, by the read-out time (M, 6).
     """
     seen = problem.observations
-    moments, own = np.unique(np.column_stack([seen.frame, seen.row_share]), axis=0, return_inverse=True)
-    frame = moments[:, 0].astype(np.int64)
-    return frame, own.ravel(), np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]
+    rows = np.column_stack([seen.frame, np.asarray(seen.row_share)])
+    moments, own = np.unique(rows, axis=0, return_inverse=True)
+    frame, own = moments[:, 0].astype(np.int64), own.ravel().astype(np.int64)
+    return frame, own, np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]

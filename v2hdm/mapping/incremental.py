@@ -143,8 +143,12 @@ class IncrementalMapper:
         # Only the IPM that the first map starts from may be far off, and all that is located by it.
         self._coarse = rig is self._first_rig
         read_out_s = None if rig.read_out_s is None else np.maximum(rig.read_out_s, 0.0)
-        poses = {"cam_from_vehicle": rig.cam_from_vehicle, "map_from_vehicle": rig.map_from_vehicle}
-        drive = replace(self._drive, **poses, read_out_s=read_out_s)
+        drive = replace(
+            self._drive,
+            cam_from_vehicle=rig.cam_from_vehicle,
+            map_from_vehicle=rig.map_from_vehicle,
+            read_out_s=read_out_s,
+        )
         self.grown = IncrementalMap(drive, replace(self._model.solver, coarse=self._coarse))
         self._places: list[_Place] = []
         self._centres = np.zeros((0, 2))
