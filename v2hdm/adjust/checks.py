@@ -179,7 +179,7 @@ def _check_observations(problem: Problem) -> None:
     frames = len(problem.map_from_vehicle)
     by_corner = np.zeros(problem.corner_count, dtype=np.int64)
     by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
-    seen = Seen.of(problem.observations, problem.intrinsic)
+    seen = Seen.of(problem.observations.columns, problem.intrinsic)
     k = first_unsound(seen, frames, _SYMMETRIC_TO, _MAX_SLOPE, by_corner, by_camera)
     if k >= 0:
         raise AdjustError(_fault(problem, k))

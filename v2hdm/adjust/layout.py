@@ -128,7 +128,7 @@ def make_arrays(
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
-    seen = Seen.of(problem.observations, problem.intrinsic)
+    seen = Seen.of(problem.observations.columns, problem.intrinsic)
     order, corner, pair = _sorted_observations(seen, rank, len(problem.map_from_vehicle))
     measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
     whiten_observations(seen, order, measured, root)

@@ -67,6 +67,11 @@ class Observations:
     covariance_px: FloatArray
     row_share: FloatArray | None = None
 
+    @property
+    def columns(self) -> tuple[IntArray | FloatArray, ...]:
+        """All but the rows."""
+        return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
+
     def take(self, rows: IntArray | BoolArray) -> Observations:
         """Those at ``rows``, indices or a mask."""
         columns = vars(self).items()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust.engines.numba.build import kernel
-from v2hdm.adjust.problem import Observations
 from v2hdm.records import FloatArray, IntArray
 
 
@@ -24,9 +24,8 @@ class Seen(NamedTuple):
     intrinsic: FloatArray
 
     @classmethod
-    def of(cls, seen: Observations, intrinsic: FloatArray) -> Seen:
-        """Their columns in this order, copied only where their kind or layout is another."""
-        columns = (getattr(seen, name) for name in cls._fields[:-1])
+    def of(cls, columns: Iterable[NDArray[Any]], intrinsic: FloatArray) -> Seen:
+        """Of columns in this order, copied only where their kind or layout is another."""
         kinds = 3 * (np.int64,) + 3 * (np.float64,)
         both = zip((*columns, intrinsic), kinds, strict=True)
         made: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in both]
