@@ -79,7 +79,8 @@ class Camera:
     trusted. ``linear_response``: grey values are proportional to radiance; otherwise sRGB coding is assumed.
     ``own_vehicle`` (height, width) says which pixels show the vehicle itself, None if unknown.
     ``mounting_sigma`` are the standard deviations of its horizon, rad, and of the logarithm of its focal
-    length where these are guessed from its images.
+    length where these are guessed from its images. ``read_out_s`` is the time from the first row of an image
+    to the last, 0 for a global shutter; an image's stamp is that of its middle row.
     """
 
     info: CameraInfo
@@ -90,6 +91,7 @@ class Camera:
     linear_response: bool = False
     own_vehicle: BoolArray | None = None
     mounting_sigma: tuple[float, float] = (0.0, 0.0)
+    read_out_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ the score tests by kind, how well their p-values are uniform (Kolmogorov-Smirnov
 inside the 95 % regions. ``--spoil`` maps each drive with each of these faults as well (``all``, or names of
 :data:`tests.benchmarks.made.faults.SPOILS`): a map whose corners are more than 1.3 times as far off as those
 of the drive as it was is wrong. ``--control`` states all errors as they are and draws none of another kind:
-what is not uniform there is a mistake of this benchmark or of the mathematics.
+what is not uniform there is a mistake of this benchmark or of the mathematics. ``--read-out S`` has the
+images recorded by rolling shutters, whose read-out time is stated or, with ``--estimate``, estimated.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
 from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.camera_sets import BEST, camera_sets
 from v2hdm.records import Drive
 from v2hdm.report.metrics import driven_past, marking_metrics
@@ -99,6 +101,8 @@ class Job:
         spoil: name of the fault.
         alone: whether each camera is mapped by itself, too.
         control: whether errors are of the kind and the size that the product reckons with.
+        read_out_s: of the cameras; stated, unless it is to be estimated.
+        estimate: whether the mapping estimates it.
     """
 
     seed: int
@@ -106,6 +110,8 @@ class Job:
     spoil: str = CLEAN
     alone: bool = False
     control: bool = False
+    read_out_s: float = 0.0
+    estimate: bool = False
 
     @property
     def recipe(self) -> Recipe:
@@ -120,6 +126,9 @@ def map_one(job: Job) -> Row:
     world = make(recipe)
     if job.spoil != CLEAN:
         world = SPOILS[job.spoil].change(world)
+    if job.read_out_s:
+        world = world.rolling(job.read_out_s, stated=not job.estimate)
+    options = MappingOptions(estimate_read_out=job.estimate)
     drive = drive_of(world)
     detections, visibility = detect(world, drive)
     truth = truth_of(world, drive, visibility)
@@ -133,7 +142,7 @@ def map_one(job: Job) -> Row:
     if not job.alone:
         sets = dict(list(sets.items())[-1:])
     try:
-        methods = {name: run_methods(drive, detections, cameras) for name, cameras in sets.items()}
+        methods = {name: run_methods(drive, detections, cameras, options) for name, cameras in sets.items()}
         findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
@@ -148,6 +157,7 @@ def map_one(job: Job) -> Row:
     figures = marking_metrics(best.hd_map, truth, expected)
     errors = squared_errors(best, truth) if figures.markings > figures.false_markings else {}
     assert best.evidence is not None
+    about["drawn"] |= {f"read_out_s {name}": found for name, found in best.evidence.read_out_s.items()}
     return Row(
         **about,
         status=verdict.status.value,
@@ -216,8 +226,14 @@ def line(row: Row, clean: Row | None) -> str:
     return (
         f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
         f"{100 * row.rmse_m:6.2f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
-        f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}"
+        f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}{_read_outs(row)}"
     )
+
+
+def _read_outs(row: Row) -> str:
+    """The estimated read-out times, if there are any."""
+    found = {key.split()[1]: one for key, one in row.drawn.items() if key.startswith("read_out_s ")}
+    return "".join(f" | {name} {1e3 * one[0]:.2f} +- {1e3 * one[1]:.2f} ms" for name, one in found.items())
 
 
 def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
@@ -351,13 +367,16 @@ def main() -> None:
     parser.add_argument(
         "--control", action="store_true", help="draw no errors but those that the product reckons with"
     )
+    parser.add_argument("--read-out", type=float, default=0.0, help="of rolling shutters, s")
+    parser.add_argument("--estimate", action="store_true", help="do not state it, estimate it")
     parser.add_argument("--verbose", action="store_true", help="print all findings")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/right_drives.json"))
     parsed = parser.parse_args()
     seeds = [s for s in range(*parsed.seeds) if re.search(parsed.only, Job(s, parsed.route).recipe.name)]
     kinds = [CLEAN, *(spoil.name for spoil in wanted_spoils(parsed.spoil))]
-    jobs = [Job(seed, parsed.route, kind, parsed.alone, parsed.control) for seed in seeds for kind in kinds]
+    how = parsed.alone, parsed.control, parsed.read_out, parsed.estimate
+    jobs = [Job(seed, parsed.route, kind, *how) for seed in seeds for kind in kinds]
     rows = measure(jobs, parsed.workers, parsed.verbose or bool(parsed.spoil))
     parsed.out.parent.mkdir(parents=True, exist_ok=True)
     parsed.out.write_text(json.dumps([asdict(row) for row in rows]))

@@ -119,6 +119,10 @@ CASES: dict[str, tuple[Damage, str]] = {
     "bow tie": (front(roi_vehicle=[[0, 0], [1, 1], [1, 0], [0, 1]]), r"polygon is not convex"),
     "sigma": (front(centre_prior={"xyz": [0, 0, 2], "sigma_m": 0}), r"sigma_m: must be positive"),
     "prior typo": (front(centre_prior={"xyz": [0, 0, 2], "sigma": 1}), r"'sigma'; did you mean 'sigma_m'"),
+    "negative read-out": (front(read_out_s=-0.01), r"read_out_s: -0.01 s is no read-out time; give seconds"),
+    "long read-out": (front(read_out_s=1.0), r"read_out_s: 1 s is no .*, from 0 to 0.6, the time from image"),
+    "read-out nan": (front(read_out_s=float("nan")), r"read_out_s: expected a finite number, got nan"),
+    "read-out text": (front(read_out_s="fast"), r"read_out_s: expected a finite number"),
     "linear": (front(linear_response="perhaps"), r"linear_response: expected true or false"),
 }
 

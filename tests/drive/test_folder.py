@@ -3,6 +3,7 @@
 import logging
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES
 from v2hdm.io.drive.truth import read_truth
+from v2hdm.io.drive.writing import write_drive
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
 from v2hdm.io.importers.tables import NAMES
 from v2hdm.io.safe.pixels import read_header
@@ -57,6 +59,14 @@ def test_a_drive_that_was_written_is_read_back_as_it_was(tmp_path):
             np.testing.assert_allclose(got.ipm[key], ipm, rtol=1e-12)
         np.testing.assert_array_equal(got.roi_vehicle, camera.roi_vehicle)
         np.testing.assert_array_equal(got.centre_prior.sigma_m, [0.02] * 3)
+
+
+def test_a_read_out_time_comes_back_and_is_0_where_none_is_stated(tmp_path):
+    written = make_drive(tmp_path)
+    front = replace(written.cameras["front"], read_out_s=0.03)
+    write_drive(tmp_path, replace(written, cameras=written.cameras | {"front": front}), straight_trajectory())
+    read = read_drive(tmp_path).cameras
+    assert (read["front"].read_out_s, read["rear"].read_out_s) == (0.03, 0.0)
 
 
 def test_images_get_the_pose_at_their_time(tmp_path):

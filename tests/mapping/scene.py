@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 from tests.cameras import mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import exp
+from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.records import (
     Camera,
     CameraInfo,
@@ -53,6 +55,7 @@ class SceneOptions:
     max_range_m: float = 20.0
     dashes_only: bool = False
     lines: tuple[float, ...] = (-3.2,)
+    read_out_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,9 @@ class Scene:
     lanes: list[Lane]
     cam_from_vehicle: dict[str, FloatArray]
 
+
+FRAME_S = 0.2
+"""Time from image to image, s."""
 
 MOUNTS = {
     "front": mounted((3.6, 0.1, 2.4), pitch_deg=16.0, yaw_deg=1.0, roll_deg=0.5),
@@ -85,11 +91,12 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
     truth = {name: MOUNTS[name] for name in options.cameras}
     cameras = {name: _camera(name, truth[name], options, rng) for name in options.cameras}
     true_poses, recorded = _poses(route, options, rng)
-    images, detections = [], []
+    images, detections, twist = [], [], _twists(route)
     for j in range(len(recorded)):
         for name in sorted(options.cameras):
-            images.append(Image(name, 0.2 * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
-            seen = _look(cameras[name].info, truth[name], true_poses[j], markings, lanes, options, rng)
+            images.append(Image(name, FRAME_S * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
+            at = truth[name], true_poses[j], twist[j]
+            seen = _look(cameras[name].info, *at, markings, lanes, options, rng)
             detections.append(ImageDetections(len(images) - 1, *seen))
     heading_rad, jitter_rad = (max(np.deg2rad(a), 2e-4) for a in (options.heading_deg, options.jitter_deg))
     none = dict.fromkeys(("position_drift_m", "heading_drift_rad", "roll_pitch_drift_rad"), 0.0)
@@ -153,7 +160,7 @@ def _camera(name: str, truth: FloatArray, options: SceneOptions, rng: np.random.
     roi = np.column_stack([x, [-2.0, -4.0, 4.0, 2.0]])
     prior = CentrePrior(centre + rng.normal(size=3) * 0.02, np.full(3, 0.02))
     ipms = {"estimated": ipm_from_extrinsic(info, guess), "calibrated": ipm_from_extrinsic(info, truth)}
-    return Camera(info, ipms, "estimated", roi, prior)
+    return Camera(info, ipms, "estimated", roi, prior, read_out_s=options.read_out_s)
 
 
 def _poses(
@@ -174,9 +181,35 @@ def _poses(
     return true, recorded
 
 
+def _twists(route: FloatArray) -> FloatArray:
+    """Twists (J, 6) of the vehicle along a route of poses (J, 3) that are a frame apart."""
+    poses = np.tile(np.eye(4), (len(route), 1, 1))
+    poses[:, :2, 3] = route[:, :2]
+    poses[:, :3, :3] = Rotation.from_euler("Z", route[:, 2:]).as_matrix()
+    return vehicle_twists(poses, FRAME_S * np.arange(len(route)))
+
+
+def _project_rows(
+    info: CameraInfo, cam_from_vehicle: FloatArray, pose: FloatArray, twist: FloatArray, read_out_s: float
+) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """:func:`_project` by the pose at which each point's row is read, which is found by turns."""
+
+    def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        px, depth = _project(info, cam_from_vehicle @ np.linalg.inv(pose), points)
+        for _ in range(6 if read_out_s else 0):
+            late_s = read_out_s * (np.clip(px[:, 1] / (info.height - 1), 0, 1) - 0.5)
+            px, depth = _project(
+                info, cam_from_vehicle @ np.linalg.inv(pose @ exp(twist * late_s[:, None])), points
+            )
+        return px, depth
+
+    return project
+
+
 def _project(info: CameraInfo, cam_from_map: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Recorded pixels (N, 2) and depths (N,) of ground points (N, 2)."""
-    cam = np.column_stack([points, np.zeros(len(points)), np.ones(len(points))]) @ cam_from_map[:3].T
+    """Recorded pixels (N, 2) and depths (N,) of ground points (N, 2), by one pose or each by its own."""
+    ground = np.column_stack([points, np.zeros(len(points)), np.ones(len(points))])
+    cam = (cam_from_map[..., :3, :] @ ground[..., None])[..., 0]
     depth = np.maximum(cam[:, 2], 1e-3)
     pinhole = cam[:, :2] / depth[:, None] * [900.0, 900.0] + [640.0, 350.0]
     seen = (cam[:, 2] > 1) & (np.abs(pinhole - [640, 350]) < [900, 600]).all(axis=1)
@@ -192,17 +225,18 @@ def _look(
     info: CameraInfo,
     cam_from_vehicle: FloatArray,
     map_from_vehicle: FloatArray,
+    twist: FloatArray,
     markings: list[Marking],
     lanes: list[Lane],
     options: SceneOptions,
     rng: np.random.Generator,
 ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
-    cam_from_map = cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
+    project = _project_rows(info, cam_from_vehicle, map_from_vehicle, twist, options.read_out_s)
     found = []
     for marking in markings:
         if np.linalg.norm(marking.corners_map[0] - map_from_vehicle[:2, 3]) > options.max_range_m + 5:
             continue
-        px, depth = _project(info, cam_from_map, marking.corners_map)
+        px, depth = project(marking.corners_map)
         inside = _inside(px, depth, options)
         if inside.sum() < 2 or rng.random() > options.detection_rate:
             continue
@@ -215,7 +249,7 @@ def _look(
     strips += [("lane_dash", _centre_line(m.corners_map)) for m in markings if m.kind == "lane_dash"]
     rows = []
     for kind, points in strips:
-        px, depth = _project(info, cam_from_map, points)
+        px, depth = project(points)
         keep = _inside(px, depth, options)
         if keep.sum() >= 3:
             noise = rng.normal(size=(int(keep.sum()), 2)) * 2 * options.pixel_sigma

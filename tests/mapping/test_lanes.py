@@ -190,6 +190,12 @@ ARROW = np.array(
 )
 
 
+def symbols_of(outlines, kinds):
+    """One outline in each frame of one camera, whose shutter is global."""
+    count, rows = len(outlines), tuple(np.zeros(len(one)) for one in outlines)
+    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows)
+
+
 def scene(arrow_x_m):
     """Three frames, a metre apart, that all see an arrow ahead of the first one."""
     poses = np.tile(np.eye(4), (3, 1, 1))
@@ -202,7 +208,7 @@ def scene(arrow_x_m):
         )
         cam = vehicle @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
         outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
-    return Symbols(np.zeros(3, dtype=np.int64), np.arange(3), tuple(outlines), ("arrow",) * 3), rig
+    return symbols_of(outlines, ("arrow",) * 3), rig
 
 
 def rectangle(centre, length_m, width_m):
@@ -249,8 +255,7 @@ def seen(shapes, kinds, poses_x):
         ground = np.column_stack([shape, np.zeros(len(shape)), np.ones(len(shape))])
         cam = ground @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
         outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
-    count = len(poses_x)
-    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds)), rig
+    return symbols_of(outlines, kinds), rig
 
 
 def mapped(symbols, rig, markings=()):

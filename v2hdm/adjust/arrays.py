@@ -69,7 +69,9 @@ class Arrays:
 
     Everything that an extrinsic and a frame do to an observation, they do through its pair. So the
     big arrays know only pairs and corners, and sums over pairs are carried on to extrinsics and
-    frames on small tables (pair = camera * J + frame).
+    frames on small tables (pair = camera * J + frame). Where images are read out row by row, a frame has
+    several *moments*, one for each row that something was seen in: they take its place (M for J) in pairs,
+    and in ``clock_twist``.
 
     Attributes:
         order: (K,) where each sorted observation stood in the problem.
@@ -87,12 +89,14 @@ class Arrays:
         state_transition: (J, S, S) what a frame's states are expected to be, given the frame's before.
         state_information_root: (J, S) 1 / sigma of what is new in it.
         clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offsets; Q is the number of visits,
-            or 0 where no offset is estimated.
-        clock_information_root: 1 / sigma of a clock offset.
+            or 0 where no offset is estimated, and one more where the read-out time is: the last.
+        clock_information_root: (Q,) 1 / sigma of each.
         control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N, 2), 0 where
             there is no survey.
         lengths: known distances between corners.
         camera_prior: what earlier markings say of the cameras, None if nothing.
+        frame_of_moment: (M,) the frame of each moment, None where frames are moments themselves.
+        read_out: (C, M, 6) how the vehicle has moved since the frame's stamp by the read-out times as stated.
     """
 
     order: Tensor
@@ -110,11 +114,13 @@ class Arrays:
     state_transition: Tensor
     state_information_root: Tensor
     clock_twist: Tensor
-    clock_information_root: float
+    clock_information_root: Tensor
     control: Tensor
     control_information: Tensor
     lengths: Lengths
     camera_prior: CameraQuadratic | None = None
+    frame_of_moment: Tensor | None = None
+    read_out: Tensor | None = None
 
     @property
     def frame_count(self) -> int:
@@ -133,13 +139,44 @@ class Arrays:
 
     @property
     def camera_unknowns(self) -> int:
-        """6 + Q: a camera's extrinsic and, where they are estimated, its clock offsets."""
+        """6 + Q: a camera's extrinsic and, where they are estimated, its clock offsets and read-out time."""
         return 6 + self.clock_twist.shape[-1]
+
+    @property
+    def moves(self) -> bool:
+        """Whether images may be of other times than their stamps."""
+        return self.clock_twist.shape[-1] > 0 or self.read_out is not None
 
     @property
     def pair_count(self) -> int:
         """P."""
-        return self.camera_count * self.frame_count
+        return self.camera_count * self.moment_count
+
+    @property
+    def moment_count(self) -> int:
+        """M, or J where frames are moments."""
+        return len(self.clock_twist)
+
+    def camera_of(self, pair: Tensor) -> Tensor:
+        """The cameras of pairs."""
+        return pair // self.moment_count
+
+    def frame_of(self, pair: Tensor) -> Tensor:
+        """The frames of pairs."""
+        moment = pair % self.moment_count
+        return moment if self.frame_of_moment is None else self.frame_of_moment[moment.long()]
+
+    def at_moments(self, by_frame: Tensor, axis: int = 0) -> Tensor:
+        """Values (..., J, ...) of frames as those (..., M, ...) of their moments."""
+        moments = self.frame_of_moment
+        return by_frame if moments is None else by_frame.index_select(axis, moments)
+
+    def over_moments(self, by_moment: Tensor) -> Tensor:
+        """Sums (J, ...) over the moments of each frame of values (M, ...)."""
+        if self.frame_of_moment is None:
+            return by_moment
+        out = by_moment.new_zeros(self.frame_count, *by_moment.shape[1:])
+        return out.index_add_(0, self.frame_of_moment, by_moment)
 
     def no_clock(self) -> Tensor:
         """Clock offsets (C, Q) of zero."""

@@ -72,7 +72,8 @@ def _check_lengths(problem: Problem) -> None:
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
     """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
-    prior, each = problem.camera_prior, 6 + problem.visit_count * int(options.clock_offset)
+    prior, clocks = problem.camera_prior, problem.visit_count * int(options.clock_offset)
+    each = 6 + clocks + int(options.read_out)
     if prior is not None:
         size = len(problem.intrinsic) * each
         shapes = problem.cam_from_vehicle.shape, (len(problem.intrinsic), each), (size, size)
@@ -81,6 +82,11 @@ def check_model(problem: Problem, options: SolveOptions) -> None:
                 raise AdjustError(f"camera_prior.{name} must hold finite numbers in the shape {shape}")
     if options.clock_offset and problem.twist_vehicle is None:
         raise AdjustError("a clock offset needs twist_vehicle: say how the vehicle moves at each frame")
+    if options.read_out or problem.read_out_s is not None:
+        needed = {"twist_vehicle": problem.twist_vehicle, "row_share": problem.observations.row_share}
+        for name, values in needed.items():
+            if values is None:
+                raise AdjustError(f"a read-out time needs {name}: leave out read_out_s, or give it")
 
 
 def check_options(options: SolveOptions) -> None:
@@ -115,6 +121,8 @@ def _check_shapes(problem: Problem) -> None:
         ("centre_sigma_m", problem.centre_sigma_m, (cameras, 3)),
         ("corners_start", problem.corners_start, (problem.corner_count, 2)),
         ("twist_vehicle", problem.twist_vehicle, (frames, 6)),
+        ("read_out_s", problem.read_out_s, (cameras,)),
+        ("observations.row_share", seen.row_share, (count,)),
         ("observations.camera", seen.camera, (count,)),
         ("observations.frame", seen.frame, (count,)),
         ("observations.corner", seen.corner, (count,)),
@@ -144,6 +152,8 @@ def _check_finite(problem: Problem) -> None:
         ("centre_vehicle of camera", problem.centre_vehicle),
         ("corners_start of corner", problem.corners_start),
         ("twist_vehicle of frame", problem.twist_vehicle),
+        ("read_out_s of camera", problem.read_out_s),
+        ("row_share of observation", problem.observations.row_share),
     ):
         if values is not None:
             wrong = ~np.isfinite(values).reshape(len(values), -1).all(1)
@@ -169,7 +179,7 @@ def _check_observations(problem: Problem) -> None:
     frames = len(problem.map_from_vehicle)
     by_corner = np.zeros(problem.corner_count, dtype=np.int64)
     by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
-    seen = Seen.of(vars(problem.observations).values(), problem.intrinsic)
+    seen = Seen.of(problem.observations.columns, problem.intrinsic)
     k = first_unsound(seen, frames, _SYMMETRIC_TO, _MAX_SLOPE, by_corner, by_camera)
     if k >= 0:
         raise AdjustError(_fault(problem, k))
@@ -210,6 +220,11 @@ def _check_priors(problem: Problem) -> None:
         _refuse(wrong, "centre_sigma_m of camera {} must be above 0 (inf where nothing is known)")
     if not problem.clock_sigma_s > 0:
         raise AdjustError(f"clock_sigma_s is {problem.clock_sigma_s}: give a number of seconds above 0")
+    if not problem.read_out_sigma_s > 0:
+        raise AdjustError(f"read_out_sigma_s is {problem.read_out_sigma_s}: give a number of seconds above 0")
+    if problem.read_out_s is not None:
+        said = "read_out_s of camera {} is {} s: give one of 0 (all rows at once) or above"
+        _refuse(problem.read_out_s < 0, said, problem.read_out_s)
     _check_visits(problem)
     for one in problem.pose_sigmas:
         sigma = one.by_state()

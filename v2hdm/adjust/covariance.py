@@ -43,7 +43,10 @@ class Covariance:
         return np.stack([block[:6, :6] for block in self._cameras()])
 
     def clock_s2(self) -> FloatArray:
-        """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is."""
+        """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is.
+
+        Where the read-out time is estimated, its variance is in one more column, the last.
+        """
         return np.stack([block.diagonal()[6:] for block in self._cameras()])
 
     def _cameras(self) -> list[FloatArray]:

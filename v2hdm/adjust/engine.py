@@ -62,7 +62,7 @@ class Linearised(ABC):
 
         Args:
             step: of the reduced unknowns; its corners are not looked at.
-            tangents: (C, J, 6) left tangents of the pairs under the step.
+            tangents: (C, M, 6) left tangents of the pairs under the step.
             own: (N, 2) whitened variables of the corners.
         """
 
@@ -95,11 +95,11 @@ class Engine(ABC):
 
     @abstractmethod
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
-        """Whitened residuals (2, K) of the observations, for pairs (C, J, 4, 4)."""
+        """Whitened residuals (2, K) of the observations, for pairs (C, M, 4, 4)."""
 
     @abstractmethod
     def poses(self, estimate: Estimate) -> Tensor:
-        """``cam_from_map`` of every pair, (C, J, 4, 4)."""
+        """``cam_from_map`` of every pair, (C, M, 4, 4)."""
 
     @abstractmethod
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:

@@ -242,7 +242,7 @@ class IncrementalMap:
         solution = _sound(solve(problem, options), "the map")
         information = solution.covariance.camera_information()
         at = np.zeros((len(cameras), len(information) // len(cameras)))
-        at[:, 6:] = solution.clock_offset_s
+        at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu().numpy()
         self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
         self._adjusted_count = len(every)
         gain, end = solution.covariance.gain(), 0
@@ -263,6 +263,7 @@ class IncrementalMap:
             centre_vehicle=None,
             centre_sigma_m=None,
             clock_sigma_s=np.inf,
+            read_out_sigma_s=np.inf,
             camera_prior=CameraPrior(base, mean[rows].reshape(len(cameras), -1), marginal),
         )
         options = replace(
@@ -276,7 +277,8 @@ class IncrementalMap:
             part = slice(c * at.shape[1], (c + 1) * at.shape[1])
             chart[part, part] = np.eye(at.shape[1])
             chart[part, part][:6, :6] = turn
-        reached = np.column_stack([tangents, solution.clock_offset_s])[:, : at.shape[1]].ravel()
+        clock_s = solution.covariance.descent.estimate.clock_s.cpu().numpy()
+        reached = np.column_stack([tangents, clock_s]).ravel()
         information = chart.T @ solution.covariance.camera_information() @ chart - marginal
         vector = information @ reached + marginal @ (reached - mean[rows])
         everywhere = mean.copy()
@@ -310,6 +312,7 @@ class IncrementalMap:
             corners_start=None,
             visit=None if drive.visit is None else drive.visit[frames],
             twist_vehicle=of(drive.twist_vehicle, frames),
+            read_out_s=of(drive.read_out_s, cameras),
             control=_known([one.control for one in sighted], starts),
             lengths=_known([one.lengths for one in sighted], starts),
             camera_prior=None,
@@ -336,10 +339,8 @@ _Known = TypeVar("_Known", Observations, ControlPoints, KnownLengths)
 
 
 def _stacked(parts: Sequence[_Known]) -> _Known:
-    columns = (
-        np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)
-    )
-    return type(parts[0])(*columns)
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return type(parts[0])(*(None if one[0] is None else np.concatenate(one) for one in columns))
 
 
 def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:

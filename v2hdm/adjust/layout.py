@@ -104,7 +104,11 @@ _MOST_JOINED = 256
 
 
 def make_arrays(
-    problem: Problem, pose_states: tuple[str, ...], device: str, clock_offset: bool = False
+    problem: Problem,
+    pose_states: tuple[str, ...],
+    device: str,
+    clock_offset: bool = False,
+    read_out: bool = False,
 ) -> Arrays:
     """Lay a checked problem out for the solver.
 
@@ -124,7 +128,7 @@ def make_arrays(
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
-    seen = Seen.of(vars(problem.observations).values(), problem.intrinsic)
+    seen = Seen.of(problem.observations.columns, problem.intrinsic)
     order, corner, pair = _sorted_observations(seen, rank, len(problem.map_from_vehicle))
     measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
     whiten_observations(seen, order, measured, root)
@@ -137,6 +141,18 @@ def make_arrays(
     if problem.control is not None:
         control[problem.control.corner] = problem.control.points_map
         control_information[problem.control.corner] = 1 / problem.control.sigma_m**2
+    clock_twist, sigma_s = _clock_twist(problem, clock_offset)
+    moments: IntArray | None = None
+    motion: FloatArray | None = None
+    if read_out or problem.read_out_s is not None:
+        moments, own, twist = _moments(problem)
+        pair = (pair // len(clock_twist) * len(moments) + own[order]).astype(np.int32)
+        clock_twist = clock_twist[moments]
+        if problem.read_out_s is not None:
+            motion = problem.read_out_s[:, None, None] * twist
+        if read_out:
+            clock_twist = np.concatenate([clock_twist, twist[..., None]], axis=2)
+            sigma_s = [*sigma_s, problem.read_out_sigma_s]
     none = np.zeros(0)
     known = problem.lengths or KnownLengths(none.astype(np.int64), none.astype(np.int64), none, none)
     return Arrays(
@@ -154,8 +170,8 @@ def make_arrays(
         centre_information_root=real(centre_root),
         state_transition=real(transition),
         state_information_root=real(information_root),
-        clock_twist=real(_clock_twist(problem, clock_offset)),
-        clock_information_root=1 / problem.clock_sigma_s,
+        clock_twist=real(clock_twist),
+        clock_information_root=1 / real(np.array(sigma_s, dtype=np.float64)),
         control=real(control[corner_order]),
         control_information=real(control_information[corner_order]),
         lengths=Lengths(
@@ -164,6 +180,8 @@ def make_arrays(
         camera_prior=None
         if problem.camera_prior is None
         else CameraQuadratic(*(real(values) for values in vars(problem.camera_prior).values())),
+        frame_of_moment=None if moments is None else index(moments),
+        read_out=None if motion is None else real(motion),
     )
 
 
@@ -210,9 +228,22 @@ def _sorted_observations(
     return order, corner, pair
 
 
-def _clock_twist(problem: Problem, clock_offset: bool) -> FloatArray:
-    """(J, 6, Q), Q visits if clock offsets are estimated: a frame moves with that of its own visit."""
+def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:
+    """(J, 6, Q), Q visits if clock offsets are estimated: a frame moves with that of its visit; sigmas."""
     if not clock_offset or problem.twist_vehicle is None:
-        return np.zeros((len(problem.map_from_vehicle), 6, 0))
+        return np.zeros((len(problem.map_from_vehicle), 6, 0)), []
     own = problem.visit_of_frame[:, None] == np.arange(problem.visit_count)
-    return np.asarray(problem.twist_vehicle[:, :, None] * own[:, None])
+    sigma_s = problem.visit_count * [problem.clock_sigma_s]
+    return np.asarray(problem.twist_vehicle[:, :, None] * own[:, None]), sigma_s
+
+
+def _moments(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
+    """The frames (M,) of the moments at which rows were read, ascending, and each observation's moment (K,).
+
+    Lastly how the vehicle has moved at them since its frame's stamp, by the read-out time (M, 6).
+    """
+    seen = problem.observations
+    rows = np.column_stack([seen.frame, np.asarray(seen.row_share)])
+    moments, own = np.unique(rows, axis=0, return_inverse=True)
+    frame, own = moments[:, 0].astype(np.int64), own.ravel().astype(np.int64)
+    return frame, own, np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]

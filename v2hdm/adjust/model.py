@@ -9,6 +9,8 @@ camera c in frame j has the whitened residual
 
 which is the paper's for s = 0 and q = 0. Beyond it, frames have states s (what the recorded pose is off,
 some of it drifting) and cameras clock offsets q (images are late, and the vehicle moves with the twist v).
+A rolling shutter reads the first row r / 2 before the image's stamp and the last r / 2 after it: for q_c
+there stands q_c + r_c rho_k, with rho_k from -1/2 to 1/2 by the row of the observation.
 The cost is half the sum of all squares, where a robust loss takes the squares of the observations.
 
 Tangents are (translation, rotation), as kornia's ``Se3`` has them, and act from the left: exp(x) T.
@@ -38,7 +40,8 @@ MIN_DEPRESSION_SINE = 0.01
 class Estimate:
     """A point in the space of unknowns.
 
-    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s.
+    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s, where the read-out
+    time is estimated what it is longer than stated in the last column.
     """
 
     cam_from_vehicle: Tensor
@@ -84,21 +87,32 @@ def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
 
 
 def cam_from_map(arrays: Arrays, cam_from_vehicle: Tensor, frame_state: Tensor, clock_s: Tensor) -> Tensor:
-    """T exp(-q v) exp(-s) P^-1 of every pair of a camera and a frame, (C, J, 4, 4).
+    """T exp(-(q + r rho) v) exp(-s) P^-1 of every pair of a camera and a moment, (C, M, 4, 4).
 
     Args:
         arrays: the problem.
         cam_from_vehicle: (C, 4, 4).
-        frame_state: (J, S), or (C, J, S) for states of each pair.
-        clock_s: (C, Q), or (C, J, Q) for offsets of each pair.
+        frame_state: (J, S), or (C, M, S) for states of each pair.
+        clock_s: (C, Q), or (C, M, Q) for offsets of each pair.
     """
     camera, vehicle_from_map = cam_from_vehicle[:, None], arrays.vehicle_from_map
+    by_pair = frame_state.ndim == 3
+    if by_pair:
+        vehicle_from_map = arrays.at_moments(vehicle_from_map)
     if arrays.states:
         vehicle_from_map = rigid(-frame_tangent(arrays, frame_state)) @ vehicle_from_map
-    if arrays.clock_twist.shape[-1]:
-        late = clock_s if clock_s.ndim == 3 else clock_s[:, None]
-        camera = camera @ rigid(-(arrays.clock_twist @ late[..., None])[..., 0])
+    if not by_pair:
+        vehicle_from_map = arrays.at_moments(vehicle_from_map)
+    if arrays.moves:
+        camera = camera @ rigid(-moved(arrays, clock_s))
     return camera @ vehicle_from_map
+
+
+def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
+    """Tangents (C, M, 6) by which the vehicle has moved since the stamps, by offsets (C, Q) or (C, M, Q)."""
+    late = clock_s if clock_s.ndim == 3 else clock_s[:, None]
+    by_clock: Tensor = (arrays.clock_twist @ late[..., None])[..., 0]
+    return by_clock if arrays.read_out is None else by_clock + arrays.read_out
 
 
 def before_camera(points_cam: Tensor) -> Tensor:
@@ -162,7 +176,7 @@ def state_residual(arrays: Arrays, frame_state: Tensor, before: Tensor | None = 
 
 
 def clock_residual(arrays: Arrays, clock_s: Tensor) -> Tensor:
-    """Clock offsets (C, Q) against zero."""
+    """Clock offsets (C, Q) against zero, and read-out times against the stated ones."""
     return clock_s * arrays.clock_information_root
 
 

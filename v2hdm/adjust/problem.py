@@ -6,7 +6,9 @@ Unknown are, in the frames of :mod:`v2hdm.geometry`,
 - the corners of the markings ``corners_map`` (x, y); the ground is z = 0,
 - optionally, for every frame, how far the vehicle was from its recorded pose: any of x, y, height,
   roll, pitch, heading, as a tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``,
-- optionally, for every camera, a clock offset: its images were taken that much later than they say.
+- optionally, for every camera, a clock offset: its images were taken that much later than they say,
+- optionally, for every camera, its read-out time: from the first row of an image to the last, the middle row
+  being taken at the image's stamp (plus the clock offset).
 
 Frames may be of several visits to the site. Each visit has its own noise of poses, whose drift begins anew,
 and its own clock offsets; cameras and corners are common to all.
@@ -40,6 +42,10 @@ _LINE_RATIO = 1e3
 LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
 """Squared trace over determinant of a covariance from which an observation is one of a line."""
 
+READ_OUT_SIGMA_S = 0.03
+"""How far a read-out time may be from the stated one, s: a global shutter's is 0, that of CMOS cameras in
+phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
+
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
 ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
@@ -50,7 +56,8 @@ class Observations:
     """K sightings: camera ``camera`` (K,) saw at frame ``frame`` (K,) the corner ``corner`` (K,).
 
     ``pinhole_px`` (K, 2) is where, with the lens distortion removed; ``covariance_px`` (K, 2, 2) how
-    well, px^2.
+    well, px^2. ``row_share`` (K,) is when in the read-out its row of the recorded image was taken, from -1/2
+    for the first row to 1/2 for the last; only a rolling shutter asks for it.
     """
 
     camera: IntArray
@@ -58,6 +65,17 @@ class Observations:
     corner: IntArray
     pinhole_px: FloatArray
     covariance_px: FloatArray
+    row_share: FloatArray | None = None
+
+    @property
+    def columns(self) -> tuple[IntArray | FloatArray, ...]:
+        """All but the rows."""
+        return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
+
+    def take(self, rows: IntArray | BoolArray) -> Observations:
+        """Those at ``rows``, indices or a mask."""
+        columns = vars(self).items()
+        return Observations(**{name: None if one is None else one[rows] for name, one in columns})
 
     @property
     def on_line(self) -> BoolArray:
@@ -106,9 +124,10 @@ class KnownLengths:
 class CameraPrior:
     """A prior on the cameras by earlier markings: a quadratic in their tangents and clock offsets.
 
-    With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where it is
-    estimated, clock offset in s are ``mean`` (C, 6 + Q), with the joint ``information``
-    (C (6 + Q), C (6 + Q)). What the priors on centres and clocks say is part of it; do not state them again.
+    With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where they are
+    estimated, clock offsets and the read-out time beyond the stated one, s, are ``mean`` (C, 6 + Q), with the
+    joint ``information`` (C (6 + Q), C (6 + Q)). What the priors on centres and clocks say is part of it; do
+    not state them again.
     """
 
     base: FloatArray
@@ -153,9 +172,11 @@ class Problem:
     ``centre_sigma_m`` (C, 3) are the surveyed camera centres, or None. ``corners_start`` (N, 2), if
     given, replaces the start by weighted back-projection. ``twist_vehicle`` (J, 6) is how the vehicle
     moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
-    is held near zero by ``clock_sigma_s``. ``control``, if given, ties corners to a survey: the only thing
-    that can tell a shift of the whole map from the drift of the receiver. ``lengths``, if given, are known
-    distances between corners. ``camera_prior``, if given, is what markings outside this problem say of the
+    is held near zero by ``clock_sigma_s``. ``read_out_s`` (C,) are the cameras' read-out times as stated,
+    None for global shutters; estimated ones are held near them by ``read_out_sigma_s``. ``control``, if
+    given, ties corners to a survey: the only thing that can tell a shift of the whole map from the drift of
+    the receiver. ``lengths``, if given, are known distances between corners. ``camera_prior``, if given, is
+    what markings outside this problem say of the
     cameras. ``visit`` (J,), if given, numbers the visit that each frame is of, from 0 and rising; there is
     then one ``pose_sigma`` for all visits or one for each.
 
@@ -175,6 +196,8 @@ class Problem:
     corners_start: FloatArray | None = None
     twist_vehicle: FloatArray | None = None
     clock_sigma_s: float = 0.01
+    read_out_s: FloatArray | None = None
+    read_out_sigma_s: float = READ_OUT_SIGMA_S
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
     camera_prior: CameraPrior | None = None
@@ -206,6 +229,7 @@ class SolveOptions:
     Attributes:
         pose_states: the states each frame is given, of :data:`POSE_STATES`; () is the paper's model.
         clock_offset: whether each camera's clock offset, one a visit, is estimated.
+        read_out: whether each camera's read-out time is estimated.
         loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
         loss_scale: residual, in standard deviations, from which the loss departs from least squares.
         gate_probability: share of sound observations that the verdict on outliers may cost.
@@ -223,6 +247,7 @@ class SolveOptions:
 
     pose_states: tuple[str, ...] = POSE_STATES
     clock_offset: bool = False
+    read_out: bool = False
     loss: str = "cauchy"
     loss_scale: float = 2.0
     gate_probability: float = 1e-4

@@ -103,24 +103,25 @@ class Coupled:
 class Spread:
     """How pairs move with what they belong to: derivatives of their left tangents.
 
-    ``state`` (C, J, 6, S) by the states of the frame; ``clock`` (C, J, 6, Q) by the camera's clock offset. By
+    ``state`` (C, M, 6, S) by the states of the frame; ``clock`` (C, M, 6, Q) by the camera's clock offset. By
     the camera's extrinsic it is the identity.
     """
 
+    arrays: Arrays
     state: Tensor
     clock: Tensor
 
     @property
     def camera(self) -> Tensor:
-        """(C, J, 6, 6 + Q): by all unknowns of the camera."""
+        """(C, M, 6, 6 + Q): by all unknowns of the camera."""
         identity = torch.eye(6, dtype=self.clock.dtype, device=self.clock.device)
         return torch.cat([identity.expand(*self.clock.shape[:2], 6, 6), self.clock], dim=-1)
 
     def gather(self, by_pair: Tensor) -> Coupled:
-        """A gradient (C, J, 6) by the pairs' tangents as one by the unknowns that they move with."""
-        by_state, by_camera = by_pair.new_zeros(by_pair.shape[1], 0), by_pair.sum(1)
+        """A gradient (C, M, 6) by the pairs' tangents as one by the unknowns that they move with."""
+        by_state, by_camera = by_pair.new_zeros(self.arrays.frame_count, 0), by_pair.sum(1)
         if self.state.shape[-1]:
-            by_state = (self.state.mT @ by_pair[..., None])[..., 0].sum(0)
+            by_state = self.arrays.over_moments((self.state.mT @ by_pair[..., None])[..., 0].sum(0))
         if self.clock.shape[-1]:
             by_clock = (self.clock.mT @ by_pair[..., None])[..., 0].sum(1)
             by_camera = torch.cat([by_camera, by_clock], dim=1)
@@ -132,11 +133,11 @@ class Spread:
 
     def by_camera(self, run: Run, coupling: Tensor) -> Tensor:
         """W' (n, 2, C (6 + Q)) of a run's corners by the cameras' unknowns."""
-        cameras, frames, _, clocks = self.clock.shape
+        cameras, _, _, clocks = self.clock.shape
         if clocks:
             coupling = torch.cat([coupling, coupling @ self.clock.flatten(0, 1)[run.pair]], dim=2)
         out = coupling.new_zeros(run.corner_count * cameras, *coupling.shape[1:])
-        out.index_add_(0, run.corner * cameras + run.pair // frames, coupling)
+        out.index_add_(0, run.corner * cameras + self.arrays.camera_of(run.pair), coupling)
         return out.view(run.corner_count, cameras, 2, -1).transpose(1, 2).flatten(2)
 
 
@@ -169,7 +170,7 @@ class ReducedSystem:
         self._diagonal = arrays.centre.new_zeros(plan.tile_count * plan.size)
 
     def add(self, own: Tensor, cameras: Tensor) -> None:
-        """Add U of all observations, (C, J or 1, 6, 6), and subtract the cameras' B' B."""
+        """Add U of all observations, (C, M or 1, 6, 6), and subtract the cameras' B' B."""
         self._own = own
         self.matrix.tiles[TIP, TIP].sub_(cameras)
 
@@ -185,7 +186,7 @@ class ReducedSystem:
         plan, axes = self.plan, torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
         rows = self._kept_rows(run.corner)[:, None] + axes
-        columns = self._frame_rows(run.pair % self.arrays.frame_count)
+        columns = self._frame_rows(self.arrays.frame_of(run.pair))
         self._scatter(rows[:, :, None], columns[:, None, :], by_state)
         first, second = self._kept_rows(index)[..., None] + axes
         self._scatter(first[:, :, None], second[:, None, :], blocks)
@@ -249,8 +250,8 @@ class ReducedSystem:
         if not arrays.states:
             return
         by_state = self._own @ spread.state
-        by_frame = (spread.state.mT @ by_state).sum(0) + priors.frame
-        border = (by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2)
+        by_frame = arrays.over_moments((spread.state.mT @ by_state).sum(0)) + priors.frame
+        border = arrays.over_moments((by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2))
         for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):
             self.matrix.tiles[TIP, column].add_(part.mT)
         rows = self._frame_rows(torch.arange(arrays.frame_count, device=border.device))
@@ -267,8 +268,8 @@ class ReducedSystem:
 def reduced_coupling(plan: Plan, spread: Spread, run: Run, coupling: Tensor) -> Tensor:
     """W (D, 2 n) of a run's n corners by all reduced unknowns, from W' by observation (k, 2, 6)."""
     by_state = spread.by_state(run, coupling)
-    frames = spread.state.shape[1]
-    by_frame = coupling.new_zeros(frames, by_state.shape[2], run.corner_count, 2)
-    by_frame.permute(0, 2, 3, 1).index_put_((run.pair % frames, run.corner), by_state, accumulate=True)
+    frame = spread.arrays.frame_of(run.pair)
+    by_frame = coupling.new_zeros(spread.arrays.frame_count, by_state.shape[2], run.corner_count, 2)
+    by_frame.permute(0, 2, 3, 1).index_put_((frame, run.corner), by_state, accumulate=True)
     by_camera = spread.by_camera(run, coupling)
     return torch.cat([to_tiles(plan, by_frame.flatten(2)), by_camera.permute(2, 0, 1).flatten(1)])

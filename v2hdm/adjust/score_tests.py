@@ -224,7 +224,7 @@ class _Bench:
     @property
     def camera(self) -> Tensor:
         """The camera (K,) of each observation."""
-        return (self.arrays.pair // self.arrays.frame_count).long()
+        return self.arrays.camera_of(self.arrays.pair).long()
 
     def whiten(self, off: Tensor) -> Tensor:
         """Weighted residuals (2, K) of points that are off (2, K) at depth 1."""
@@ -279,7 +279,7 @@ class _Bench:
         for name, row in one.items():
             product = row * other[name]
             if name == "observations":
-                frame = self.arrays.pair.long() % self.arrays.frame_count
+                frame = self.arrays.frame_of(self.arrays.pair).long()
                 out.index_add_(0, self.stretch[frame], product.sum(0))
             elif name == "frame_states":
                 out.index_add_(0, self.stretch, product.sum(1))
@@ -533,7 +533,8 @@ def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], Rows]:
 
     def column(bench: _Bench) -> Rows:
         engine, estimate = bench.whitening.engine, bench.whitening.estimate
-        extrinsic, tangent = estimate.cam_from_vehicle[:, None], motion(bench.arrays) * _STEP
+        extrinsic = estimate.cam_from_vehicle[:, None]
+        tangent = bench.arrays.at_moments(motion(bench.arrays), axis=1) * _STEP
         poses = engine.poses(estimate)
         high, low = (
             engine.residuals(

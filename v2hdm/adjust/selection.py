@@ -47,13 +47,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     part = replace(
         problem,
         map_from_vehicle=problem.map_from_vehicle[used],
-        observations=Observations(
-            camera=seen.camera[keep],
-            frame=frame - used.start,
-            corner=corner.astype(np.int64),
-            pinhole_px=seen.pinhole_px[keep],
-            covariance_px=seen.covariance_px[keep],
-        ),
+        observations=replace(seen.take(keep), frame=frame - used.start, corner=corner.astype(np.int64)),
         corner_count=len(corners),
         corners_start=None if start is None else start[corners],
         twist_vehicle=None if twist is None else twist[used],
@@ -177,6 +171,8 @@ def predicted_squared(
     vehicle_from_map = np.linalg.inv(solution.map_from_vehicle)[frame - first]
     if fitted.twist_vehicle is not None:
         late_s = solution.clock_offset_s[camera, fitted.visit_of_frame[frame - first]]
+        if seen.row_share is not None:
+            late_s = late_s + solution.read_out_s[camera] * seen.row_share[held_out]
         moved = fitted.twist_vehicle[frame - first] * late_s[:, None]
         vehicle_from_map = exp(torch.as_tensor(-moved)).numpy() @ vehicle_from_map
     cam_from_map = solution.cam_from_vehicle[camera] @ vehicle_from_map

@@ -60,6 +60,8 @@ class Solution:
         loss, loss_scale: the robust loss, as in :class:`v2hdm.adjust.SolveOptions`.
         clock_offset_s: (C, V) how much later than stated each camera's images of each visit were taken; 0
             where that is not estimated.
+        read_out_s: (C,) the time from the first row of each camera's images to the last; as stated where that
+            is not estimated.
         cost_terms: the parts of the cost by name; they add up to :attr:`cost`.
         evaluations: of cost and gradient, all stages together.
         gap: predicted decrease still possible, as a fraction of the cost (the certificate).
@@ -80,6 +82,7 @@ class Solution:
     loss: str
     loss_scale: float
     clock_offset_s: FloatArray
+    read_out_s: FloatArray
     cost_terms: Mapping[str, float]
     evaluations: int
     gap: float

@@ -54,7 +54,8 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
     """Solve what has been checked."""
     origin_map = nearby_origin(problem)
     near = shifted(problem, -origin_map)
-    arrays = make_arrays(near, tuple(options.pose_states), options.device, options.clock_offset)
+    states, estimated = tuple(options.pose_states), (options.clock_offset, options.read_out)
+    arrays = make_arrays(near, states, options.device, *estimated)
     engine, robust = make_engine(options.engine, arrays), Loss(options.loss, options.loss_scale)
     start, opening, spent = _start(near, engine, robust, options)
     del near
@@ -140,6 +141,9 @@ def _report(
     corners_map = np.empty(estimate.corners_map.shape)
     corners_map[arrays.corner_order.cpu().numpy()] = estimate.corners_map.cpu().numpy()
     map_from_vehicle, clock_s = problem.map_from_vehicle.copy(), estimate.clock_s.cpu().numpy()
+    read_out_s = np.zeros(len(clock_s)) if problem.read_out_s is None else problem.read_out_s
+    if options.read_out:
+        clock_s, read_out_s = clock_s[:, :-1], read_out_s + clock_s[:, -1]
     if arrays.states:
         off = exp(frame_tangent(arrays, estimate.frame_state))
         recorded = torch.as_tensor(map_from_vehicle, dtype=off.dtype, device=off.device)
@@ -155,6 +159,7 @@ def _report(
         loss=options.loss,
         loss_scale=options.loss_scale,
         clock_offset_s=clock_s if clock_s.size else np.zeros((len(clock_s), problem.visit_count)),
+        read_out_s=read_out_s,
         cost_terms=cost_terms,
         evaluations=descent.evaluations + spent,
         gap=descent.gap,

@@ -74,16 +74,21 @@ def _papers_model(arrays: Arrays) -> Arrays:
     """The problem of some corners and the frames that saw them, no states and no clocks."""
     if arrays.corner_count > _CORNERS:
         arrays, _ = arrays.take(_route_blocks(arrays))
-    frames, frame = torch.unique(arrays.pair % arrays.frame_count, return_inverse=True)
-    camera, frames = arrays.pair // arrays.frame_count, frames.long()
+    # Without states a moment is a frame of its own.
+    moments, moment = torch.unique(arrays.pair % arrays.moment_count, return_inverse=True)
+    camera, moments = arrays.camera_of(arrays.pair), moments.long()
+    frames = arrays.frame_of(moments)
     return replace(
         arrays,
-        pair=camera * len(frames) + frame.to(camera.dtype),
+        pair=camera * len(moments) + moment.to(camera.dtype),
         vehicle_from_map=arrays.vehicle_from_map[frames],
         states=(),
         state_transition=arrays.state_transition[frames, :0, :0],
         state_information_root=arrays.state_information_root[frames, :0],
-        clock_twist=arrays.clock_twist[frames, :, :0],
+        clock_twist=arrays.clock_twist[moments, :, :0],
+        clock_information_root=arrays.clock_information_root[:0],
+        frame_of_moment=None,
+        read_out=None if arrays.read_out is None else arrays.read_out[:, moments],
     )
 
 
@@ -100,7 +105,7 @@ def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
     """The problem of the corners that ``keep`` leaves at least two observations, if these are enough."""
     sightings = torch.bincount(arrays.corner[keep], minlength=arrays.corner_count)
     keep = keep & (sightings >= 2)[arrays.corner]
-    camera = arrays.pair[keep] // arrays.frame_count
+    camera = arrays.camera_of(arrays.pair[keep])
     if int(torch.bincount(camera, minlength=arrays.camera_count).min()) < _MIN_OBSERVATIONS:
         return None
     part, _ = arrays.take(keep)

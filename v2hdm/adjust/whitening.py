@@ -85,7 +85,7 @@ class Whitening:
     def step(self, whitened: Tensor) -> tuple[Gradient, Tensor, Tensor]:
         """The step x that whitened variables stand for, but for its corners.
 
-        Returns it, the pairs' left tangents (C, J, 6) under it, and the whitened variables (N, 2) of the
+        Returns it, the pairs' left tangents (C, M, 6) under it, and the whitened variables (N, 2) of the
         corners, of kept ones the step itself.
         """
         arrays = self.engine.arrays
@@ -94,9 +94,9 @@ class Whitening:
         states, kept = from_tiles(self.plan, solved[:-tip], arrays.frame_count, len(arrays.states))
         by_camera = solved[-tip:].reshape(arrays.camera_count, -1)
         extrinsics, clock = by_camera[:, :6], by_camera[:, 6:]
-        motion = extrinsics[:, None].expand(-1, arrays.frame_count, -1)
+        motion = extrinsics[:, None].expand(-1, arrays.moment_count, -1)
         if arrays.states:
-            motion = motion + (self.spread.state @ states[None, ..., None])[..., 0]
+            motion = motion + (self.spread.state @ arrays.at_moments(states)[None, ..., None])[..., 0]
         if clock.shape[-1]:
             motion = motion + (self.spread.clock @ clock[:, None, :, None])[..., 0]
         own = whitened[self.reduced_factor.size :].reshape(-1, 2)

@@ -80,16 +80,28 @@ def ground_points_with_jacobian(
     return points, jacobian
 
 
-def _ipms(rig: Rig, camera: IntArray, frame: IntArray) -> FloatArray:
-    """The IPMs (N, 3, 3), map from pinhole pixels, of cameras (N,) at frames (N,)."""
-    return ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
+def _on_ground(
+    rig: Rig, camera: IntArray, frame: IntArray, pinhole_px: FloatArray, row_share: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """:func:`ground_points_with_jacobian` of pixels (N, K, 2) of cameras (N,) at frames (N,).
+
+    Where shutters roll, each by the pose at which its row (N, K) was read.
+    """
+    if rig.read_out_s is None:
+        ipms = ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
+        return ground_points_with_jacobian(ipms, pinhole_px)
+    camera, frame = (np.broadcast_to(one[:, None], row_share.shape).ravel() for one in (camera, frame))
+    cam_from_map = rig.cam_from_map(camera, frame, row_share.ravel())
+    ipms = ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
+    points, jacobian = ground_points_with_jacobian(ipms, pinhole_px.reshape(-1, 1, 2))
+    return points.reshape(pinhole_px.shape), jacobian.reshape(*pinhole_px.shape, 2)
 
 
 def locate(sightings: Sightings, rig: Rig) -> Located:
     """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
     camera, frame = sightings.camera, sightings.frame
-    ipms = _ipms(rig, camera, frame)
-    corners_map, jacobian = ground_points_with_jacobian(ipms, sightings.corners_pinhole_px)
+    seen = sightings.corners_pinhole_px, sightings.row_share
+    corners_map, jacobian = _on_ground(rig, camera, frame, *seen)
     covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
     centre_vehicle = camera_centre(rig.cam_from_vehicle)[camera]
     poses = rig.map_from_vehicle[frame]
@@ -143,8 +155,9 @@ def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
     length = [len(outline) for outline in symbols.outlines_pinhole_px]
     of_point = np.repeat(np.arange(len(length)), length)
     points_px = np.concatenate(symbols.outlines_pinhole_px)
-    ipms = _ipms(rig, symbols.camera, symbols.frame)[of_point]
-    ground, by_px = (one[:, 0] for one in ground_points_with_jacobian(ipms, points_px[:, None]))
+    seen = points_px[:, None], np.concatenate(symbols.row_shares)[:, None]
+    found = _on_ground(rig, symbols.camera[of_point], symbols.frame[of_point], *seen)
+    ground, by_px = (one[:, 0] for one in found)
     sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px, axis=(1, 2))
     ends = np.cumsum(length)[:-1]
     return [

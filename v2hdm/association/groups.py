@@ -312,13 +312,17 @@ def squared_distances(
 ) -> FloatArray:
     """Squared distances (P, 4), in sigmas, of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
     camera = sightings.camera[row]
-    cam_from_map = rig.cam_from_map(camera, sightings.frame[row])
-    expected, depth_m = project_ground(rig.intrinsic[camera], cam_from_map, corners_map)
+    # By the pose at which the row of each seen corner was read, where shutters roll.
+    rows = sightings.row_share[row] if rig.read_out_s is not None else np.zeros((len(row), 1))
+    cam_from_map = rig.cam_from_map(camera[:, None], sightings.frame[row][:, None], rows)
+    expected, depth_m = project_ground(rig.intrinsic[camera][:, None], cam_from_map, corners_map[:, None])
+    own = SHIFTS if rig.read_out_s is not None else np.zeros_like(SHIFTS)
+    expected, depth_m = expected[:, own, np.arange(4)], depth_m[:, own, np.arange(4)]
     jitter_px = rig.intrinsic[camera, 0, 0] * jitter_rad
     noise = sightings.covariance_px[row] + jitter_px[:, None, None, None] ** 2 * np.eye(2)
     used = located.informs[row]
     information = np.linalg.inv(np.where(used[..., None, None], noise, np.eye(2)))[:, SHIFTS]
-    off = np.where(used[..., None], sightings.corners_pinhole_px[row], 0.0)[:, SHIFTS] - expected[:, None]
+    off = np.where(used[..., None], sightings.corners_pinhole_px[row], 0.0)[:, SHIFTS] - expected
     each = np.einsum("psci,pscij,pscj->psc", off, information, off)
-    each = np.where(depth_m[:, None] > 0, each, np.inf)
+    each = np.where(depth_m > 0, each, np.inf)
     return np.asarray(np.where(used[:, SHIFTS], each, 0.0).sum(axis=2))

@@ -9,7 +9,7 @@ import numpy as np
 
 from v2hdm.errors import MappingError
 from v2hdm.geometry.lens import has_distortion, undistort_points
-from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
 
 LEAST_HEIGHT_M = 0.1
@@ -20,16 +20,26 @@ LEAST_HEIGHT_M = 0.1
 class Rig:
     """Cameras and frames as the mapping currently believes them to be.
 
-    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4).
+    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4). Where a camera's
+    shutter rolls, ``read_out_s`` (C,) are the cameras' read-out times and ``twist_vehicle`` (F, 6) how the
+    vehicle moves, m/s and rad/s in its own frame; else None.
     """
 
     intrinsic: FloatArray
     cam_from_vehicle: FloatArray
     map_from_vehicle: FloatArray
+    read_out_s: FloatArray | None = None
+    twist_vehicle: FloatArray | None = None
 
-    def cam_from_map(self, camera: IntArray, frame: IntArray) -> FloatArray:
-        """The poses (N, 4, 4) of cameras (N,) at frames (N,)."""
-        return np.asarray(self.cam_from_vehicle[camera] @ np.linalg.inv(self.map_from_vehicle[frame]))
+    def cam_from_map(
+        self, camera: IntArray, frame: IntArray, row_share: FloatArray | None = None
+    ) -> FloatArray:
+        """The poses (..., 4, 4) of cameras (...) at frames (...), when rows ``row_share`` (...) are read."""
+        cam_from_vehicle, poses = self.cam_from_vehicle[camera], self.map_from_vehicle[frame]
+        if row_share is not None and self.read_out_s is not None and self.twist_vehicle is not None:
+            late_s = self.read_out_s[camera] * np.nan_to_num(row_share)
+            poses = poses @ exp(self.twist_vehicle[frame] * late_s[..., None])
+        return np.asarray(cam_from_vehicle @ np.linalg.inv(poses))
 
     @property
     def height_m(self) -> FloatArray:
@@ -37,17 +47,26 @@ class Rig:
         return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], LEAST_HEIGHT_M))
 
 
+def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
+    """When in the read-out the rows of points (..., 2) were taken: -1/2 for the first to 1/2 for the last."""
+    return np.asarray(np.clip(points_px[..., 1] / max(info.height - 1, 1), 0.0, 1.0) - 0.5)
+
+
 @dataclass(frozen=True)
 class Symbols:
-    """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes."""
+    """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes.
+
+    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them.
+    """
 
     camera: IntArray
     frame: IntArray
     outlines_pinhole_px: tuple[FloatArray, ...]
     kinds: tuple[str, ...]
+    row_shares: tuple[FloatArray, ...]
 
 
-NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), ())
+NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), ())
 
 
 def collect_symbols(
@@ -71,6 +90,7 @@ def collect_symbols(
             undistort_points(drive.cameras[name].info, marking.outline_px) for _, name, marking in rows
         ),
         kinds=tuple(marking.kind for _, _, marking in rows),
+        row_shares=tuple(row_shares(drive.cameras[name].info, one.outline_px) for _, name, one in rows),
     )
 
 
@@ -82,7 +102,8 @@ class Sightings:
     F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
     images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
-    says which of them are points, small in every direction. ``symbols`` are those of the same images.
+    says which of them are points, small in every direction. ``row_share`` (S, 4) is when in the read-out
+    their rows were taken (:func:`row_shares`). ``symbols`` are those of the same images.
     ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
     """
 
@@ -98,6 +119,7 @@ class Sightings:
     valid: BoolArray
     kinds: tuple[str, ...]
     visit: IntArray
+    row_share: FloatArray
     symbols: Symbols = NO_SYMBOLS
 
     def __len__(self) -> int:
@@ -111,7 +133,8 @@ class Sightings:
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
-        of_rows = ("image", "camera", "frame", "kind", "corners_pinhole_px", "covariance_px", "valid")
+        of_rows = ["image", "camera", "frame", "kind"]
+        of_rows += ["corners_pinhole_px", "covariance_px", "valid", "row_share"]
         return replace(self, **{name: getattr(self, name)[rows] for name in of_rows})
 
 
@@ -166,8 +189,10 @@ def collect_sightings(
     corners = np.stack([marking.corners_px for _, marking in rows]).astype(np.float64)
     covariance = np.stack([marking.covariance_px for _, marking in rows]).astype(np.float64)
     covariance = np.stack([covariance[:, c : c + 2, c : c + 2] for c in (0, 2, 4, 6)], axis=1)
+    row_share = np.zeros(corners.shape[:2])
     for c, info in enumerate(infos):
         own = camera == c
+        row_share[own] = row_shares(info, corners[own])
         corners[own], covariance[own] = _undistort(info, corners[own], covariance[own])
     valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
     valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
@@ -184,6 +209,7 @@ def collect_sightings(
         valid=valid,
         kinds=kinds,
         visit=frames.visit,
+        row_share=row_share,
         symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)

@@ -5,7 +5,7 @@ One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -49,6 +49,12 @@ def vehicle_twists(
     moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
     elapsed_s = stamp_s[after] - stamp_s[before]
     return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
+
+
+def read_outs_s(cameras: Iterable[Camera]) -> FloatArray | None:
+    """The cameras' read-out times (C,) as stated, s; None where all shutters are global."""
+    stated_s = np.array([camera.read_out_s for camera in cameras])
+    return stated_s if stated_s.any() else None
 
 
 _UNSURVEYED_CENTRE_SIGMA_M = 0.3
@@ -158,7 +164,8 @@ def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOpti
 
 
 def _solver(options: MappingOptions) -> SolveOptions:
-    return SolveOptions(loss=options.loss, loss_scale=options.loss_scale, device=options.device)
+    robust, read_out = (options.loss, options.loss_scale), options.estimate_read_out
+    return SolveOptions(loss=robust[0], loss_scale=robust[1], read_out=read_out, device=options.device)
 
 
 def solve_bundle(
@@ -198,6 +205,7 @@ def solve_bundle(
         corner=corner_index[group, corner],
         pinhole_px=sightings.corners_pinhole_px[row, own_corner],
         covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
+        row_share=sightings.row_share[row, own_corner],
     )
     names = [sightings.cameras[c] for c in used.cameras]
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
@@ -207,10 +215,12 @@ def solve_bundle(
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
     cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
     map_from_vehicle[used.frames] = solution.map_from_vehicle
-    adjusted, index = (
-        Rig(rig.intrinsic, cam_from_vehicle, map_from_vehicle),
-        {n: c for c, n in enumerate(names)},
-    )
+    adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
+    if rig.read_out_s is not None:
+        read_out_s = rig.read_out_s.copy()
+        read_out_s[used.cameras] = solution.read_out_s
+        adjusted = replace(adjusted, read_out_s=read_out_s)
+    index = {n: c for c, n in enumerate(names)}
     return Bundle(adjusted, model, problem, solution, association, row, group, corner, corner_index, index)
 
 
@@ -253,6 +263,7 @@ def _problem(
         twist_vehicle=twists[used.frames],
         visit=sightings.visit[used.frames],
         clock_sigma_s=model.clock_sigma_s,
+        read_out_s=read_outs_s(cameras),
     )
 
 
@@ -260,7 +271,7 @@ def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera],
     """All cameras and frames of a drive and their priors, without any observation."""
     none = np.zeros(0, dtype=np.int64)
     used = _Used(np.arange(len(sightings.cameras)), none, np.arange(len(sightings.map_from_vehicle)), none)
-    nothing = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    nothing = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
     return _problem(sightings, rig, used, [cameras[name] for name in sightings.cameras], nothing, model)
 
 

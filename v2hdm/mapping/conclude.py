@@ -162,8 +162,10 @@ def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad:
     fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
     camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
     points = fused.corners_map[bundle.group, bundle.corner]
-    pixel, _ = project_ground(rig.intrinsic[camera], rig.cam_from_map(camera, frame), points[:, None])
-    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[bundle.row, bundle.own_corner])
+    own = bundle.row, bundle.own_corner
+    cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
+    pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
+    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[own])
 
 
 def _root_mean_square(residual_px: FloatArray) -> float:

@@ -141,8 +141,12 @@ class IncrementalMapper:
         self._rig, self._known = rig, known
         # Only the IPM that the first map starts from may be far off, and all that is located by it.
         self._coarse = rig is self._first_rig
+        read_out_s = None if rig.read_out_s is None else np.maximum(rig.read_out_s, 0.0)
         drive = replace(
-            self._drive, cam_from_vehicle=rig.cam_from_vehicle, map_from_vehicle=rig.map_from_vehicle
+            self._drive,
+            cam_from_vehicle=rig.cam_from_vehicle,
+            map_from_vehicle=rig.map_from_vehicle,
+            read_out_s=read_out_s,
         )
         self.grown = IncrementalMap(drive, replace(self._model.solver, coarse=self._coarse))
         self._places: list[_Place] = []
@@ -245,6 +249,7 @@ class IncrementalMapper:
             pinhole_px=sightings.corners_pinhole_px[row, own],
             covariance_px=model.variance_factor
             * (sightings.covariance_px[row, own] + model.floor_px**2 * np.eye(2)),
+            row_share=sightings.row_share[row, own],
         )
         corners = np.full((4, 2), np.nan)
         try:
@@ -288,4 +293,4 @@ class IncrementalMapper:
 
     def _present_rig(self) -> Rig:
         """The extrinsics, and the poses as they were last solved for."""
-        return Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, self._rig.map_from_vehicle)
+        return replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)

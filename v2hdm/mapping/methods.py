@@ -225,9 +225,10 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
     """The naive strategy under one IPM per camera, for instance that of a known extrinsic."""
     begin_s = time.perf_counter()
     drive, sightings = inputs.drive, inputs.sightings
-    markings, excluded = _naive_markings(inputs, ipm)
     extrinsic = {c: extrinsic_from_ipm(drive.cameras[c].info, matrix) for c, matrix in ipm.items()}
-    lanes = _lanes(inputs, ground_by_ipm(drive, ipm, extrinsic))
+    ground = ground_by_ipm(drive, ipm, extrinsic, inputs.optimiser.initial_rig)
+    markings, excluded = _naive_markings(inputs, ipm, ground)
+    lanes = _lanes(inputs, ground)
     return MethodResult(
         name=name,
         cameras=sightings.cameras,
@@ -237,7 +238,9 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
     )
 
 
-def _naive_markings(inputs: Inputs, ipm: Mapping[str, FloatArray]) -> tuple[list[Marking], list[Exclusion]]:
+def _naive_markings(
+    inputs: Inputs, ipm: Mapping[str, FloatArray], ground: ImageGround
+) -> tuple[list[Marking], list[Exclusion]]:
     """The naive strategy: back-project by an IPM within its region of interest, and average.
 
     It is the paper's baseline. Recorded poses are taken at their word; only sightings with four valid corners
@@ -253,6 +256,7 @@ def _naive_markings(inputs: Inputs, ipm: Mapping[str, FloatArray]) -> tuple[list
     corners_vehicle = ground_points(homographies, sightings.corners_pinhole_px)
     to_map = flat_motion(sightings.map_from_vehicle[sightings.frame]) @ homographies
     corners_map = ground_points(to_map, sightings.corners_pinhole_px)
+    corners_map = ground.at_rows(corners_map, sightings.image[:, None], sightings.row_share)
     usable = (inputs.tracks.group >= 0) & sightings.valid.all(axis=1)
     for c, roi in enumerate(rois):
         own = sightings.camera == c

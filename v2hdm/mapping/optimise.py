@@ -9,7 +9,7 @@ is solved together, and again without the observations that contradict the rest.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,9 @@ from v2hdm.mapping.bundle import (
     coarse_model,
     full_model,
     pose_sigma_of,
+    read_outs_s,
     solve_bundle,
+    vehicle_twists,
 )
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
@@ -78,7 +80,8 @@ class Optimiser:
         self.held_out: Mapping[str, float] = {}
         self.growth: tuple[tuple[Marking, ...], ...] = ()
         self.camera_names = sightings.cameras
-        self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
+        start = initial_rig(self._cameras, sightings.map_from_vehicle)
+        self.initial_rig = rolling(start, self._cameras.values(), sightings, options.estimate_read_out)
 
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
@@ -293,3 +296,13 @@ def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> 
     ipm = np.stack([camera.ipm[camera.initial_ipm] for camera in cameras.values()])
     start = extrinsic_from_ipm(torch.tensor(intrinsic), torch.tensor(ipm)).numpy()
     return Rig(intrinsic, start, map_from_vehicle)
+
+
+def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate: bool) -> Rig:
+    """``rig`` with its cameras' read-out times; as it is where all are 0 and none is to be estimated."""
+    stated_s = read_outs_s(cameras)
+    if stated_s is None and not estimate:
+        return rig
+    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
+    read_out_s = np.zeros(len(rig.intrinsic)) if stated_s is None else stated_s
+    return replace(rig, read_out_s=read_out_s, twist_vehicle=twists)

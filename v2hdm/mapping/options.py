@@ -118,6 +118,8 @@ class MappingOptions:
     ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
     clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
     ``loss_scale`` are the robust loss of the solver.
+    ``estimate_read_out`` estimates each camera's read-out time (rolling shutter), near the one that the drive
+    states.
     ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
     and in the end solved as ``batch`` does.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
@@ -128,6 +130,7 @@ class MappingOptions:
     model_floor_px: float = 0.15
     mode: str = BATCH
     pose_model: str = AUTO
+    estimate_read_out: bool = False
     loss: str = "cauchy"
     loss_scale: float = 2.0
     rounds: int = 2

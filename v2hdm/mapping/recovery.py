@@ -253,6 +253,7 @@ def _evidence(
         worst_innovation=float(largest.max()),
         worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
         clock_s=_clocks(final),
+        read_out_s=_read_outs(final),
         # Noise of a coordinate is a mean of both: along the way alone its variance is twice as large.
         jitter_s=math.sqrt(2) * stated_m * optimiser.pose_noise.get("position_m", 0.0) / max(speed_mps, 0.1),
         along_over_across=innovations.along_over_across,
@@ -293,9 +294,16 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     offset_s = bundle.solution.clock_offset_s.T.tolist()
     if not bundle.model.solver.clock_offset:
         return tuple({} for _ in offset_s)
-    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()
+    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()[: len(offset_s)]
     index, visits = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
     return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in visits)
+
+
+def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
+    if not bundle.model.solver.read_out:
+        return {}
+    read_out_s, sigma_s = bundle.solution.read_out_s, np.sqrt(bundle.solution.covariance.clock_s2()[:, -1])
+    return {name: (float(read_out_s[c]), float(sigma_s[c])) for name, c in bundle.camera_index.items()}
 
 
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:

@@ -79,6 +79,7 @@ class SolveEvidence:
         worst_innovation: the largest of them all, in sigmas.
         worst_innovation_s: when, s.
         clock_s: by visit and camera the estimated clock offset and sigma, where the pose model has one.
+        read_out_s: by camera the read-out time and its sigma, where it is estimated.
         jitter_s: by how much stamps would scatter, s, were all noise of the positions from them.
         along_over_across: how many times as much positions err anew along the way as across it.
     """
@@ -95,6 +96,7 @@ class SolveEvidence:
     worst_innovation: float
     worst_innovation_s: float
     clock_s: Sequence[Mapping[str, tuple[float, float]]] = ({},)
+    read_out_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     jitter_s: float = 0.0
     along_over_across: float = 1.0
 

@@ -123,6 +123,9 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
             found: dict[str, Any] = extrinsic_figures(calibration.cam_from_vehicle, initial, true)
             found["certainty"] = optimised.certainty.get(name, "")
             found |= _clocks(drive, optimised, name)
+            if optimised.evidence is not None and name in optimised.evidence.read_out_s:
+                read_out = optimised.evidence.read_out_s[name]
+                found |= dict(zip(("read_out_s", "read_out_sigma_s"), read_out, strict=True))
             if calibration.covariance is not None:
                 sigma = np.sqrt(np.diag(calibration.covariance))
                 found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))

@@ -218,7 +218,9 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: 
         clock = None if drive.joined else best.clocks[0].get(name)
         clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
         path = folder / f"calibration_{name}.yaml"
-        write_calibration(calibration, path, clock_s=clock_s, verdict=verdict, about=about)
+        read_out_s = None if best.evidence is None else best.evidence.read_out_s.get(name)
+        noted: dict[str, Any] = {"clock_s": clock_s, "read_out_s": read_out_s, "verdict": verdict}
+        write_calibration(calibration, path, about=about, **noted)
         for form in CALIBRATION_FORMATS:  # of other tools, into a folder named like the file
             try:
                 write_calibration_as(form, calibration, about, path.with_suffix(""), calibration.info.name)

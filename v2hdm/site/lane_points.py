@@ -8,13 +8,13 @@ a parallel line take no part. The rest is thinned to single nodes, half a metre 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
-from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of
+from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shares
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
@@ -74,11 +74,14 @@ class LaneCloud:
 class ImageGround:
     """How each image of a drive maps to the ground; nan for images of cameras that are not used.
 
-    ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3).
+    ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3). Where shutters roll,
+    ``moved_map`` (I, 2, 3) takes a point of the ground (x, y, 1) to how far it seems to move with the vehicle
+    during the read-out.
     """
 
     map_from_pinhole_px: FloatArray
     centre_map: FloatArray
+    moved_map: FloatArray | None = None
 
     @classmethod
     def of_images(
@@ -90,26 +93,56 @@ class ImageGround:
         out.map_from_pinhole_px[rows], out.centre_map[rows] = homographies, centre
         return out
 
+    def rolling(
+        self, rows: IntArray, camera: IntArray, frame: IntArray, poses: FloatArray, rig: Rig
+    ) -> ImageGround:
+        """With the images at ``rows`` read row by row, as ``rig`` has it, the vehicle being at ``poses``."""
+        if rig.read_out_s is None or rig.twist_vehicle is None:
+            return self
+        moved = rig.twist_vehicle[frame] * rig.read_out_s[camera, None]
+        out = np.zeros((len(self.centre_map), 2, 3))
+        turn = moved[:, 5, None, None] * np.array([[0.0, -1.0], [1.0, 0.0]])
+        out[rows, :, :2] = turn
+        out[rows, :, 2] = (poses[:, :2, :2] @ moved[:, :2, None] - turn @ poses[:, :2, 3:])[..., 0]
+        return replace(self, moved_map=out)
+
+    def at_rows(self, points_map: FloatArray, image: IntArray, row_share: FloatArray) -> FloatArray:
+        """Points (..., 2) that images (...) show at rows (...), by the poses at which these were read.
+
+        To first order in the motion: the second is under a millimetre.
+        """
+        if self.moved_map is None:
+            return points_map
+        motion = self.moved_map[image]
+        moved = (motion[..., :2] @ points_map[..., None])[..., 0] + motion[..., 2]
+        return np.asarray(points_map + row_share[..., None] * moved)
+
 
 def ground_by_ipm(
-    drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray]
+    drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray], rig: Rig
 ) -> ImageGround:
-    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are."""
+    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are.
+
+    Of ``rig``, over the same cameras, only the read-out times and twists are looked at.
+    """
     rows, camera = _rows(drive, list(ipm))
     poses = np.stack([drive.images[i].map_from_vehicle for i in rows])
     forward = [facing_ipm(ipm[name], drive.cameras[name].roi_vehicle.mean(axis=0)) for name in ipm]
     extrinsic = np.stack([cam_from_vehicle[name] for name in ipm])[camera]
     homographies = flat_motion(poses) @ np.stack(forward)[camera]
-    return ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    ground = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    return ground.rolling(rows, camera, frames_of(drive).frame_of_image[rows], poses, rig)
 
 
 def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround:
     """By optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
     rows, camera = _rows(drive, cameras)
-    poses = rig.map_from_vehicle[frames_of(drive).frame_of_image[rows]]
+    frame = frames_of(drive).frame_of_image[rows]
+    poses = rig.map_from_vehicle[frame]
     extrinsic = rig.cam_from_vehicle[camera]
     homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
-    return ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    ground = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    return ground.rolling(rows, camera, frame, poses, rig)
 
 
 def collect_lane_points(
@@ -128,10 +161,10 @@ def collect_lane_points(
     if not lanes:
         empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
         return LaneCloud(*empty, guides)
-    piece, image, points_px = _points(drive, lanes)
+    piece, image, points_px, row_share = _points(drive, lanes)
     homographies = ground.map_from_pinhole_px[image]
     points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
-    points_map, jacobian = points_map[:, 0], jacobian[:, 0]
+    points_map, jacobian = ground.at_rows(points_map[:, 0], image, row_share), jacobian[:, 0]
     tangent = _tangents(points_map, piece)
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
@@ -163,16 +196,18 @@ def _lanes(
 
 def _points(
     drive: Drive, lanes: Sequence[tuple[int, LaneDetection]]
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Of all points of ``lanes`` their lane (P,), their image (P,) and their pinhole pixels (P, 2)."""
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Of all points of ``lanes`` their lane (P,), image (P,), pinhole pixels (P, 2) and row shares (P,)."""
     of_lane = np.repeat(np.arange(len(lanes)), [len(lane.points_px) for _, lane in lanes])
     image = np.array([i for i, _ in lanes], dtype=np.int64)[of_lane]
     camera = np.array([one.camera for one in drive.images])[image]
     points_px = np.concatenate([lane.points_px for _, lane in lanes]).astype(np.float64)
+    row_share = np.zeros(len(points_px))
     for name in np.unique(camera):
-        own = camera == name
-        points_px[own] = undistort_points(drive.cameras[str(name)].info, points_px[own])
-    return of_lane, image, points_px
+        own, info = camera == name, drive.cameras[str(name)].info
+        row_share[own] = row_shares(info, points_px[own])
+        points_px[own] = undistort_points(info, points_px[own])
+    return of_lane, image, points_px, row_share
 
 
 def _guides(
@@ -182,8 +217,9 @@ def _guides(
     lanes = _lanes(detections, ground, whole=True)
     if not lanes:
         return Guides()
-    line, image, points_px = _points(drive, lanes)
+    line, image, points_px, row_share = _points(drive, lanes)
     points_map = ground_points(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
+    points_map = ground.at_rows(points_map, image, row_share)
     with np.errstate(invalid="ignore"):
         near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
     return Guides(points_map[near], line[near], np.array([i for i, _ in lanes], dtype=np.int64))

@@ -19,7 +19,7 @@ from scipy.stats import norm
 
 from v2hdm.association.ground import Views, easy_views, locate
 from v2hdm.association.groups import near_pairs, squared_distances
-from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
@@ -216,12 +216,16 @@ class Observer:
 
     def _contrast(self, grey: NDArray[np.float32], row: int, corners: FloatArray) -> float:
         """The log ratio of the mean grey values within an outline (4, 2) and beside it."""
-        camera, pose = self.views.camera[row], self.rig.map_from_vehicle[self.views.frame[row]]
-        cam_from_map = self.rig.cam_from_vehicle[camera] @ np.linalg.inv(pose)
+        camera, frame = self.views.camera[row], self.views.frame[row]
+        info, cam_from_map = self.cameras[camera].info, self.rig.cam_from_map(camera, frame)
+        if self.rig.read_out_s is not None:  # the row that shows its middle says when the outline was read
+            seen, _ = project_ground(self.rig.intrinsic[camera], cam_from_map, corners)
+            middle = distort_points(info, seen.mean(axis=0, keepdims=True))
+            cam_from_map = self.rig.cam_from_map(camera, frame, row_shares(info, middle)[0])
         means = []
         for points in _samples(corners):
             pinhole, depth_m = project_ground(self.rig.intrinsic[camera], cam_from_map, points)
-            pixel = distort_points(self.cameras[camera].info, pinhole).astype(np.float32)
+            pixel = distort_points(info, pinhole).astype(np.float32)
             values = cv2.remap(grey, pixel[None, :, 0], pixel[None, :, 1], cv2.INTER_LINEAR, borderValue=-1.0)
             if not (depth_m > 0).all() or not (values >= 0).all():
                 return float("nan")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from tests.benchmarks.made.world import World
+from v2hdm.association.sightings import row_shares
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import apply, camera_centre
 from v2hdm.records import (
@@ -28,6 +31,7 @@ _BORDER_PX = 4.0
 _HIDDEN_PX = 200.0  # sigma of a corner in the direction that the image's border hides
 _NEAR_M = 0.3
 _BISECTIONS = 12
+_TURNS = 5  # from row to pose and back: each leaves a twentieth of the step before
 _TANGENT = 0.98  # share of the way to the border, from which on a side is straight
 _IMAGES = 42  # stream of a seed
 
@@ -65,7 +69,8 @@ def _in_image(
     errors, corners = world.recipe.detector, world.corners_map
     cam_from_map = world.cam_from_vehicle[camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
     lens = world.lenses[camera]
-    seen = project(lens, cam_from_map, corners)
+    pose = partial(world.cam_from_map, camera, frame) if world.read_out_s else cam_from_map
+    seen = project(lens, pose, corners)
     candidates = (seen.distance_m.max(axis=1) < _RANGE_M) & (seen.inside.sum(axis=1) >= 2)
     covered = np.zeros_like(seen.inside)
     covered[candidates] = _covered(world, frame, camera_centre(cam_from_map), corners[candidates])
@@ -82,7 +87,7 @@ def _in_image(
         px, covariance = seen.px[j] + off[j], np.zeros((4, 2, 2))
         covariance[:] = np.square(sigma[j])[:, None, None] * np.eye(2)
         for k in np.flatnonzero(~seen.inside[j]):
-            px[k], covariance[k] = _at_border(lens, cam_from_map, corners[j], seen, j, k, sigma[j, k])
+            px[k], covariance[k] = _at_border(lens, pose, corners[j], seen, j, k, sigma[j, k])
             px[k] += rng.multivariate_normal(np.zeros(2), np.square(sigma[j, k]) * np.eye(2))
         if cut[j]:
             px = _cut(px, float(rng.uniform(0.2, 0.6)))
@@ -90,7 +95,7 @@ def _in_image(
         kind = world.port.hd_map.markings[j].kind
         found.append(_detection(kind, px, covariance, seen.inside[j], lens))
     for _ in range(rng.poisson(errors.false * len(found))):
-        false = _false(world, camera, frame, cam_from_map, rng)
+        false = _false(world, camera, frame, pose, rng)
         if false is not None:
             found.append(false)
     return found, shown
@@ -107,9 +112,27 @@ def _covered(world: World, frame: int, centre_map: FloatArray, corners_map: Floa
     return hidden_by(near, centre_map, corners_map[..., :2].reshape(-1, 2)).reshape(-1, 4)
 
 
-def project(lens: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> Projected:
-    """Points (J, K, 3) as a camera records them."""
-    cam = apply(cam_from_map, points_map.reshape(-1, 3))
+Pose = FloatArray | Callable[[FloatArray], FloatArray]
+"""``cam_from_map`` of all rows (4, 4), or by when in the read-out they are read, -1/2 to 1/2 (N,)."""
+
+
+def project(lens: CameraInfo, cam_from_map: Pose, points_map: FloatArray) -> Projected:
+    """Points (J, K, 3) as a camera records them, each by the pose of its row where rows have their own."""
+    if not callable(cam_from_map):
+        return _project(lens, cam_from_map, points_map)
+    row_share = np.zeros(points_map.shape[0] * points_map.shape[1])
+    seen = _project(lens, cam_from_map(row_share), points_map)
+    for _ in range(_TURNS):
+        known = np.isfinite(seen.px[..., 1].ravel())
+        row_share[known] = row_shares(lens, seen.px.reshape(-1, 2)[known])
+        seen = _project(lens, cam_from_map(row_share), points_map)
+    return seen
+
+
+def _project(lens: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> Projected:
+    """Points (J, K, 3) by one pose (4, 4), or each by its own."""
+    points = points_map.reshape(-1, 3)
+    cam = apply(cam_from_map, points[:, None] if cam_from_map.ndim == 3 else points).reshape(-1, 3)
     depth = cam[:, 2]
     ahead = depth > _NEAR_M
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -120,14 +143,14 @@ def project(lens: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) 
     px = np.full((len(cam), 2), np.nan)
     px[inside] = distort_points(lens, pinhole[inside, :2])
     inside[inside] = ((px[inside] >= 0) & (px[inside] <= size - 1)).all(axis=1)
-    distance = np.linalg.norm(points_map.reshape(-1, 3)[:, :2] - camera_centre(cam_from_map)[:2], axis=1)
+    distance = np.linalg.norm(points[:, :2] - camera_centre(cam_from_map)[..., :2], axis=1)
     shape = points_map.shape[:2]
     return Projected(px.reshape(*shape, 2), inside.reshape(shape), distance.reshape(shape))
 
 
 def _at_border(
     lens: CameraInfo,
-    cam_from_map: FloatArray,
+    cam_from_map: Pose,
     corners: FloatArray,
     seen: Projected,
     j: int,
@@ -177,7 +200,7 @@ def _detection(
 
 
 def _false(
-    world: World, camera: str, frame: int, cam_from_map: FloatArray, rng: np.random.Generator
+    world: World, camera: str, frame: int, cam_from_map: Pose, rng: np.random.Generator
 ) -> MarkingDetection | None:
     """A quadrilateral on bare ground, where the camera's region of interest is."""
     roi = world.cameras[camera].roi_vehicle

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,9 +12,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from tests.benchmarks.made.draw import Recipe
-from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.geometry.rigid import exp, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.drive.road import lay_flat
+from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, Image, PoseNoise, Trajectory, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.route import Route, correlated_noise
@@ -42,6 +43,7 @@ class World:
         stamp_s: (F,) by camera, as its images are stamped.
         recorded: poses.
         pose_noise: as stated.
+        read_out_s: time from the first row of every image to its last.
         elsewhere: another world, and the frames in which its images were put in place of those of this.
     """
 
@@ -56,6 +58,7 @@ class World:
     stamp_s: Mapping[str, FloatArray]
     recorded: Trajectory
     pose_noise: PoseNoise
+    read_out_s: float = 0.0
     elsewhere: tuple[World, range] | None = field(default=None, repr=False)
 
     @cached_property
@@ -67,6 +70,22 @@ class World:
     def second_half(self) -> FloatArray:
         """(F,) whether an image was taken in the second half of the way."""
         return self.station_m > self.station_m.mean()
+
+    @cached_property
+    def twist_vehicle(self) -> FloatArray:
+        """(F, 6) how the vehicle truly moves at the images, m/s and rad/s."""
+        return vehicle_twists(self.map_from_vehicle, self.taken_s)
+
+    def rolling(self, read_out_s: float, stated: bool) -> World:
+        """The same, recorded by rolling shutters, of which the user knows or not."""
+        cameras = {name: replace(one, read_out_s=read_out_s * stated) for name, one in self.cameras.items()}
+        return replace(self, read_out_s=read_out_s, cameras=cameras)
+
+    def cam_from_map(self, camera: str, frame: int, row_share: FloatArray) -> FloatArray:
+        """True poses (N, 4, 4) of a camera when rows of an image, -1/2 to 1/2 (N,), were read."""
+        moved = exp(self.twist_vehicle[frame] * self.read_out_s * row_share[:, None])
+        vehicle_from_map = np.linalg.inv(self.map_from_vehicle[frame] @ moved)
+        return np.asarray(self.cam_from_vehicle[camera][frame] @ vehicle_from_map)
 
     def frame_of(self, image: Image) -> int:
         """Which of the F frames an image of :func:`drive_of` is of."""

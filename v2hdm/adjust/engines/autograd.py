@@ -55,7 +55,7 @@ class TorchEngine(Engine):
         """The tiles that each block of observations touches; none where frames have no states."""
         arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
         blocks = arrays.runs(_BLOCK) if arrays.states else ()
-        return [tuple(torch.unique(run.pair % arrays.frame_count // per_tile).tolist()) for run in blocks]
+        return [tuple(torch.unique(arrays.frame_of(run.pair) // per_tile).tolist()) for run in blocks]
 
     def plan(self) -> Plan:
         """How the reduced system is cut into tiles: all corners are eliminated before the frames."""
@@ -66,7 +66,7 @@ class TorchEngine(Engine):
         return Plan(per_tile, per_tile * len(arrays.states), count, pattern, arrays.corner_order[:0])
 
     def poses(self, estimate: Estimate) -> Tensor:
-        """``cam_from_map`` of every pair, (C, J, 4, 4)."""
+        """``cam_from_map`` of every pair, (C, M, 4, 4)."""
         with torch.no_grad():
             return model.cam_from_map(
                 self.arrays, estimate.cam_from_vehicle, estimate.frame_state, estimate.clock_s
@@ -87,7 +87,7 @@ class TorchEngine(Engine):
         none = torch.tensor([[1.0], [0.0], [1.0]], dtype=points.dtype, device=points.device)
         off = model.corner_residual(points, arrays.measured, none).cpu().numpy()
         squared = self.residuals(poses[None], estimate.corners_map).square().sum(0).cpu().numpy()
-        camera = arrays.pair.cpu().numpy() // arrays.frame_count
+        camera = arrays.camera_of(arrays.pair).cpu().numpy()
         out = np.empty((len(order), 2)), np.empty(len(order)), np.empty(len(order), dtype=np.bool_)
         out[0][order], out[1][order] = off * focal_px[camera], squared
         out[2][order] = (points[:, 2] <= NEAR_M).cpu().numpy()
@@ -169,13 +169,13 @@ class TorchEngine(Engine):
     def spread(self, estimate: Estimate) -> Spread:
         """How pairs move with frame states and clock offsets."""
         arrays = self.arrays
-        shape = (arrays.camera_count, arrays.frame_count)
-        state = leaf(estimate.frame_state.expand(*shape, -1))
+        shape = (arrays.camera_count, arrays.moment_count)
+        state = leaf(arrays.at_moments(estimate.frame_state).expand(*shape, -1))
         clock = leaf(estimate.clock_s[:, None].expand(*shape, -1))
         poses = model.cam_from_map(arrays, estimate.cam_from_vehicle, state, clock)
         if not poses.requires_grad:
-            return Spread(poses.new_zeros(*shape, 6, 0), poses.new_zeros(*shape, 6, 0))
-        return Spread(*jacobians(model.left_tangent(poses, poses.detach()), [state, clock]))
+            return Spread(arrays, poses.new_zeros(*shape, 6, 0), poses.new_zeros(*shape, 6, 0))
+        return Spread(arrays, *jacobians(model.left_tangent(poses, poses.detach()), [state, clock]))
 
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
         """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
@@ -225,7 +225,7 @@ class TorchEngine(Engine):
             blocks[run.corners] += run.sum_by_corner(by_corner.mT @ by_corner)
             coupling[run.observations] = by_corner.mT @ by_pair
         factor = factorise_corners(arrays, blocks, self._by_length(estimate), damping)
-        own = own.view(arrays.camera_count, arrays.frame_count, 6, 6)
+        own = own.view(arrays.camera_count, -1, 6, 6)
         tip = own.new_zeros(system.tip, system.tip)
         for n, run in enumerate(arrays.runs(_BLOCK if arrays.states else None)):
             of_run, part = factor.part(run.corners), coupling[run.observations]
@@ -300,7 +300,7 @@ def _carry(
     for run in arrays.runs():
         along = step[run.corners][run.corner]
         by_pair.index_add_(0, run.pair, (couplings[run.observations].mT @ along[..., None])[..., 0])
-    return whitened, spread.gather(by_pair.view(arrays.camera_count, arrays.frame_count, 6))
+    return whitened, spread.gather(by_pair.view(arrays.camera_count, -1, 6))
 
 
 def _residual(run: Run, poses: Tensor, corners_map: Tensor) -> Tensor:
@@ -311,7 +311,7 @@ def _residual(run: Run, poses: Tensor, corners_map: Tensor) -> Tensor:
 
 def _by_frame(system: ReducedSystem, run: Run, tiles: tuple[int, ...], by_state: Tensor) -> Tensor:
     """W' of a block by the states of the frames of its tiles, (n, 2, tiles * F * S)."""
-    per_tile, frame = system.plan.frames_per_tile, run.pair % system.arrays.frame_count
+    per_tile, frame = system.plan.frames_per_tile, system.arrays.frame_of(run.pair)
     index, slots = torch.tensor(tiles, device=frame.device), per_tile * len(tiles)
     slot = torch.searchsorted(index, frame // per_tile) * per_tile + frame % per_tile
     rows = by_state.new_zeros(run.corner_count * slots, *by_state.shape[1:])

@@ -20,7 +20,7 @@ _SIZE = ("image_width", "image_height")
 _INFO = ("camera_name", *_SIZE, "camera_matrix", "distortion_model", "distortion_coefficients")
 _OPTIONAL = (
     "vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance", "clock_offset_s",
-    "clock_sigma_s", "drive", "date", "verdict",
+    "clock_sigma_s", "read_out_s", "read_out_sigma_s", "drive", "date", "verdict",
 )  # fmt: skip
 _IGNORED = ("rectification_matrix", "projection_matrix")  # of stereo rectification, not of recorded images
 _OF_OPENCV = ("dt", "type_id")  # OpenCV adds these to its matrices; numbers tell their type themselves

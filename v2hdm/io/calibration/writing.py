@@ -31,6 +31,7 @@ def write_calibration(
     path: Path,
     *,
     clock_s: tuple[float, float] | None = None,
+    read_out_s: tuple[float, float] | None = None,
     verdict: Mapping[str, Any] | None = None,
     about: Provenance | None = None,
 ) -> None:
@@ -38,7 +39,8 @@ def write_calibration(
 
     The sigmas are of the left-perturbation tangent of ``cam_from_vehicle``, along the camera's own axes
     (right, down, forward), and left out without a covariance. ``clock_s`` is the delay of its images behind
-    their stamps and its sigma (infinite where unknown), ``verdict`` that on the run which found it, as JSON.
+    their stamps and its sigma (infinite where unknown), ``read_out_s`` the estimated time from first row to
+    last and its sigma, ``verdict`` that on the run which found it, as JSON.
     """
     info = calibration.info
     content: dict[str, Any] = {
@@ -58,6 +60,8 @@ def write_calibration(
         content["clock_offset_s"] = float(clock_s[0])
         if np.isfinite(clock_s[1]):
             content["clock_sigma_s"] = float(clock_s[1])
+    if read_out_s is not None:
+        content["read_out_s"], content["read_out_sigma_s"] = (float(one) for one in read_out_s)
     if about is not None:
         known = {"drive": about.drive, "date": about.date}
         content |= {key: value for key, value in known.items() if value is not None}

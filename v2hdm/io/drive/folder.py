@@ -21,7 +21,7 @@ from v2hdm.io.importers.poses import read_poses
 from v2hdm.io.safe.fields import take_origin
 from v2hdm.io.safe.pixels import read_pixels
 from v2hdm.io.safe.texts import shown, take_camera_name, take_name
-from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise
+from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, FloatArray, PoseNoise
 from v2hdm.store.files import check_keys, load_yaml, take_mapping, take_number, take_text
 
 DRIVE_FILE = "drive.yaml"
@@ -31,7 +31,7 @@ TRUTH_FOLDER = "truth"
 _DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "truth"))
 _CAMERA_KEYS = (
     ("camera_info", "images", "roi_vehicle"),
-    ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior", "mask"),
+    ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior", "mask", "read_out_s"),
 )
 
 
@@ -81,8 +81,10 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     for name, (entry, read_info, list_images) in planned.items():
         # Many tools call every camera they calibrate alike: the drive's own name for it holds.
         named = replace(read_info(), name=name)
-        cameras[name] = _read_camera(entry, named, path, f"{where}: camera '{name}'")
-        files.append(list_images())
+        listed, place = list_images(), f"{where}: camera '{name}'"
+        read_out_s = _take_read_out(entry, listed.stamp_s, f"{place}, read_out_s")
+        cameras[name] = replace(_read_camera(entry, named, path, place), read_out_s=read_out_s)
+        files.append(listed)
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
     truth = None
@@ -132,6 +134,16 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         linear_response=linear,
         own_vehicle=_read_mask(entry, root, info, where),
     )
+
+
+def _take_read_out(entry: Mapping[str, Any], stamp_s: FloatArray, where: str) -> float:
+    """The time from an image's first row to its last, over before the next image begins; 0 without."""
+    read_out_s = take_number(entry.get("read_out_s", 0.0), where, DriveError)
+    period_s = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else np.inf
+    if not 0 <= read_out_s <= period_s:
+        most = "" if np.isinf(period_s) else f" to {period_s:g}, the time from image to image"
+        raise DriveError(f"{where}: {read_out_s:g} s is no read-out time; give seconds, from 0{most}")
+    return read_out_s
 
 
 def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) -> BoolArray | None:

@@ -42,6 +42,8 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
         if (prior := camera.centre_prior) is not None:
             surveyed = {"xyz": prior.centre_vehicle.tolist(), "sigma_m": prior.sigma_m.tolist()}
             entry["centre_prior"] = surveyed
+        if camera.read_out_s:
+            entry["read_out_s"] = camera.read_out_s
         entries[name] = entry
     write_tum(trajectory, folder / POSES_FILE)
     noise = asdict(drive.pose_noise)

@@ -48,11 +48,13 @@ class Route:
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """One camera's calibration, and its clock offset and sigma, s, None where they are not known."""
+    """One camera's calibration; its clock offset, read-out time and their sigmas, s, None where not known."""
 
     calibration: Calibration
     clock_offset_s: float | None
     clock_sigma_s: float | None
+    read_out_s: float | None
+    read_out_sigma_s: float | None
 
 
 @dataclass(frozen=True)
@@ -125,11 +127,11 @@ def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
         content, calibration = load_yaml(path, MapFileError), read_calibration(path)
-        clock_s = (
+        times_s = (
             take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
-            for key in ("clock_offset_s", "clock_sigma_s")
+            for key in ("clock_offset_s", "clock_sigma_s", "read_out_s", "read_out_sigma_s")
         )
-        found[calibration.info.name] = CameraFacts(calibration, *clock_s)
+        found[calibration.info.name] = CameraFacts(calibration, *times_s)
     return found
 
 

@@ -303,6 +303,9 @@ def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
     if one.clock_offset_s is not None:
         offset, sigma = number(one.clock_offset_s, 1, 1e3), number(one.clock_sigma_s, 1, 1e3)
         rows.append(["clock, images later", f"{offset} ms", f"{sigma} ms", "–"])
+    if one.read_out_s is not None:
+        read_out, sigma = number(one.read_out_s, 1, 1e3), number(one.read_out_sigma_s, 1, 1e3)
+        rows.append(["read-out, first row to last", f"{read_out} ms", f"{sigma} ms", "–"])
     return table(("", "value", "± 1 σ", "changed by"), rows)
 
 

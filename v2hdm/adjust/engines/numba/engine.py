@@ -73,7 +73,7 @@ class NumbaEngine(Engine):
             return best
         for kept in (none, self._shared_corners()):
             edges, most = self._coupled_tiles(self._with_kept(kept), per_tile, count)
-            corner_tiles = _kept_tiles(arrays.gather(kept), size // 2, count, arrays.frame_count, per_tile)
+            corner_tiles = _kept_tiles(arrays, kept, size // 2, count, per_tile)
             total = count + -(-len(kept) // (size // 2))
             pattern = find_pattern(total, [*edges, *along, *corner_tiles], least_degree=True)
             cost = pattern.multiplications(size, tip)
@@ -89,7 +89,7 @@ class NumbaEngine(Engine):
     def _shared_corners(self) -> Tensor:
         """Corners (n,) that several drives observed, with those that known lengths join to them."""
         arrays, layout = self.arrays, self._whole
-        visit = arrays.visit[arrays.pair.long() % arrays.frame_count].numpy()
+        visit = arrays.visit[arrays.frame_of(arrays.pair).long()].numpy()
         begin = layout.begin[layout.unit[:-1]]
         shared = np.minimum.reduceat(visit, begin) < np.maximum.reduceat(visit, begin)
         size = np.diff(layout.unit)
@@ -99,7 +99,7 @@ class NumbaEngine(Engine):
 
     def _coupled_tiles(self, layout: Layout, per_tile: int, tile_count: int) -> tuple[list[list[int]], int]:
         """The pairs of tiles that eliminated corners couple, and how many tiles a unit touches at most."""
-        tile = layout.pair % layout.frames // per_tile
+        tile = layout.frame[layout.pair % layout.moments] // per_tile
         units, seen = len(layout.kept), layout.begin[layout.unit]
         touched = csr_array((np.ones(len(tile), dtype=np.int32), tile, seen), shape=(units, tile_count))
         touched.sum_duplicates()
@@ -109,7 +109,7 @@ class NumbaEngine(Engine):
         return edges.tolist(), int(np.diff(touched.indptr).max(initial=0))
 
     def poses(self, estimate: Estimate) -> Tensor:
-        """``cam_from_map`` of every pair, (C, J, 4, 4)."""
+        """``cam_from_map`` of every pair, (C, M, 4, 4)."""
         return cam_from_map(self.arrays, estimate)
 
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
@@ -365,11 +365,12 @@ class NumbaLinearised(Linearised):
 
 
 def _kept_tiles(
-    run: Run, per_corner_tile: int, first: int, frames: int, per_tile: int
+    arrays: Arrays, kept: Tensor, per_corner_tile: int, first: int, per_tile: int
 ) -> list[Sequence[int]]:
     """The pairs of tiles that observations of kept corners couple, and that corners joined to them may."""
+    run = arrays.gather(kept)
     tile = first + run.corner // per_corner_tile
-    pairs = torch.unique(torch.stack([run.pair % frames // per_tile, tile]), dim=1).T.tolist()
+    pairs = torch.unique(torch.stack([arrays.frame_of(run.pair) // per_tile, tile]), dim=1).T.tolist()
     # Joined corners lie side by side: those of one unit may reach into the next tile.
     tiles = torch.unique(tile).tolist()
     return [*pairs, *pairwise(tiles)]

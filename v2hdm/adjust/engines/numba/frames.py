@@ -39,7 +39,7 @@ def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
     mark, place, touched = marks[0], marks[1], marks[2]
     count = 0
     for k in range(layout.begin[layout.unit[u]], layout.begin[layout.unit[u + 1]]):
-        tile = layout.pair[k] % layout.frames // tiles.per_tile
+        tile = layout.frame[layout.pair[k] % layout.moments] // tiles.per_tile
         if mark[tile] != u:
             mark[tile], touched[count] = u, tile
             count += 1
@@ -87,7 +87,7 @@ def subtract_frames(
         values: the tiles' numbers.
     """
     states, size, tip_row = by_state.shape[1] // 6, tiles.size, len(tiles.begin)
-    width = len(base.table) // layout.frames * each
+    width = len(base.table) // layout.moments * each
     place, touched, low, high = marks[1], marks[2], marks[3], marks[4]
     jacobian, w, rows = scratch.jacobian, scratch.coupling, scratch.rows
     for u in range(len(layout.unit) - 1):
@@ -111,7 +111,7 @@ def subtract_frames(
                 x, y = base.corners[c, 0], base.corners[c, 1]
                 r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)
                 couple(jacobian, floored(weigh(base, r0 * r0 + r1 * r1)), w, 0)
-                frame = t % layout.frames
+                frame = layout.frame[t % layout.moments]
                 a, within = place[frame // tiles.per_tile], frame % tiles.per_tile * states
                 low[a], high[a] = min(low[a], within), max(high[a], within + states)
                 column = a * size + within
@@ -119,7 +119,7 @@ def subtract_frames(
                     for s in range(states):
                         rows[i, column + s] += w[0, p] * by_state[t, p * states + s]
                         rows[i + 1, column + s] += w[0, 6 + p] * by_state[t, p * states + s]
-                column = tip + t // layout.frames * each
+                column = tip + t // layout.moments * each
                 for p in range(6):
                     rows[i, column + p] += w[0, p]
                     rows[i + 1, column + p] += w[0, 6 + p]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -23,7 +24,8 @@ class Layout(NamedTuple):
 
     Attributes:
         pair, measured, root: as in :class:`~v2hdm.adjust.arrays.Arrays`.
-        frames: J.
+        moments: M.
+        frame: (M,) of each moment.
         begin: (N + 1,) where each corner's observations begin.
         unit: (M + 1,) where each unit's corners begin.
         joint_at: (M,) where the factor of a unit of several corners begins among those of all.
@@ -39,7 +41,8 @@ class Layout(NamedTuple):
     pair: IntArray
     measured: FloatArray
     root: FloatArray
-    frames: int
+    moments: int
+    frame: IntArray
     begin: IntArray
     unit: IntArray
     joint_at: IntArray
@@ -73,7 +76,8 @@ def make_layout(arrays: Arrays) -> Layout:
         pair=pair,
         measured=arrays.measured.numpy(),
         root=arrays.root_information.numpy(),
-        frames=arrays.frame_count,
+        moments=arrays.moment_count,
+        frame=arrays.frame_of(torch.arange(arrays.moment_count)).numpy(),
         begin=begin,
         unit=unit,
         joint_at=joint_offsets(joined),

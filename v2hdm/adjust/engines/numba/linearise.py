@@ -110,7 +110,7 @@ def linearise(
         out: where the results go.
     """
     table, corners, states = base.table, base.corners, len(base.rows) == 0
-    cameras, width = len(table) // layout.frames, out.tip.shape[1]
+    cameras, width = len(table) // layout.moments, out.tip.shape[1]
     each = width // cameras
     slot, jacobian, coupling, _, block, _, gradient, rows = scratch
     for q in range(begin, end):
@@ -142,7 +142,7 @@ def linearise(
                     xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
                     yx += weight * (jacobian[13] * jacobian[12] + jacobian[15] * jacobian[14])
                     yy += weight * (jacobian[13] * jacobian[13] + jacobian[15] * jacobian[15])
-                    camera = layout.pair[k] // layout.frames
+                    camera = layout.pair[k] // layout.moments
                     owner, m = at if by_pair else q * cameras + camera, 0
                     for p in range(6):
                         top, low = weight * jacobian[p], weight * jacobian[6 + p]

@@ -88,7 +88,7 @@ def report(
         for k in range(layout.begin[c], layout.begin[c + 1]):
             _, _, pz, _, _, u, v = see(layout, table, k, x, y)
             r0, r1 = whiten(layout, k, u, v)
-            row, camera = order[k], layout.pair[k] // layout.frames
+            row, camera = order[k], layout.pair[k] // layout.moments
             out.residual_px[row, 0] = u * focal[camera, 0]
             out.residual_px[row, 1] = v * focal[camera, 1]
             out.mahalanobis2[row] = r0 * r0 + r1 * r1

@@ -6,7 +6,7 @@ forces and of their moments p x force. Extrinsics, frame states and clock offset
 
 - a left perturbation of ``cam_from_vehicle`` is one of every pair of the camera;
 - ds in ``exp(-s)`` perturbs the pair by -Ad(cam_from_vehicle exp(-q v)) J_l(-s) ds;
-- dq in ``exp(-q v)`` perturbs the pair by -Ad(cam_from_vehicle) v dq.
+- dq in ``exp(-q v)`` perturbs the pair by -Ad(cam_from_vehicle) v dq; so does a read-out time, its v by row.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from v2hdm.adjust.model import (
     centre_residual,
     clock_residual,
     frame_tangent,
+    moved,
     state_residual,
 )
 from v2hdm.adjust.reduced import PriorBlocks, Spread
@@ -31,19 +32,17 @@ from v2hdm.geometry.tensors import adjoint, exp, inverse, left_jacobian
 
 
 def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
-    """Cameras from where the vehicle is at each frame's stated time, (C, J or 1, 4, 4)."""
+    """Cameras from where the vehicle is at each frame's stated time, (C, M or 1, 4, 4)."""
     cam_from_vehicle = estimate.cam_from_vehicle[:, None]
-    if not arrays.clock_twist.shape[-1]:
-        return cam_from_vehicle
-    moved = (arrays.clock_twist @ estimate.clock_s[:, None, :, None])[..., 0]
-    return cam_from_vehicle @ exp(-moved)
+    return cam_from_vehicle @ exp(-moved(arrays, estimate.clock_s)) if arrays.moves else cam_from_vehicle
 
 
 def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
-    """Poses of every pair, (C, J, 4, 4)."""
+    """Poses of every pair, (C, M, 4, 4)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
         vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
+    vehicle_from_map = arrays.at_moments(vehicle_from_map)
     cameras = _cam_from_vehicle_then(arrays, estimate)
     if cameras.shape[1] > 1:
         return cameras @ vehicle_from_map
@@ -54,13 +53,13 @@ def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
 
 def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
     """How pairs move with frame states and clock offsets."""
-    state = clock = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6, 0)
+    state = clock = arrays.centre.new_zeros(arrays.camera_count, arrays.moment_count, 6, 0)
     if arrays.states:
         by_tangent = left_jacobian(-frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
-        state = -adjoint(_cam_from_vehicle_then(arrays, estimate)) @ by_tangent
+        state = -adjoint(_cam_from_vehicle_then(arrays, estimate)) @ arrays.at_moments(by_tangent)
     if arrays.clock_twist.shape[-1]:
         clock = -adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
-    return Spread(state, clock)
+    return Spread(arrays, state, clock)
 
 
 def with_priors(
@@ -73,7 +72,7 @@ def with_priors(
         estimate: where.
         spread: how pairs move there.
         costs: (3,) of the observations, the survey and the known lengths.
-        wrench: (C, J, 6) the observations' gradient by the pairs' left tangents.
+        wrench: (C, M, 6) the observations' gradient by the pairs' left tangents.
     """
     centre = centre_residual(arrays, estimate.cam_from_vehicle)
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
