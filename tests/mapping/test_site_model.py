@@ -151,7 +151,7 @@ def test_an_end_on_which_images_disagree_is_likelier_worn_than_one_on_which_they
     wear_off(candidates, true, 10, 0.1)
     wear_off(candidates, true, 20, 0.15, 0.05)
     crisp, ragged = of_one_class(candidates).probability[[10, 20], WRONG_END]
-    assert ragged > 0.9
+    assert ragged > 0.8
     assert crisp < 0.5
 
 

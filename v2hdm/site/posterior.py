@@ -46,7 +46,7 @@ _SIZE_SIGMA_M = 1.0
 _LENGTH_SIGMA_M = 0.3
 """Sigma, m, of the length of paint that is rolled by the metre: a tenth of a dash's."""
 
-_REPEATED_COUNT = 1.0
+_REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
 
 _SOUND_SPREAD, _WORN_SPREAD = (0.0, 0.4), (1.5, 0.7)
@@ -328,7 +328,7 @@ def _hypotheses(
             )
         )
 
-    total = sum(shape.share for shape in shapes)
+    total, anything = sum(shape.share for shape in shapes), np.zeros(len(candidates))
     for shape in shapes:
         part = shape.share / total
         laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
@@ -336,9 +336,12 @@ def _hypotheses(
         add(OF_CLASS, part / 2, laid, scatter)
         add(OF_CLASS, part / 2, otherwise, scatter)
         ends = _inwards(laid.corners_map, shape.is_elongated)
-        worn = _worn_evidence(candidates, [end for end, _ in ends], weight)
         lengths, angles = [(1.0, scatter)], [[nothing]] * len(ends)
+        worn = [np.zeros(len(candidates))] * len(ends)
         if shape.is_elongated:
+            worn = _worn_evidence(candidates, [end for end, _ in ends], weight)
+            # Of what is no marking any end is as likely ragged as not.
+            anything = np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0)
             shorter = (ends[0][0] + ends[1][0]) / 2
             longer = scatter + _LENGTH_SIGMA_M**2 * _outer(shorter)
             again = _repeated(candidates, laid, shorter, shape.sigma_m, other_length)
@@ -367,8 +370,8 @@ def _hypotheses(
     own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else _as_seen(candidates)
     any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
     add(OWN_SHAPE, 1.0, own, any_size)
-    add(PART_OF_SYMBOL, 1.0, own, any_size)
-    add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8))
+    add(PART_OF_SYMBOL, 1.0, own, any_size, beside=anything)
+    add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8), beside=anything)
     return out
 
 
