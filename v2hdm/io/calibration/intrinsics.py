@@ -138,7 +138,9 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
     while (count := len(values)) in _BEYOND:
         first, lens = _BEYOND[count]
         if any(values[first:]):
-            raise DriveError(f"{where}: a {lens} ({count} coefficients) is beyond us; calibrate with 5 or 8")
+            raise DriveError(
+                f"{where}: a {lens} ({count} coefficients) is beyond our lens models; calibrate with 5 or 8"
+            )
         values = values[:first]
     if count not in _BROWN_CONRADY:
         raise DriveError(f"{where}: {count} distortion coefficients; expected 4, 5 or 8")
