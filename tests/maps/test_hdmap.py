@@ -358,6 +358,14 @@ def test_a_calibration_says_the_clock_and_the_verdict(tmp_path, sigma_s, known):
     np.testing.assert_allclose(read_calibration(path).cam_from_vehicle, _looking_down())
 
 
+def test_a_calibration_says_an_estimated_read_out_time(tmp_path):
+    calibration, path = Calibration(CALIBRATION.info, _looking_down()), tmp_path / "front.yaml"
+    write_calibration(calibration, path, read_out_s=(0.03, 0.0005))
+    content = load_yaml(path, MapFileError)
+    assert (content["read_out_s"], content["read_out_sigma_s"]) == (0.03, 0.0005)
+    assert read_calibration(path).info.name == CALIBRATION.info.name
+
+
 def test_what_was_left_out_is_a_point_with_its_reason(tmp_path):
     one = ExcludedMarking("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
     road = Road(np.array([[3.0, 4.0]]), np.array([46.2]), np.zeros((1, 2)))

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -340,7 +340,8 @@ _Known = TypeVar("_Known", Observations, ControlPoints, KnownLengths)
 
 def _stacked(parts: Sequence[_Known]) -> _Known:
     columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return type(parts[0])(*(None if one[0] is None else np.concatenate(one) for one in columns))
+    stacked: list[Any] = [None if one[0] is None else np.concatenate(one) for one in columns]
+    return type(parts[0])(*stacked)
 
 
 def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:

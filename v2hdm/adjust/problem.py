@@ -27,6 +27,7 @@ the camera's *centre in the vehicle frame*, which a survey measures, and not on 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -74,8 +75,8 @@ class Observations:
 
     def take(self, rows: IntArray | BoolArray) -> Observations:
         """Those at ``rows``, indices or a mask."""
-        columns = vars(self).items()
-        return Observations(**{name: None if one is None else one[rows] for name, one in columns})
+        taken: list[Any] = [None if one is None else one[rows] for one in vars(self).values()]
+        return Observations(*taken)
 
     @property
     def on_line(self) -> BoolArray:
