@@ -22,7 +22,7 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
-from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
+from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_step, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
@@ -49,6 +49,7 @@ __all__ = [
     "Status",
     "Verdict",
     "estimate_noise",
+    "height_step",
     "observability",
     "observed",
     "pose_innovations",
