@@ -21,25 +21,28 @@ import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from scipy.stats import chi2, kstest
 
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import ROUTES, Recipe, draw
 from tests.benchmarks.made.faults import SPOILS, Spoil
-from tests.benchmarks.made.world import drive_of, make, truth_of
+from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
+from v2hdm.io.maps import ground_height_m
 from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.options import GROUNDS, PLANE, MappingOptions
 from v2hdm.pipeline.camera_sets import BEST, camera_sets
-from v2hdm.records import Drive
+from v2hdm.records import Drive, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
 from v2hdm.verdict.inputs.cameras import check_camera
@@ -53,6 +56,7 @@ from v2hdm.workers import share_out
 CLEAN = "nothing"
 _INSIDE = float(chi2.ppf(0.95, 1))
 _MOUNTING = ("height", "roll", "pitch", "yaw")
+_PAIRED_M = 0.3  # of a corner and its true one, apart, at most
 _LEVEL = 0.01  # of the tests whether p-values are uniform
 _REFUSED, _CRASHED = "refused", "CRASHED"
 
@@ -75,6 +79,7 @@ class Row:
     findings: list[dict[str, Any]] = field(default_factory=list)
     untold: list[dict[str, Any]] = field(default_factory=list)
     rmse_m: float = float("nan")
+    height_rmse_m: float = float("nan")
     recall: float = float("nan")
     false: int = 0
     markings: int = 0
@@ -98,6 +103,7 @@ class Job:
         route: one of :data:`ROUTES`; None draws one.
         spoil: name of the fault.
         alone: whether each camera is mapped by itself, too.
+        ground: as ``mapping.ground``.
         control: whether errors are of the kind and the size that the product reckons with.
     """
 
@@ -106,6 +112,7 @@ class Job:
     spoil: str = CLEAN
     alone: bool = False
     control: bool = False
+    ground: str = PLANE
 
     @property
     def recipe(self) -> Recipe:
@@ -133,7 +140,8 @@ def map_one(job: Job) -> Row:
     if not job.alone:
         sets = dict(list(sets.items())[-1:])
     try:
-        methods = {name: run_methods(drive, detections, cameras) for name, cameras in sets.items()}
+        options = MappingOptions(ground=job.ground)
+        methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
         findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
@@ -154,6 +162,7 @@ def map_one(job: Job) -> Row:
         findings=[finding.as_json() for finding in verdict.raised],
         untold=[finding.as_json() for finding in verdict.unobservable],
         rmse_m=figures.corner_rmse_m,
+        height_rmse_m=height_rmse_m(world, drive, best.hd_map),
         recall=figures.recall,
         false=figures.false_markings,
         markings=figures.markings,
@@ -161,6 +170,20 @@ def map_one(job: Job) -> Row:
         errors={name: np.round(own, 3).tolist() for name, own in errors.items()},
         seconds=seconds,
     )
+
+
+def height_rmse_m(world: World, drive: Drive, hd_map: HdMap) -> float:
+    """Of the corners' heights beyond the recorded road's, by the nearest true corner; nan where none is told."""
+    true, told = world.corners_map.reshape(-1, 3), [m for m in hd_map.markings if m.heights_m is not None]
+    if not told:
+        return float("nan")
+    corners = np.concatenate([marking.corners_map for marking in told])
+    heights = np.concatenate([marking.heights_m for marking in told])
+    off_m, nearest = cKDTree(true[:, :2]).query(corners)
+    flat = make(world.recipe).corners_map.reshape(-1, 3)[nearest, 2]
+    road_m = 0.0 if drive.road is None else ground_height_m(drive.road, corners)
+    off = (heights - road_m) - (true[nearest, 2] - flat)
+    return float(np.sqrt(np.mean(off[off_m < _PAIRED_M] ** 2)))
 
 
 def findings_of_inputs(drive: Drive) -> list[Finding]:
@@ -215,7 +238,7 @@ def line(row: Row, clean: Row | None) -> str:
     noise = ("default" if row.default_noise else "stated") + (", road" if row.road else "")
     return (
         f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
-        f"{100 * row.rmse_m:6.2f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
+        f"{100 * row.rmse_m:6.2f} cm | heights {100 * row.height_rmse_m:4.1f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
         f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}"
     )
 
@@ -351,13 +374,15 @@ def main() -> None:
     parser.add_argument(
         "--control", action="store_true", help="draw no errors but those that the product reckons with"
     )
+    parser.add_argument("--ground", choices=GROUNDS, default=PLANE, help="as mapping.ground")
     parser.add_argument("--verbose", action="store_true", help="print all findings")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/right_drives.json"))
     parsed = parser.parse_args()
     seeds = [s for s in range(*parsed.seeds) if re.search(parsed.only, Job(s, parsed.route).recipe.name)]
     kinds = [CLEAN, *(spoil.name for spoil in wanted_spoils(parsed.spoil))]
-    jobs = [Job(seed, parsed.route, kind, parsed.alone, parsed.control) for seed in seeds for kind in kinds]
+    rest = parsed.alone, parsed.control, parsed.ground
+    jobs = [Job(seed, parsed.route, kind, *rest) for seed in seeds for kind in kinds]
     rows = measure(jobs, parsed.workers, parsed.verbose or bool(parsed.spoil))
     parsed.out.parent.mkdir(parents=True, exist_ok=True)
     parsed.out.write_text(json.dumps([asdict(row) for row in rows]))

@@ -15,7 +15,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from v2hdm.adjust import PoseSigma, Status, estimate_noise, height_step, select_model
+from v2hdm.adjust import (
+    PoseSigma,
+    Problem,
+    Status,
+    estimate_noise,
+    height_step,
+    predicts_better,
+    select_model,
+)
 from v2hdm.association.cross_section import SLOPE_SIGMA, CrossSection, Paths, hinges
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
@@ -143,6 +151,12 @@ class Optimiser:
             {name: float(offset_s[c]) for name, c in bundle.camera_index.items()}
             for offset_s in solved.clock_offset_s.T
         ]
+
+    def is_curved(self, bundle: Bundle) -> bool:
+        """Whether ``bundle``, over a cross-section, predicts held-out observations better than the plane."""
+        problem, own = self._as_stated(bundle), bundle.own_corner
+        seen = replace(problem.observations, pinhole_px=self._seen.corners_pinhole_px[bundle.row, own])
+        return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
@@ -286,16 +300,21 @@ class Optimiser:
             factor = self._variance_factor * bundle.solution.observation_factor
             self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
-    def _choose_pose_model(self, bundle: Bundle) -> str:
-        """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
+    def _as_stated(self, bundle: Bundle) -> Problem:
+        """The problem of ``bundle`` from where that ended, with the detector's own covariances.
+
+        What is left of errors that no model knows must not shrink with them.
+        """
         seen = bundle.problem.observations
-        # As the detector states them: what is left of errors that no model knows must not shrink with them.
         stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
-        start = replace(
+        return replace(
             bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated
         )
+
+    def _choose_pose_model(self, bundle: Bundle) -> str:
+        """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
         try:
-            selection = select_model(start, bundle.model.solver)
+            selection = select_model(self._as_stated(bundle), bundle.model.solver)
         except AdjustError as failure:
             _log.warning("the pose model stays %r, since none could be chosen: %s", _SETTLED_MODEL, failure)
             return _SETTLED_MODEL
