@@ -21,7 +21,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +173,7 @@ def map_one(job: Job) -> Row:
 
 
 def height_rmse_m(world: World, drive: Drive, hd_map: HdMap) -> float:
-    """Of the corners' heights beyond the recorded road's, by the nearest true corner; nan where none is told."""
+    """Of the corners' heights above the recorded road, by the nearest true corner; nan where none is told."""
     true, told = world.corners_map.reshape(-1, 3), [m for m in hd_map.markings if m.heights_m is not None]
     if not told:
         return float("nan")
@@ -238,7 +238,8 @@ def line(row: Row, clean: Row | None) -> str:
     noise = ("default" if row.default_noise else "stated") + (", road" if row.road else "")
     return (
         f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
-        f"{100 * row.rmse_m:6.2f} cm | heights {100 * row.height_rmse_m:4.1f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
+        f"{100 * row.rmse_m:6.2f} cm, heights {100 * row.height_rmse_m:3.1f} | "
+        f"recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
         f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}"
     )
 

@@ -8,7 +8,8 @@ import pytest
 from tests.adjust.scene import make_scene
 from tests.benchmarks.made.draw import draw
 from tests.benchmarks.right_drives import Job, map_one
-from tests.mapping.scene import SceneOptions, make_scene as make_yard
+from tests.mapping.scene import SceneOptions
+from tests.mapping.scene import make_scene as make_yard
 from v2hdm.adjust import SolveOptions, height_step, solve
 from v2hdm.association.cross_section import KNOTS_M, CrossSection, Paths
 from v2hdm.association.sightings import Rig, collect_sightings
@@ -37,8 +38,10 @@ def ground_of_arc(points_map, radius_m=40.0):
     return height
 
 
-def projected(cam_from_map, points_map):
-    cam = apply(cam_from_map, points_map)
+def projected(cam_from_map, points_map, height_m):
+    """Pixels (K, 2) of points (K, 2) at heights (K,), each of a camera (K, 4, 4) of its own."""
+    points = np.column_stack([points_map, height_m, np.ones(len(height_m))])
+    cam = np.einsum("kij,kj->ki", cam_from_map, points)[:, :3]
     return (cam / cam[:, 2:] @ INTRINSIC.T)[:, :2]
 
 
@@ -60,18 +63,12 @@ def test_a_moved_pixel_is_the_plane_s_where_the_ground_s_point_is_projected():
     section = CrossSection(FALLS, Paths.of(poses, np.zeros(len(poses), dtype=np.int64)))
     height = ground_of_arc(points)
     assert np.abs(height).max() > 0.2
-    # Between the places of the path a chord cuts the circle by a millimetre or two.
-    assert np.abs(section.height_m(points, frame) - height).max() < 2e-4
-    for z in (section.height_m(points, frame), height):
-        pixels = np.array(
-            [
-                projected(one, np.append(p, h)[None])[0]
-                for one, p, h in zip(cam_from_map, points, z, strict=True)
-            ]
-        )
-        plane = [projected(one, np.append(p, 0)[None])[0] for one, p in zip(cam_from_map, points, strict=True)]
-        moved = section.flattened_px(np.tile(INTRINSIC, (len(frame), 1, 1)), cam_from_map, frame, pixels)
-        assert np.abs(moved - plane).max() < (1e-6 if z is not height else 0.1)
+    # Between the places of the path a chord is up to 5 mm off the circle.
+    assert np.abs(section.height_m(points, frame) - height).max() < 5e-4
+    plane, intrinsic = projected(cam_from_map, points, 0 * height), np.tile(INTRINSIC, (len(frame), 1, 1))
+    for z, most_px in ((section.height_m(points, frame), 1e-6), (height, 0.1)):
+        moved = section.flattened_px(intrinsic, cam_from_map, frame, projected(cam_from_map, points, z))
+        assert np.abs(moved - plane).max() < most_px
 
 
 def test_ground_without_slopes_changes_no_pixel():
@@ -143,4 +140,3 @@ def test_a_plane_stays_one_to_the_last_bit():
     plane, auto = map_one(Job(seed)), map_one(Job(seed, ground="auto"))
     assert np.isnan(auto.height_rmse_m)
     assert (auto.rmse_m, auto.errors) == (plane.rmse_m, plane.errors)
-

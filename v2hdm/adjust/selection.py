@@ -161,7 +161,7 @@ def select_model(
 
 
 def predicts_better(problem: Problem, rival: Problem, options: SolveOptions, seed: int = 0) -> bool:
-    """Whether ``problem`` surely predicts held-out observations better than ``rival``, which places them else.
+    """Whether ``problem`` surely predicts held-out observations better than ``rival``, which moves them.
 
     Surely means by more than three standard errors of the paired difference, as in :func:`select_model`.
 

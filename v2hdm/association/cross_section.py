@@ -83,9 +83,7 @@ class Paths:
         span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
         here = station[place][:, None] + np.array([-_AHEAD_M, _AHEAD_M])
         bounds = np.clip(here, *np.array([span[v] for v in visit.tolist()]).T[:, :, None])
-        return cls(
-            place, at, ahead / np.linalg.norm(ahead, axis=1, keepdims=True), sense, station, bounds
-        )
+        return cls(place, at, ahead / np.linalg.norm(ahead, axis=1, keepdims=True), sense, station, bounds)
 
     def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
         """How far points (K, 2) lie to the left of the path near frames (K,), and the left there (K, 2)."""

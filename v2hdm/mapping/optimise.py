@@ -156,7 +156,11 @@ class Optimiser:
         """Whether ``bundle``, over a cross-section, predicts held-out observations better than the plane."""
         problem, own = self._as_stated(bundle), bundle.own_corner
         seen = replace(problem.observations, pinhole_px=self._seen.corners_pinhole_px[bundle.row, own])
-        return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
+        try:
+            return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
+        except AdjustError as failure:
+            _log.warning("the ground stays a plane, since no cross-section could be tried: %s", failure)
+            return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
@@ -307,9 +311,7 @@ class Optimiser:
         """
         seen = bundle.problem.observations
         stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
-        return replace(
-            bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated
-        )
+        return replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated)
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
