@@ -15,7 +15,7 @@ from v2hdm.association.cross_section import KNOTS_M, CrossSection, Paths
 from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.geometry.rigid import apply, rotation_from_euler
 
-FALLS = np.array([0.02, 0.03, -0.01, 0.015, 0.02])
+FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
 SEED = 4
 """Of a drive on level ground, 43 markings."""

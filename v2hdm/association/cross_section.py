@@ -26,9 +26,9 @@ from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-KNOTS_M = (1.75, 5.25)
-"""Where beside the path the slope may change: a crown lies along a lane line, half a lane of 3.5 m or one and
-a half from the middle of the vehicle's own. One elsewhere is smoothed."""
+KNOTS_M = (1.75, 3.5, 5.25)
+"""Where beside the path the slope may change: every half lane of 3.5 m. A crown lies along a lane line, half
+a lane or one and a half from the middle of the vehicle's own; one elsewhere is smoothed by 2 cm at most."""
 
 SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A

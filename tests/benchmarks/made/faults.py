@@ -133,7 +133,7 @@ def _foreign(world: World) -> World:
 
 
 def _crown(fall: float, line_m: float, world: World) -> World:
-    """The road falls to both sides of a crown to the left of the vehicle, which leans as its side does."""
+    """The road falls to both sides of a crown to the left of the vehicle, which leans with its own side."""
     corners = world.corners_map.copy()
     _, left_m = beside(world.port.route, corners[..., :2].reshape(-1, 2))
     lower_m = 2 * np.maximum(left_m - line_m, 0.0) if line_m else np.abs(left_m)
