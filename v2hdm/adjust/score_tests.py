@@ -666,7 +666,8 @@ def height_step(
     z = torch.stack([_stacked(column) for column in columns], dim=1)
     information = (z.T @ z).cpu().numpy() + np.eye(len(off)) / sigma**2
     score = (z.T @ _stacked(bench.residuals)).cpu().numpy() + off / sigma**2
-    return -np.linalg.solve(information, score), np.linalg.inv(information)
+    covariance: FloatArray = np.linalg.inv(information)
+    return -covariance @ score, covariance
 
 
 def _stacked(rows: Rows) -> Tensor:

@@ -106,7 +106,7 @@ class Paths:
     def nearest_frame(self, points_map: FloatArray) -> IntArray:
         """The frame (K,) at the place nearest to each point (K, 2)."""
         _, place = cKDTree(self.points_map).query(points_map)
-        return np.searchsorted(self.place, place)
+        return np.asarray(np.searchsorted(self.place, place), dtype=np.int64)
 
 
 def hinges(left_m: FloatArray) -> FloatArray:
@@ -115,23 +115,23 @@ def hinges(left_m: FloatArray) -> FloatArray:
     return -np.column_stack([np.abs(left_m), *sides])
 
 
+def sentence_of(falls: FloatArray) -> str:
+    """One sentence on the heights that parameters (B,) give the ground."""
+    left_m = np.array([-8.0, -4.0, 4.0, 8.0])
+    heights_cm = (100 * hinges(left_m) @ falls).tolist()
+    told = ", ".join(
+        f"{height:+.0f} cm {abs(d):.0f} m to the {'left' if d > 0 else 'right'}"
+        for d, height in zip(left_m.tolist(), heights_cm, strict=True)
+    )
+    return f"the ground beside the vehicle's path is no plane: {told}"
+
+
 @dataclass(frozen=True)
 class CrossSection:
     """The cross-section of the ground along the ``paths``: ``falls`` (B,) a_0 and a_k, left ones first."""
 
     falls: FloatArray
     paths: Paths
-
-    @property
-    def sentence(self) -> str:
-        """One sentence on its heights."""
-        left_m = np.array([-8.0, -4.0, 4.0, 8.0])
-        heights_cm = 100 * hinges(left_m) @ self.falls
-        told = ", ".join(
-            f"{height:+.0f} cm {abs(d):.0f} m to the {'left' if d > 0 else 'right'}"
-            for d, height in zip(left_m, heights_cm, strict=True)
-        )
-        return f"the ground beside the vehicle's path is no plane: {told}"
 
     def height_m(self, points_map: FloatArray, frame: IntArray | None = None) -> FloatArray:
         """Heights (K,) of the ground at points (K, 2) seen from frames (K,); None takes the nearest ones."""

@@ -24,7 +24,13 @@ from v2hdm.adjust import (
     predicts_better,
     select_model,
 )
-from v2hdm.association.cross_section import SLOPE_SIGMA, CrossSection, Paths, hinges
+from v2hdm.association.cross_section import (
+    SLOPE_SIGMA,
+    CrossSection,
+    Paths,
+    hinges,
+    sentence_of,
+)
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -207,14 +213,14 @@ class Optimiser:
             left_m, _ = paths.beside(points_map, self._seen.frame[bundle.row])
             step, _ = height_step(bundle.solution, hinges(left_m), falls, SLOPE_SIGMA)
             falls = falls + step
-            self.cross_section = CrossSection(falls, paths)
-            self.sightings = self.cross_section.flattened(self._seen, bundle.rig)
+            section = self.cross_section = CrossSection(falls, paths)
+            self.sightings = section.flattened(self._seen, bundle.rig)
             association = self._associate(bundle.rig)
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
             if np.abs(step).max() < _SETTLED_SLOPE:
                 break
-        _log.info("%s: %s", ", ".join(self.camera_names), self.cross_section.sentence)
+        _log.info("%s: %s", ", ".join(self.camera_names), sentence_of(falls))
         return bundle
 
     def _locate(self, rig: Rig) -> Located:
