@@ -666,7 +666,7 @@ def height_step(
     z = torch.stack([_stacked(column) for column in columns], dim=1)
     information = (z.T @ z).cpu().numpy() + np.eye(len(off)) / sigma**2
     score = (z.T @ _stacked(bench.residuals)).cpu().numpy() + off / sigma**2
-    covariance: FloatArray = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return -covariance @ score, covariance
 
 

@@ -127,7 +127,9 @@ class Optimiser:
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
-        return self._weigh_poses(self._fit_ground(bundle, progress), progress)
+        bundle = self._fit_ground(bundle, progress)
+        progress("noise of the poses")
+        return self._weigh_poses(bundle)
 
     def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
@@ -199,7 +201,7 @@ class Optimiser:
         self.growth = tuple(mapper.growth)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
         self._reweigh(bundle)
-        return self._weigh_poses(self._fit_ground(bundle, progress), progress)
+        return self._weigh_poses(self._fit_ground(bundle, progress))
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None]) -> Bundle:
         """The solve over the cross-section of the ground that the drive shows, if one is asked for."""
@@ -283,12 +285,11 @@ class Optimiser:
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
 
-    def _weigh_poses(self, bundle: Bundle, progress: Callable[[str], None]) -> Bundle:
+    def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
 
         The positions' stays as stated: images do not see what moves the vehicle and its map alike.
         """
-        progress("noise of the poses")
         stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
