@@ -164,8 +164,12 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         if inputs.options.ground == AUTO and any(_is_bent(one) for one in found):
             curved = replace(inputs, options=replace(inputs.options, ground=CROSS_SECTION))
             over, tests, rival = _settled(curved, progress)
-            if (rival is None or rival.fault not in _LIKE_GROUND) and curved.optimiser.is_curved(over):
+            explained = rival is None or rival.fault not in _LIKE_GROUND
+            is_curved = explained and curved.optimiser.is_curved(over)
+            if is_curved:
                 inputs, settled, found, worst = curved, over, tests, rival
+            taken = "that" if is_curved else "a plane: that does not explain what the drive contradicts"
+            _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
         left = None
