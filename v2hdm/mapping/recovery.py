@@ -168,7 +168,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             is_curved = explained and curved.optimiser.is_curved(over)
             if is_curved:
                 inputs, settled, found, worst = curved, over, tests, rival
-            taken = "a cross-section" if is_curved else "a plane: a cross-section does not explain what contradicts it"
+            taken = "a cross-section" if is_curved else "a plane: no cross-section explains the drive"
             _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
