@@ -29,19 +29,21 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from scipy.stats import chi2, kstest
 
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import ROUTES, Recipe, draw
 from tests.benchmarks.made.faults import SPOILS, Spoil
-from tests.benchmarks.made.world import drive_of, make, truth_of
+from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
+from v2hdm.io.maps import ground_height_m
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import GROUNDS, PLANE, MappingOptions
 from v2hdm.pipeline.camera_sets import BEST, camera_sets
-from v2hdm.records import Drive
+from v2hdm.records import Drive, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
 from v2hdm.verdict.inputs.cameras import check_camera
@@ -55,6 +57,7 @@ from v2hdm.workers import share_out
 CLEAN = "nothing"
 _INSIDE = float(chi2.ppf(0.95, 1))
 _MOUNTING = ("height", "roll", "pitch", "yaw")
+_PAIRED_M = 0.3  # of a corner and its true one, apart, at most
 _LEVEL = 0.01  # of the tests whether p-values are uniform
 _REFUSED, _CRASHED = "refused", "CRASHED"
 
@@ -77,6 +80,7 @@ class Row:
     findings: list[dict[str, Any]] = field(default_factory=list)
     untold: list[dict[str, Any]] = field(default_factory=list)
     rmse_m: float = float("nan")
+    height_rmse_m: float = float("nan")
     recall: float = float("nan")
     false: int = 0
     markings: int = 0
@@ -100,6 +104,7 @@ class Job:
         route: one of :data:`ROUTES`; None draws one.
         spoil: name of the fault.
         alone: whether each camera is mapped by itself, too.
+        ground: as ``mapping.ground``.
         control: whether errors are of the kind and the size that the product reckons with.
         read_out_s: of the cameras; stated, unless it is to be estimated.
         estimate: whether the mapping estimates it.
@@ -112,6 +117,7 @@ class Job:
     control: bool = False
     read_out_s: float = 0.0
     estimate: bool = False
+    ground: str = PLANE
 
     @property
     def recipe(self) -> Recipe:
@@ -128,7 +134,6 @@ def map_one(job: Job) -> Row:
         world = SPOILS[job.spoil].change(world)
     if job.read_out_s:
         world = world.rolling(job.read_out_s, stated=not job.estimate)
-    options = MappingOptions(estimate_read_out=job.estimate)
     drive = drive_of(world)
     detections, visibility = detect(world, drive)
     truth = truth_of(world, drive, visibility)
@@ -142,7 +147,8 @@ def map_one(job: Job) -> Row:
     if not job.alone:
         sets = dict(list(sets.items())[-1:])
     try:
-        methods = {name: run_methods(drive, detections, cameras, options) for name, cameras in sets.items()}
+        options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
+        methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
         findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
@@ -164,6 +170,7 @@ def map_one(job: Job) -> Row:
         findings=[finding.as_json() for finding in verdict.raised],
         untold=[finding.as_json() for finding in verdict.unobservable],
         rmse_m=figures.corner_rmse_m,
+        height_rmse_m=height_rmse_m(world, drive, best.hd_map),
         recall=figures.recall,
         false=figures.false_markings,
         markings=figures.markings,
@@ -171,6 +178,20 @@ def map_one(job: Job) -> Row:
         errors={name: np.round(own, 3).tolist() for name, own in errors.items()},
         seconds=seconds,
     )
+
+
+def height_rmse_m(world: World, drive: Drive, hd_map: HdMap) -> float:
+    """Of the corners' heights above the recorded road, by the nearest true corner; nan where none is told."""
+    true, told = world.corners_map.reshape(-1, 3), [m for m in hd_map.markings if m.heights_m is not None]
+    if not told:
+        return float("nan")
+    corners = np.concatenate([marking.corners_map for marking in told])
+    heights = np.concatenate([marking.heights_m for marking in told])
+    off_m, nearest = cKDTree(true[:, :2]).query(corners)
+    flat = make(world.recipe).corners_map.reshape(-1, 3)[nearest, 2]
+    road_m = 0.0 if drive.road is None else ground_height_m(drive.road, corners)
+    off = (heights - road_m) - (true[nearest, 2] - flat)
+    return float(np.sqrt(np.mean(off[off_m < _PAIRED_M] ** 2)))
 
 
 def findings_of_inputs(drive: Drive) -> list[Finding]:
@@ -225,7 +246,8 @@ def line(row: Row, clean: Row | None) -> str:
     noise = ("default" if row.default_noise else "stated") + (", road" if row.road else "")
     return (
         f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
-        f"{100 * row.rmse_m:6.2f} cm | recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
+        f"{100 * row.rmse_m:6.2f} cm, heights {100 * row.height_rmse_m:3.1f} | "
+        f"recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
         f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}{_read_outs(row)}"
     )
 
@@ -369,14 +391,15 @@ def main() -> None:
     )
     parser.add_argument("--read-out", type=float, default=0.0, help="of rolling shutters, s")
     parser.add_argument("--estimate", action="store_true", help="do not state it, estimate it")
+    parser.add_argument("--ground", choices=GROUNDS, default=PLANE, help="as mapping.ground")
     parser.add_argument("--verbose", action="store_true", help="print all findings")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/right_drives.json"))
     parsed = parser.parse_args()
     seeds = [s for s in range(*parsed.seeds) if re.search(parsed.only, Job(s, parsed.route).recipe.name)]
     kinds = [CLEAN, *(spoil.name for spoil in wanted_spoils(parsed.spoil))]
-    how = parsed.alone, parsed.control, parsed.read_out, parsed.estimate
-    jobs = [Job(seed, parsed.route, kind, *how) for seed in seeds for kind in kinds]
+    rest = parsed.alone, parsed.control, parsed.read_out, parsed.estimate, parsed.ground
+    jobs = [Job(seed, parsed.route, kind, *rest) for seed in seeds for kind in kinds]
     rows = measure(jobs, parsed.workers, parsed.verbose or bool(parsed.spoil))
     parsed.out.parent.mkdir(parents=True, exist_ok=True)
     parsed.out.write_text(json.dumps([asdict(row) for row in rows]))

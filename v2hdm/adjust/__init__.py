@@ -22,8 +22,8 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
-from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
-from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
+from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_step, score_faults, sigmas_of
+from v2hdm.adjust.selection import MODELS, Model, Selection, predicts_better, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.validation import Excluded, Verdict
@@ -49,9 +49,11 @@ __all__ = [
     "Status",
     "Verdict",
     "estimate_noise",
+    "height_step",
     "observability",
     "observed",
     "pose_innovations",
+    "predicts_better",
     "score_faults",
     "select_model",
     "sigmas_of",

@@ -634,12 +634,46 @@ def _crown(bench: _Bench) -> Rows:
     route = KDTree(frames[:, :2, 3].cpu().numpy())
     nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
     away = estimate.corners_map - frames[nearest, :2, 3]
-    aside = (away * frames[nearest, :2, 1]).sum(1).abs()[arrays.corner.long()]
+    return _raised(bench, -(away * frames[nearest, :2, 1]).sum(1).abs()[arrays.corner.long()])
+
+
+def _raised(bench: _Bench, height: Tensor) -> Rows:
+    """Corners that each observation (K,) sees so much higher, m, a unit of the value."""
+    arrays, estimate = bench.arrays, bench.whitening.estimate
     poses = bench.whitening.engine.poses(estimate).flatten(0, 1)[arrays.pair.long()]
     up, points = poses[:, :3, 2], points_in_camera(poses, estimate.corners_map[arrays.corner.long()])
     depth = points[:, 2:].clamp(min=NEAR_M)
-    moved = -aside[:, None] * (up[:, :2] - points[:, :2] / depth * up[:, 2:]) / depth
+    moved = height[:, None] * (up[:, :2] - points[:, :2] / depth * up[:, 2:]) / depth
     return {"observations": bench.whiten(moved.T)}
+
+
+def height_step(
+    solution: Solution, heights: FloatArray, off: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """The Gauss-Newton step (B,) of parameters that raise the ground, all else being estimated anew with it.
+
+    Args:
+        solution: at the parameters' present values.
+        heights: (K, B) m by which a unit of each raises what each observation of the problem shows.
+        off: (B,) how far the parameters are from their expectation.
+        sigma: of that.
+
+    Returns:
+        The step, and the covariance (B, B) of the parameters.
+    """
+    bench = _Bench.at(solution.covariance.whitening)
+    by_order = torch.as_tensor(heights)[bench.arrays.order.cpu()].to(bench.root)
+    columns = [bench.efficient(_raised(bench, column)) for column in by_order.T]
+    z = torch.stack([_stacked(column) for column in columns], dim=1)
+    information = (z.T @ z).cpu().numpy() + np.eye(len(off)) / sigma**2
+    score = (z.T @ _stacked(bench.residuals)).cpu().numpy() + off / sigma**2
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return -covariance @ score, covariance
+
+
+def _stacked(rows: Rows) -> Tensor:
+    """All rows, in the order of their kinds, as one vector."""
+    return torch.cat([rows[name].flatten() for name in sorted(rows)])
 
 
 def _slope_motion(axis: int) -> Callable[[Arrays], Tensor]:

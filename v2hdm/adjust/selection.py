@@ -80,8 +80,9 @@ _STRETCH_FRAMES = 120
 _HELD_OUT_SHARE = 0.2
 # With fewer than these the residuals cannot tell one model from another.
 _MIN_HELD_OUT = 40
-# By how much a clock offset must predict better than everything else.
-_CLOCK_STANDARD_ERRORS = 3.0
+# By how much what can take up errors of other inputs, such as a clock offset, must predict better than what
+# does without.
+_SURE_STANDARD_ERRORS = 3.0
 # Where the loss of a held-out residual bends, squared sigmas: wrong associations must not decide.
 _LOSS_SCALE2 = 9.0
 
@@ -142,20 +143,43 @@ def select_model(
     held_out = _held_out(stretch.observations, np.random.default_rng(seed))
     if np.count_nonzero(held_out) < _MIN_HELD_OUT:
         return Selection(punctual[-1], {})
-    fitted, corners = restrict(stretch, ~held_out)
-    losses = {}
-    for name in candidates:
-        solution = solve(fitted, replace(with_model(options, MODELS[name]), coarse=False))
-        squared = predicted_squared(stretch, held_out, fitted, solution, corners)
-        losses[name] = _LOSS_SCALE2 * np.log1p(squared / _LOSS_SCALE2)
+    losses = {name: _losses(stretch, held_out, with_model(options, MODELS[name])) for name in candidates}
     frame = stretch.observations.frame[held_out]
     best = min(punctual, key=lambda name: float(losses[name].mean()))
     chosen = [name for name in punctual if _as_good(losses[name] - losses[best], frame)][-1]
     for name in candidates:
         gain = losses[best] - losses[name]
-        if MODELS[name].clock_offset and not _as_good(gain, frame, _CLOCK_STANDARD_ERRORS):
+        if MODELS[name].clock_offset and not _as_good(gain, frame, _SURE_STANDARD_ERRORS):
             chosen = name
     return Selection(chosen, {name: float(loss.mean()) for name, loss in losses.items()})
+
+
+def predicts_better(problem: Problem, rival: Problem, options: SolveOptions, seed: int = 0) -> bool:
+    """Whether ``problem`` surely predicts held-out observations better than ``rival``, which moves them.
+
+    Surely means by more than three standard errors of the paired difference, as in :func:`select_model`.
+
+    Args:
+        problem: the drive; its extrinsics are near already.
+        rival: the same observations of the same corners, but for where in the image they are.
+        options: how to solve.
+        seed: draws what is held out.
+    """
+    chosen = _stretch(problem)
+    held_out = _held_out(restrict(problem, chosen)[0].observations, np.random.default_rng(seed))
+    if np.count_nonzero(held_out) < _MIN_HELD_OUT:
+        return False
+    own, other = (_losses(restrict(one, chosen)[0], held_out, options) for one in (problem, rival))
+    frame = problem.observations.frame[chosen][held_out]
+    return not _as_good(other - own, frame, _SURE_STANDARD_ERRORS)
+
+
+def _losses(whole: Problem, held_out: BoolArray, options: SolveOptions) -> FloatArray:
+    """The robust losses of the ``held_out`` observations of ``whole``, as the others predict them."""
+    fitted, corners = restrict(whole, ~held_out)
+    solution = solve(fitted, replace(options, coarse=False))
+    squared = predicted_squared(whole, held_out, fitted, solution, corners)
+    return np.asarray(_LOSS_SCALE2 * np.log1p(squared / _LOSS_SCALE2))
 
 
 def predicted_squared(

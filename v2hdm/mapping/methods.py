@@ -24,6 +24,7 @@ from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
+from v2hdm.io.maps import with_heights
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import silent
@@ -314,15 +315,17 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
             len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
     known = observability(bundle.problem, solution)
-    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig))
+    section = inputs.optimiser.cross_section
+    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, section))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
     odds = options.acceptance.min_probability
-    seen, jitter_rad = inputs.sightings.symbols, noise.roll_pitch_rad
+    seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
     symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
+    hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m),
+        hd_map=hd_map if section is None else with_heights(hd_map, drive.road, section.height_m),
         calibrations=optimised.calibrations,
         excluded=(*optimised.excluded, *no_symbols),
         reprojection_rmse_px=optimised.reprojection_rmse_px,
@@ -355,7 +358,7 @@ def _brought_up_to_date(
 ) -> MethodResult:
     drive, group = outcome.inputs.drive, optimised.bundle.association.group
     observer = Observer(
-        outcome.inputs.sightings,
+        outcome.inputs.optimiser.sightings,
         views_of(drive, made.cameras),
         tuple(drive.cameras[name] for name in made.cameras),
         optimised.bundle.rig,

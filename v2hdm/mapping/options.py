@@ -16,6 +16,11 @@ AUTO = "auto"
 MODES = (BATCH, INCREMENTAL)
 """Values of ``mapping.mode``."""
 
+PLANE = "plane"
+CROSS_SECTION = "cross_section"
+GROUNDS = (PLANE, CROSS_SECTION, AUTO)
+"""Values of ``mapping.ground``."""
+
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """Values of ``mapping.pose_model``: the models of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
@@ -122,6 +127,9 @@ class MappingOptions:
     states.
     ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
     and in the end solved as ``batch`` does.
+    ``ground`` is ``plane``, once the recorded road is laid flat; ``cross_section``, which rises or falls with
+    the distance from the vehicle's own path, alike along the route, as a road with a crown does; or ``auto``,
+    the plane unless the drive contradicts it and a cross-section predicts held-out observations better.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
@@ -131,6 +139,7 @@ class MappingOptions:
     mode: str = BATCH
     pose_model: str = AUTO
     estimate_read_out: bool = False
+    ground: str = PLANE
     loss: str = "cauchy"
     loss_scale: float = 2.0
     rounds: int = 2
@@ -154,7 +163,7 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     """
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 
-    choices = {"mode": MODES, "pose_model": POSE_MODELS, "loss": LOSSES}
+    choices = {"mode": MODES, "pose_model": POSE_MODELS, "ground": GROUNDS, "loss": LOSSES}
     for key, allowed in choices.items():
         value = getattr(options, key)
         if value not in allowed:

@@ -25,7 +25,7 @@ from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import INCREMENTAL, MappingOptions, SurveyOptions
+from v2hdm.mapping.options import AUTO, CROSS_SECTION, INCREMENTAL, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.stated import name_of
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray
@@ -100,6 +100,9 @@ _MOST_CORRECTIONS = 4
 """Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
 
 
+_LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
+"""Faults that bend what a plane looks like: one that a cross-section leaves is the likelier cause."""
+
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
 
@@ -155,17 +158,19 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
     while True:
-        # 1. Associate and solve, all at once or marking by marking.
+        # 1. Associate and solve, all at once or marking by marking; test the inputs against all else.
+        settled, found, worst = _settled(inputs, progress)
+        # 2. Where the drive contradicts the plane, and a cross-section explains all of it, take that.
+        if inputs.options.ground == AUTO and any(_is_bent(one) for one in found):
+            curved = replace(inputs, options=replace(inputs.options, ground=CROSS_SECTION))
+            over, tests, rival = _settled(curved, progress)
+            explained = rival is None or rival.fault not in _LIKE_GROUND
+            is_curved = explained and curved.optimiser.is_curved(over)
+            if is_curved:
+                inputs, settled, found, worst = curved, over, tests, rival
+            taken = "a cross-section" if is_curved else "a plane: no cross-section explains the drive"
+            _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
-        if inputs.options.mode == INCREMENTAL:
-            settled = optimiser.grow(progress)
-        else:
-            settled = optimiser.settle(inputs.tracks, progress)
-        # 2. Test the inputs against what everything else says.
-        progress("tests of the inputs")
-        found = score_faults(settled.problem, settled.solution)
-        found = tuple(one for one in found if _is_stated(one, settled, drive))
-        worst = next((one for one in found if is_contradicted(one)), None)
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
         left = None
         if worst is not None and len(corrected) < _MOST_CORRECTIONS and not _is_ambiguous(worst, found):
@@ -186,6 +191,25 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, evidence), optimised
+
+
+def _settled(
+    inputs: Inputs, progress: Callable[[str], None]
+) -> tuple[Bundle, tuple[ScoreTest, ...], ScoreTest | None]:
+    """A solve over all observations, the tests of its inputs, and the one that is contradicted most."""
+    if inputs.options.mode == INCREMENTAL:
+        settled = inputs.optimiser.grow(progress)
+    else:
+        settled = inputs.optimiser.settle(inputs.tracks, progress)
+    progress("tests of the inputs")
+    found = score_faults(settled.problem, settled.solution)
+    found = tuple(one for one in found if _is_stated(one, settled, inputs.drive))
+    return settled, found, next((one for one in found if is_contradicted(one)), None)
+
+
+def _is_bent(one: ScoreTest) -> bool:
+    """Whether the ground surely falls or rises beside the route, if only by as little as outliers leave."""
+    return one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:

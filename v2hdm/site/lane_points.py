@@ -7,12 +7,13 @@ a parallel line take no part. The rest is thinned to single nodes, half a metre 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from v2hdm.association.cross_section import CrossSection
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shares
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
@@ -70,18 +71,23 @@ class LaneCloud:
     guides: Guides = field(default_factory=Guides)
 
 
+Flattening = Callable[[IntArray, FloatArray], FloatArray]
+
+
 @dataclass(frozen=True)
 class ImageGround:
     """How each image of a drive maps to the ground; nan for images of cameras that are not used.
 
     ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3). Where shutters roll,
     ``moved_map`` (I, 2, 3) takes a point of the ground (x, y, 1) to how far it seems to move with the vehicle
-    during the read-out.
+    during the read-out. ``flattened_px`` moves pinhole pixels (P, 2) of images (P,) to where these would show
+    the same on the plane z = 0.
     """
 
     map_from_pinhole_px: FloatArray
     centre_map: FloatArray
     moved_map: FloatArray | None = None
+    flattened_px: Flattening = lambda image, points_px: points_px
 
     @classmethod
     def of_images(
@@ -134,15 +140,28 @@ def ground_by_ipm(
     return ground.rolling(rows, camera, frames_of(drive).frame_of_image[rows], poses, rig)
 
 
-def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround:
+def ground_by_rig(
+    drive: Drive, cameras: Sequence[str], rig: Rig, section: CrossSection | None = None
+) -> ImageGround:
     """By optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
     rows, camera = _rows(drive, cameras)
     frame = frames_of(drive).frame_of_image[rows]
     poses = rig.map_from_vehicle[frame]
     extrinsic = rig.cam_from_vehicle[camera]
     homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
-    ground = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
-    return ground.rolling(rows, camera, frame, poses, rig)
+    out = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    out = out.rolling(rows, camera, frame, poses, rig)
+    if section is None:
+        return out
+    of_image, frame_of_image = np.full(len(drive.images), -1), frames_of(drive).frame_of_image
+    of_image[rows] = camera
+
+    def flattened_px(image: IntArray, points_px: FloatArray) -> FloatArray:
+        camera, frame = of_image[image], frame_of_image[image]
+        cam_from_map = rig.cam_from_map(camera, frame)
+        return section.flattened_px(rig.intrinsic[camera], cam_from_map, frame, points_px)
+
+    return replace(out, flattened_px=flattened_px)
 
 
 def collect_lane_points(
@@ -162,6 +181,7 @@ def collect_lane_points(
         empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
         return LaneCloud(*empty, guides)
     piece, image, points_px, row_share = _points(drive, lanes)
+    points_px = ground.flattened_px(image, points_px)
     homographies = ground.map_from_pinhole_px[image]
     points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
     points_map, jacobian = ground.at_rows(points_map[:, 0], image, row_share), jacobian[:, 0]
@@ -218,6 +238,7 @@ def _guides(
     if not lanes:
         return Guides()
     line, image, points_px, row_share = _points(drive, lanes)
+    points_px = ground.flattened_px(image, points_px)
     points_map = ground_points(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
     points_map = ground.at_rows(points_map, image, row_share)
     with np.errstate(invalid="ignore"):

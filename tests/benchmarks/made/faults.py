@@ -132,11 +132,12 @@ def _foreign(world: World) -> World:
     return replace(world, elsewhere=(other, range(count // 3, 2 * count // 3)))
 
 
-def _crown(fall: float, world: World) -> World:
-    """The road falls to both sides of the vehicle's route."""
+def _crown(fall: float, line_m: float, world: World) -> World:
+    """The road falls to both sides of a crown to the left of the vehicle, which leans with its own side."""
     corners = world.corners_map.copy()
     _, left_m = beside(world.port.route, corners[..., :2].reshape(-1, 2))
-    corners[..., 2] -= fall * np.abs(left_m).reshape(corners.shape[:2])
+    lower_m = 2 * np.maximum(left_m - line_m, 0.0) if line_m else np.abs(left_m)
+    corners[..., 2] -= fall * lower_m.reshape(corners.shape[:2])
     return replace(world, corners_map=corners)
 
 
@@ -211,7 +212,8 @@ SPOILS: Mapping[str, Spoil] = {
         Spoil("course heading", "heading|course", _course),
         Spoil("heading off", None, partial(_heading, 0.5)),
         Spoil("foreign images", r"foreign|other drive|another (drive|place)|belong", _foreign),
-        Spoil("crown", r"\bcrown|cross-?fall|falls to both", partial(_crown, 0.02)),
+        Spoil("crown", r"\bcrown|cross-?fall|falls to both", partial(_crown, 0.02, 0.0)),
+        Spoil("crown beside", r"\bcrown|cross-?fall|falls to both", partial(_crown, 0.02, 1.75)),
         Spoil("grade", None, partial(_grade, 0.01)),
         Spoil("no heights", r"slope|grade|\bheights?\b", partial(_grade, 0.01, heights=False)),
         Spoil("survey", r"survey|\bcentre", partial(_survey, (0.1, 0.0, 0.0)), r"survey|\bcentre"),

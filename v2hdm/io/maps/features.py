@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -145,16 +145,22 @@ def properties_of(feature: Feature) -> dict[str, Any]:
     }
 
 
-def with_heights(hd_map: HdMap, road: Road | None) -> HdMap:
+def with_heights(
+    hd_map: HdMap, road: Road | None, above_m: Callable[[FloatArray], FloatArray] | None = None
+) -> HdMap:
     """``hd_map`` with the recorded height of every corner and vertex; as it is without a ``road``.
 
-    What has heights already, of an earlier drive, keeps them.
+    What has heights already, of an earlier drive, keeps them. ``above_m`` gives the heights (N,) of the
+    ground at points (N, 2) above the road's planes.
     """
-    if road is None:
+    if road is None and above_m is None:
         return hd_map
 
     def height_m(known: FloatArray | None, points_map: FloatArray) -> FloatArray:
-        return ground_height_m(road, points_map) if known is None else known
+        if known is not None:
+            return known
+        recorded = np.zeros(len(points_map)) if road is None else ground_height_m(road, points_map)
+        return recorded if above_m is None else recorded + above_m(points_map)
 
     markings = tuple(replace(m, heights_m=height_m(m.heights_m, m.corners_map)) for m in hd_map.markings)
     lanes = tuple(replace(one, heights_m=height_m(one.heights_m, one.points_map)) for one in hd_map.lanes)

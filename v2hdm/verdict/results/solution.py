@@ -56,7 +56,9 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
     Fault.CLOCK_DRIFT: (
         "clock drift", "give images the times at which they were taken, on the clock of the receiver",
     ),
-    Fault.CROWN: ("crown", "keep to one side of the road's crown, or map the sides by themselves"),
+    Fault.CROWN: (
+        "crown", "set mapping.ground=auto, or map the sides of the road's crown by themselves",
+    ),
     Fault.COURSE: ("heading", "record the heading of the vehicle, as two antennas or an INS measure it"),
     Fault.STEP: ("position step", "check the receiver's log there, and leave out what has no RTK fix"),
     Fault.KNOCK: ("mounting", "fasten the camera, and map what was driven before and after by themselves"),
