@@ -39,7 +39,7 @@ from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
-from v2hdm.io.maps import ground_height_m
+from v2hdm.io.maps.features import ground_height_m
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import GROUNDS, PLANE, MappingOptions
 from v2hdm.pipeline.camera_sets import BEST, camera_sets

@@ -350,7 +350,7 @@ def _hypotheses(
             lengths = [(1 - other, scatter), (other, longer)]
             angles = [[nothing, _slanted(laid.corners_map, end)] for end, _ in ends]
         for (end, extent_m), cuts, ragged in zip(ends, angles, worn, strict=True):
-            ways = (
+            ways: tuple[tuple[FloatArray, FloatArray | float], ...] = (
                 (_MISPLACED_M * end, ragged),
                 (_WORN_SHARE * extent_m * end, ragged),
                 (-_RUN_ON_M * end, 0.0),
