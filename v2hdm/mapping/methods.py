@@ -24,8 +24,8 @@ from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
-from v2hdm.io.maps.features import with_heights
 from v2hdm.io.maps.evidence import Residuals
+from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
