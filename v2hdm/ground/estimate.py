@@ -309,7 +309,7 @@ def estimate_cameras(
     Args:
         drive: the drive.
         workers: processes, one thread each; 1 stays in this process.
-        progress: called as ``progress(done, total)`` after each camera.
+        progress: called as ``progress(done, total)`` before the first camera and after each.
         options: of :func:`estimate_ground`.
 
     Raises:
@@ -324,6 +324,8 @@ def estimate_cameras(
             progress(len(found), len(drive.cameras))
 
     names = list(drive.cameras)
+    if progress:
+        progress(0, len(names))
     if workers <= 1 or len(names) == 1:
         for name in names:
             take(estimate_ground(drive, name, options))
