@@ -96,7 +96,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
     matcher = Matcher(drive, camera, motion, options)
     readings = try_readings(drive, camera, matcher, stated, options.readings)
-    out, start = _nothing(camera, stated, readings), readings.start
+    out, start = _nothing(camera, readings), readings.start
     if readings.best is Reading.AS_GIVEN:
         solved: _Solved | _Lost = _Lost(start_pairs(stated), start.share)
         if start.mount is not None:
@@ -186,7 +186,7 @@ def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> 
     )
 
 
-def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
+def _nothing(camera: str, readings: Readings) -> GroundEstimate:
     little = readings.start.sought < _LEAST_PATCHES and readings.best is Reading.AS_GIVEN
     return GroundEstimate(
         camera=camera,
@@ -194,7 +194,6 @@ def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
         shares=readings.shares,
         reading=readings.best,
         calibration=None,
-        guess_cam_from_vehicle=stated.guess.cam_from_vehicle,
         parameters={},
         median_residual=float("nan"),
         innovations={},

@@ -121,7 +121,6 @@ class GroundEstimate:
     shares: Mapping[Reading, float]
     reading: Reading
     calibration: Calibration | None
-    guess_cam_from_vehicle: FloatArray
     parameters: Mapping[str, Parameter]
     median_residual: float
     innovations: Mapping[str, float]
