@@ -26,14 +26,13 @@ from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_step, sco
 from v2hdm.adjust.selection import MODELS, Model, Selection, predicts_better, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.validation import Excluded, Verdict
+from v2hdm.adjust.validation import Verdict
 
 __all__ = [
     "CHANGES",
     "MODELS",
     "ControlPoints",
     "Drift",
-    "Excluded",
     "Fault",
     "KnownLengths",
     "Model",
