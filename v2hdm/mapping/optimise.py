@@ -69,8 +69,7 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 _GROUND_ROUNDS = 6
 """Solves under better and better cross-sections, at most: four are enough for a crown of 4 %."""
 
-_SETTLED_SLOPE = 5e-4
-"""Change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path."""
+_SETTLED_SLOPE = 5e-4  # change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path
 
 
 def silent(step: str) -> None:
