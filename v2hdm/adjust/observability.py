@@ -55,25 +55,8 @@ class Observability:
 
 def observability(problem: Problem, solution: Solution) -> Sequence[Observability]:
     """How well each camera of ``problem`` is determined by the drive, one record a camera."""
-    sigma = problem.centre_sigma_m
-    return observed(
-        solution.cam_from_vehicle,
-        solution.extrinsic_covariance,
-        np.full((len(solution.cam_from_vehicle), 3), np.inf) if sigma is None else sigma,
-    )
-
-
-def observed(
-    cam_from_vehicle: FloatArray, covariance: FloatArray, centre_sigma_m: FloatArray
-) -> Sequence[Observability]:
-    """How well each of C cameras is determined by a drive.
-
-    Args:
-        cam_from_vehicle: (C, 4, 4) the extrinsics found.
-        covariance: (C, 6, 6) of their left tangents.
-        centre_sigma_m: (C, 3) of the prior of their centres, inf where there is none.
-    """
-    rotation = cam_from_vehicle[:, :3, :3]
+    rotation, covariance = solution.cam_from_vehicle[:, :3, :3], solution.extrinsic_covariance
+    centre_sigma_m = np.inf if problem.centre_sigma_m is None else problem.centre_sigma_m
     # The tangent's axes are the camera's, and its translation is minus the motion of the centre.
     centre = rotation.transpose(0, 2, 1) @ covariance[:, :3, :3] @ rotation
     turn = rotation.transpose(0, 2, 1) @ covariance[:, 3:, 3:] @ rotation
