@@ -113,10 +113,6 @@ class Optimiser:
         located = self._locate(self.initial_rig)
         return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
 
-    def run(self, tracks: Association, progress: Callable[[str], None] = silent) -> Optimised:
-        """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
-        return self.finish(self.settle(tracks, progress), progress)
-
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
         progress("coarse solve")
