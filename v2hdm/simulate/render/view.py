@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.textures import Float32
@@ -148,23 +149,8 @@ def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
     if not inside.any(axis=0).all():
         return polygon[:0]
     for line, level in zip(limits, least, strict=True):
-        polygon = _clip(polygon, line, level)
+        polygon = clip_half(polygon, polygon @ line - level)
     return polygon
-
-
-def _clip(polygon: FloatArray, line: FloatArray, least: float) -> FloatArray:
-    """The part (M, 3) of a homogeneous polygon (N, 3) where ``line . p >= least`` (Sutherland-Hodgman)."""
-    inside = polygon @ line - least
-    if (inside >= 0).all():
-        return polygon
-    following, inside_next = following_row(polygon), following_row(inside)
-    out: list[FloatArray] = []
-    for p, q, a, b in zip(polygon, following, inside, inside_next, strict=True):
-        if a >= 0:
-            out.append(p)
-        if (a >= 0) != (b >= 0):
-            out.append(p + (q - p) * (a / (a - b)))
-    return np.array(out).reshape(-1, 3)
 
 
 def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
