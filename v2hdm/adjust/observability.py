@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.adjust.model import state_residual
-from v2hdm.adjust.problem import POSE_STATES, Problem
+from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray, IntArray
 
@@ -87,7 +87,7 @@ class PoseInnovations:
     """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift.
 
     Attributes:
-        state: (S,) which of :data:`v2hdm.adjust.POSE_STATES` each is; a state with a drift has two.
+        state: (S,) which of :data:`v2hdm.adjust.problem.POSE_STATES` each is; a state with a drift has two.
         normalised: (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
     """
 
@@ -102,16 +102,6 @@ class PoseInnovations:
             return 1.0
         along, across = np.sqrt(np.mean(self.normalised[:, [ahead[0], left[0]]] ** 2, axis=0))
         return float(along / max(across, 1e-9))
-
-    def rms(self) -> dict[str, float]:
-        """Root mean square by the state's name, the larger one where it has two."""
-        count = max(len(self.normalised), 1)
-        size = np.sqrt(np.sum(self.normalised**2, axis=0) / count)
-        out: dict[str, float] = {}
-        for state, one in zip(self.state, size, strict=True):
-            name = POSE_STATES[state]
-            out[name] = max(out.get(name, 0.0), float(one))
-        return out
 
 
 def pose_innovations(solution: Solution) -> PoseInnovations:
