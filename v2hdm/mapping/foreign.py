@@ -48,7 +48,8 @@ def foreign_stretch(
         groups, number = np.unique(group[own], return_inverse=True)
         counts = np.zeros((2, len(ends), len(groups)))  # of views until then: that found it, and all
         step = np.searchsorted(ends, frame[own] - frames[0], side="right")
-        np.add.at(counts, (slice(None), step, number), np.stack([found[own], np.ones(own.sum())]))
+        for count, views_of_kind in zip(counts, (found[own], np.ones(own.sum())), strict=True):
+            np.add.at(count, (step, number), views_of_kind)
         counts, share = counts.cumsum(axis=1), float(found[own].mean())
         for first in range(len(ends) - 1):
             gains = _gains(counts[:, first + 1 :] - counts[:, first, None], counts[:, -1, None], share)

@@ -48,8 +48,8 @@ _POSE_NOISE_LIMIT = 3.0
 # jitter by 20 ms begin at 13; and what stamps may scatter by, s, before it matters.
 _ALONG_LIMIT, _LEAST_JITTER_S = 3.0, 0.005
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
-# Sigma of the point that the poses are of, m, up to which a drive makes it observable.
-_LEVER_OBSERVABLE_M = 0.15
+# Sigma, m, of the point that the poses are of, up to which a drive observes it: the usual accuracy goal.
+_LEVER_OBSERVABLE_M = 0.05
 
 # The check that reports each fault, and the recovery.
 _CHECKS: Mapping[Fault, tuple[str, str]] = {
@@ -221,11 +221,13 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
         says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
         yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M})
-    if axes and "survey" not in raised:
-        names = " and ".join(("forward", "left")[axis] for axis in axes)
+    loose = [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
+    if loose and "survey" not in raised:
+        names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
+        worst_m = max(one.sigma for one in loose)
+        sure = f"no better than {200 * worst_m:.0f} cm" if worst_m < 1 else "not"
         says = (
-            f"this drive does not tell how far {names} the cameras sit of the point that the poses are of: "
+            f"this drive tells {sure} how far {names} the cameras sit of the point that the poses are of: "
             "the survey of centre and antenna is relied on; drive a turn"
         )
         yield passed("survey", "all cameras", says)
