@@ -70,7 +70,7 @@ class PoseInnovations:
     """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift.
 
     Attributes:
-        state: (S,) which of :data:`v2hdm.adjust.POSE_STATES` each is; a state with a drift has two.
+        state: (S,) which of :data:`v2hdm.adjust.problem.POSE_STATES` each is; a state with a drift has two.
         normalised: (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
     """
 

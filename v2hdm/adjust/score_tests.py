@@ -64,6 +64,12 @@ _STRETCHES_PER_CHANGE = 2
 _MOST_CHANGES = 12
 """Frames at which inputs may change, of all sessions together: each costs a test of every camera and axis."""
 
+_DRIFTS = 3
+"""Shapes of a clock that drifts: evenly, in two half waves and in three."""
+
+_STEPS = ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5), (-(0.5**0.5), 0.5**0.5))
+"""Directions in the map in which positions may step: none is farther than 22.5 deg from one of them."""
+
 _LEAST_SPEED_MPS = 0.5
 """Below it a vehicle has no course."""
 
@@ -131,15 +137,16 @@ class ScoreTest:
         fault: what would be wrong.
         camera: of which camera of the problem; -1 for all together.
         axis: along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope,
-            datum, step), of the image (principal).
+            datum; step: east, north, north-east, north-west), of the image (principal); the side (crown:
+            both, left, right), the shape of a drift.
         item: which of the problem's control points, known lengths or (clock) visits, or the frame from which
             on inputs are wrong (step, knock); -1 for none or all.
         value: by how much, true minus stated.
         sigma: how well the drive observes it, by what its stretches disagree; inf where it cannot.
+        model_sigma: how well it would, were all noise as the model has it.
         p_value: how often a drive without the fault would show as large a value, 1 where it is unobservable.
         gain: by how much the fault raises the log likelihood of each stretch as the others predict it, summed
             over all; negative where the stretches do not agree on it.
-        image_share: of its information, what comes from images and not from the priors on poses and survey.
     """
 
     fault: Fault
@@ -148,9 +155,9 @@ class ScoreTest:
     item: int
     value: float = 0.0
     sigma: float = float("inf")
+    model_sigma: float = float("inf")
     p_value: float = 1.0
     gain: float = 0.0
-    image_share: float = 0.0
 
     @property
     def sigmas(self) -> float:
@@ -324,7 +331,6 @@ class _Answer:
         score, information: (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch.
         drawn: (D, G + 1) scores of noise as the model has it.
         own: the fault's information if all else were known.
-        image_share: see :class:`ScoreTest`.
     """
 
     hypothesis: _Hypothesis
@@ -332,7 +338,6 @@ class _Answer:
     information: FloatArray
     drawn: FloatArray
     own: float
-    image_share: float
 
     @classmethod
     def to(cls, hypothesis: _Hypothesis, bench: _Bench) -> _Answer:
@@ -340,7 +345,6 @@ class _Answer:
         column = hypothesis.column(bench)
         efficient = bench.efficient(column)
         information = bench.by_stretch(efficient, efficient)
-        seen = float(efficient["observations"].square().sum())
         own = sum(float(row.square().sum()) for row in column.values())
         return cls(
             hypothesis,
@@ -348,7 +352,6 @@ class _Answer:
             information,
             np.array([bench.by_stretch(efficient, noise) for noise in bench.noise]),
             own,
-            seen / max(float(information.sum()), 1e-300),
         )
 
     @property
@@ -395,9 +398,8 @@ class _Answer:
         others = (s.sum() - s[:-1]) / np.maximum(total - w[:-1], _LEAST_OBSERVABLE * total)
         gain = float(np.sum(others * s[:-1] - others**2 * w[:-1] / 2)) / multiple
         p_value = 2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + freedom))
-        return replace(
-            blank, value=self.value, sigma=sigma, p_value=p_value, gain=gain, image_share=self.image_share
-        )
+        numbers = {"value": self.value, "sigma": sigma, "model_sigma": total**-0.5, "p_value": p_value}
+        return replace(blank, **numbers, gain=gain)
 
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
@@ -424,8 +426,8 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.DISTORTION, _lens(camera, 1), camera)
         for axis in (0, 1):
             yield _Hypothesis(Fault.PRINCIPAL, _principal(problem, camera, axis), camera, axis)
-        if problem.twist_vehicle is not None:
-            yield _Hypothesis(Fault.CLOCK_DRIFT, _moving(_drift_motion(problem, camera)), camera)
+        for axis in range(_DRIFTS if problem.twist_vehicle is not None else 0):
+            yield _Hypothesis(Fault.CLOCK_DRIFT, _moving(_drift_motion(problem, camera, axis)), camera, axis)
         for frame in changes:
             for axis in (1, 2):
                 yield _Hypothesis(
@@ -433,9 +435,11 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
                 )
     for axis in (0, 1):
         yield _Hypothesis(Fault.SLOPE, _moving(_slope_motion(axis)), axis=axis)
+    for axis in range(len(_STEPS)):
         for frame in changes:
             yield _Hypothesis(Fault.STEP, _moving(_step_motion(axis, frame)), axis=axis, item=frame)
-    yield _Hypothesis(Fault.CROWN, _crown)
+    for axis in range(3):
+        yield _Hypothesis(Fault.CROWN, _crown(axis), axis=axis)
     if problem.twist_vehicle is not None:
         yield _Hypothesis(Fault.COURSE, _moving(_course_motion(problem)))
     if bool((arrays.centre_information_root > 0).any()):
@@ -497,7 +501,7 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         # Without the point its corner would lie farther from it, by the share that it had of the information.
         apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
         sigma, p_value = apart / max(squared, 1e-12) ** 0.5, float(stats.chi2.sf(squared, 2))
-        yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, p_value, squared / 2)
+        yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, sigma, p_value, squared / 2)
 
 
 def _lens(camera: int, power: int) -> Callable[[_Bench], Rows]:
@@ -567,10 +571,10 @@ def _changes(arrays: Arrays) -> list[int]:
     return within[1 :: max(_STRETCHES_PER_CHANGE, -(-len(within) // _MOST_CHANGES))]
 
 
-def _drift_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
-    """A clock that is right in the middle, and off by half the value at either end."""
-    frames = len(problem.map_from_vehicle)
-    late = np.linspace(-0.5, 0.5, frames)[:, None]
+def _drift_motion(problem: Problem, camera: int, axis: int) -> Callable[[Arrays], Tensor]:
+    """A clock that is off by between half the value and minus that, evenly or in more waves than one."""
+    share = np.linspace(0.0, 1.0, len(problem.map_from_vehicle))[:, None]
+    late = share - 0.5 if axis == 0 else 0.5 * np.cos((axis + 1) * np.pi * share)
     twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * late)
 
     def motion(arrays: Arrays) -> Tensor:
@@ -596,11 +600,11 @@ def _course_motion(problem: Problem) -> Callable[[Arrays], Tensor]:
 
 
 def _step_motion(axis: int, frame: int) -> Callable[[Arrays], Tensor]:
-    """Positions that are recorded short along an axis of the map, from a frame to the end of its session."""
+    """Positions that are recorded short along a direction, from a frame to the end of its session."""
 
     def motion(arrays: Arrays) -> Tensor:
         out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
-        out[..., :3] = arrays.vehicle_from_map[:, :3, axis]
+        out[..., :3] = arrays.vehicle_from_map[:, :3, :2] @ arrays.centre.new_tensor(_STEPS[axis])
         return out * _since(arrays, frame)
 
     return motion
@@ -627,14 +631,20 @@ def _since(arrays: Arrays, frame: int) -> Tensor:
     return (later & (arrays.visit == arrays.visit[frame])).to(arrays.centre.dtype)[:, None]
 
 
-def _crown(bench: _Bench) -> Rows:
-    """Corners that lie lower by the value times their distance from the route."""
-    arrays, estimate = bench.arrays, bench.whitening.estimate
-    frames = arrays.vehicle_from_map.inverse()
-    route = KDTree(frames[:, :2, 3].cpu().numpy())
-    nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
-    away = estimate.corners_map - frames[nearest, :2, 3]
-    return _raised(bench, -(away * frames[nearest, :2, 1]).sum(1).abs()[arrays.corner.long()])
+def _crown(axis: int) -> Callable[[_Bench], Rows]:
+    """Corners that lie lower by the value times their distance from the route, all or on one side alone."""
+
+    def column(bench: _Bench) -> Rows:
+        arrays, estimate = bench.arrays, bench.whitening.estimate
+        frames = arrays.vehicle_from_map.inverse()
+        route = KDTree(frames[:, :2, 3].cpu().numpy())
+        nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
+        away = estimate.corners_map - frames[nearest, :2, 3]
+        left = (away * frames[nearest, :2, 1]).sum(1)
+        lower = (left.abs(), left.clamp(min=0), -left.clamp(max=0))[axis]
+        return _raised(bench, -lower[arrays.corner.long()])
+
+    return column
 
 
 def _raised(bench: _Bench, height: Tensor) -> Rows:

@@ -24,11 +24,12 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.foreign import foreign_stretch
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, CROSS_SECTION, INCREMENTAL, MappingOptions, SurveyOptions
-from v2hdm.mapping.results import WINDOW_OBSERVATIONS, CameraFit, Contradiction, SolveEvidence
+from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.stated import name_of
-from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray
+from v2hdm.records import Drive, FloatArray, ImageDetections
 
 _log = logging.getLogger(__name__)
 
@@ -41,14 +42,18 @@ _CHANGE_SIGMAS = 4.5
 """The same where an input changes on the way: few stretches speak of it, and its p-values are too small."""
 
 
+_LIKELY = math.log(1e3 * 40)
+"""Log odds from which a fault is likelier than none: one drive in a thousand has one, of forty inputs."""
+
+
 @dataclass(frozen=True)
 class _Size:
     """Sizes of a fault, in its unit.
 
     Attributes:
         least: below it an input is as good as a drive needs it, however sure the drive is.
-        sigma: up to which a drive observes it. A less observable fault is nearly what something else can be,
-            and takes up what is left of other errors: of k1 on a straight street (.04), say.
+        sigma: up to which a drive observes it, were nothing wrong. A less observable fault is nearly what
+            something else can be, and takes up what is left of other errors: k1 on a straight street, say.
         usual: that it has where an input is wrong: half of all are smaller.
         most: that is physical. What calls for more is wrong in a way that nobody has foreseen.
     """
@@ -188,6 +193,8 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
+    views, cameras = views_of(drive, inputs.cameras), tuple(drive.cameras[name] for name in inputs.cameras)
+    evidence = replace(evidence, foreign=foreign_stretch(settled, inputs.sightings, views, cameras))
     return Outcome(inputs, optimised.bundle, evidence), optimised
 
 
@@ -256,7 +263,6 @@ def _evidence(
     final: Bundle,
     sightings: Sightings,
 ) -> SolveEvidence:
-    factors, window_s = _along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
     innovations = pose_innovations(settled.solution)
     largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
     stated_m = max(sigma.position_m for sigma in settled.problem.pose_sigmas)
@@ -269,8 +275,6 @@ def _evidence(
         held_out=optimiser.held_out,
         fits=_camera_fits(settled),
         variance_factor=_factor(settled, settled.solution.mahalanobis2),
-        along_route=factors,
-        window_s=window_s,
         pose_noise=optimiser.pose_noise,
         worst_innovation=float(largest.max()),
         worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
@@ -296,18 +300,24 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
     return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
 
 
-def is_contradicted(one: ScoreTest | Contradiction) -> bool:
+def is_contradicted(one: ScoreTest) -> bool:
     """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
     size, surely = _SIZES[one.fault], _CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS
-    return one.sigma <= size.sigma and one.sigmas > surely and abs(one.value) > size.least
+    return one.model_sigma <= size.sigma and one.sigmas > surely and abs(one.value) > size.least
 
 
-def is_physical(one: ScoreTest | Contradiction) -> bool:
+def is_likely(one: ScoreTest) -> bool:
+    """Whether an input is likelier off than right by more than matters, if not surely."""
+    size = _SIZES[one.fault]
+    return one.model_sigma <= size.sigma and abs(one.value) > size.least and log_odds(one) > _LIKELY
+
+
+def is_physical(one: ScoreTest) -> bool:
     """Whether an input can be off by so much; if not, something else is wrong that nobody has foreseen."""
     return abs(one.value) <= _SIZES[one.fault].most
 
 
-def log_odds(one: ScoreTest | Contradiction) -> float:
+def log_odds(one: ScoreTest) -> float:
     """How likely a fault is the cause, by its gain and by its size, which is Cauchy about the usual one."""
     return one.gain - math.log1p((one.value / _SIZES[one.fault].usual) ** 2)
 
@@ -391,15 +401,7 @@ def _contradictions(
     frame_s = _frame_s(bundle, sightings)
     return tuple(
         Contradiction(
-            fault=one.fault,
-            cameras=_cameras_of(bundle, one),
-            axis=one.axis,
-            about=_about(bundle, one, frame_s, visits),
-            value=one.value,
-            sigma=one.sigma,
-            p_value=one.p_value,
-            gain=one.gain,
-            image_share=one.image_share,
+            **vars(one), cameras=_cameras_of(bundle, one), about=_about(bundle, one, frame_s, visits)
         )
         for one in found
     )
@@ -419,27 +421,17 @@ def _point_of(bundle: Bundle, item: int) -> str:
 
 def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     """How well each camera's observations fit ``bundle``, a solve before anything was left out."""
-    fits = {}
+    seen, fits = bundle.problem.observations, {}
+    # A corner counts by what it knows: detectors err far, and in the tails, more than they state.
+    knows = 1 / np.trace(seen.covariance_px, axis1=1, axis2=2)
     for name, c in bundle.camera_index.items():
-        own = bundle.problem.observations.camera == c
+        own = seen.camera == c
         fits[name] = CameraFit(
             observations=int(own.sum()),
             variance_factor=_factor(bundle, bundle.solution.mahalanobis2[own]),
-            rejected_share=float(1 - bundle.inliers[own].mean()),
+            rejected_share=float(1 - np.average(bundle.inliers[own], weights=knows[own])),
         )
     return fits
-
-
-def _along_route(bundle: Bundle, frame: IntArray, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance factors (W,) of windows along the route, and when they begin (W,), s.
-
-    ``frame`` (K,) is that of each observation, ``stamp_s`` (F,) the frames' times.
-    """
-    order = np.argsort(frame, kind="stable")
-    count = max(len(order) // WINDOW_OBSERVATIONS, 1)
-    windows = np.array_split(order, count)
-    factors = [_factor(bundle, bundle.solution.mahalanobis2[window]) for window in windows]
-    return np.array(factors), np.array([stamp_s[frame[window[0]]] for window in windows])
 
 
 def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:

@@ -9,39 +9,23 @@ from typing import Protocol
 
 import numpy as np
 
-from v2hdm.adjust import Fault, sigmas_of
+from v2hdm.adjust import ScoreTest
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.suspicion import Suspicion
 
-WINDOW_OBSERVATIONS = 200
-"""Observations of a window along the route: their median varies by a tenth by chance."""
-
 
 @dataclass(frozen=True)
-class Contradiction:
-    """One input that would have to be wrong, as far as the residuals say.
+class Contradiction(ScoreTest):
+    """One input that would have to be wrong, as far as the residuals say, in the words of the user's inputs.
 
-    ``fault`` of ``cameras``, along ``axis`` 0 to 2 of the vehicle (survey, lever) or the map (slope, datum),
-    ``about`` the class of a known size and its length, a surveyed point, or the visit of a clock. ``value``
-    is true minus stated, in s, m, rad or a share; the rest is as in :class:`v2hdm.adjust.ScoreTest`.
+    ``cameras`` by name; ``about`` is the class of a known size and its length, a surveyed point, or the visit
+    of a clock.
     """
 
-    fault: Fault
-    cameras: tuple[str, ...]
-    axis: int
-    about: str
-    value: float
-    sigma: float
-    p_value: float
-    gain: float
-    image_share: float
-
-    @property
-    def sigmas(self) -> float:
-        """The standard deviations at which a normal distribution has this p-value."""
-        return sigmas_of(self.p_value)
+    cameras: tuple[str, ...] = ()
+    about: str = ""
 
 
 @dataclass(frozen=True)
@@ -49,7 +33,7 @@ class CameraFit:
     """How well one camera's ``observations`` fit.
 
     ``variance_factor`` is how many times as large as stated by the detector their variances are, by the
-    median; ``rejected_share`` of them the rest contradicts.
+    median; ``rejected_share`` is the share of their information that the rest contradicts.
     """
 
     observations: int
@@ -68,8 +52,6 @@ class SolveEvidence:
         held_out: mean robust loss of held-out observations by pose model; a little below 2 without errors.
         fits: by camera.
         variance_factor: as in :class:`CameraFit`, of all cameras.
-        along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
-        window_s: (W,) when each window begins, s.
         pose_noise: how many times as large as stated the drive shows the noise of the poses to be, by kind.
         worst_innovation: the largest of them all, in sigmas.
         worst_innovation_s: when, s.
@@ -77,6 +59,7 @@ class SolveEvidence:
         read_out_s: by camera the read-out time and its sigma, where it is estimated.
         jitter_s: by how much stamps would scatter, s, were all noise of the positions from them.
         along_over_across: how many times as much positions err anew along the way as across it.
+        foreign: as :func:`v2hdm.mapping.foreign.foreign_stretch` finds it.
     """
 
     score_tests: tuple[Contradiction, ...]
@@ -85,8 +68,6 @@ class SolveEvidence:
     held_out: Mapping[str, float]
     fits: Mapping[str, CameraFit]
     variance_factor: float
-    along_route: FloatArray
-    window_s: FloatArray
     pose_noise: Mapping[str, float]
     worst_innovation: float
     worst_innovation_s: float
@@ -94,6 +75,7 @@ class SolveEvidence:
     read_out_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     jitter_s: float = 0.0
     along_over_across: float = 1.0
+    foreign: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def held_out_loss(self) -> float | None:

@@ -23,13 +23,13 @@ class Spoil:
             to the colon, behind which the recovery is; None where the input is only unusual, and the map must
             be right.
         change: spoils a world.
-        hidden_on_straight: pattern of the check that must say that a straight drive cannot tell.
+        hidden: pattern of the check that must say that a drive cannot tell, where it raises nothing.
     """
 
     name: str
     cause: str | None
     change: Callable[[World], World]
-    hidden_on_straight: str | None = None
+    hidden: str | None = None
 
 
 def _with_poses(world: World, change: Callable[[FloatArray], FloatArray]) -> World:

@@ -25,6 +25,11 @@ _FASTEST_MPS = 40.0  # no vehicle maps markings faster (144 km/h): its images wo
 _HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
 # A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance.
 _EXTREME = 12.0
+# Stamps that scatter less are as good as a drive needs them.
+_LEAST_JITTER_MS = 5.0
+# Four standard errors of the logarithm of a ratio of two robust sigmas of one offset: half the offsets count,
+# as neighbours share poses, and a median absolute deviation is worth .37 of a standard deviation.
+_SURE_JITTER = 4 / (0.5 * 0.37) ** 0.5
 _HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the plane
 # Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator.
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
@@ -178,21 +183,20 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
     longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
     spare = 0.5 * _HARDEST_MPS2 * longest_s**2
     # Poses that all scatter by so many times what is stated do not jump: their scatter is a check of its own.
-    scatter_m = max(map(_robust_sigma, _off_neighbours(motion, motion.position[:, :2]).T)) / np.sqrt(1.5)
+    off = _off_neighbours(motion, motion.position[:, :2])
+    scatter_m = max(map(_robust_sigma, off.T)) / np.sqrt(1.5)
     usual = _EXTREME / 2 * float(np.clip(scatter_m, noise.position_m, _UNDERSTATED * noise.position_m))
+    heights = _off_neighbours(motion, motion.position[:, 2:])
     return [
-        _jump("position", motion, motion.position[:, :2], usual + spare),
-        _jump("height", motion, motion.position[:, 2:], _HEIGHT_NOISE * usual + spare),
+        _jitter(motion, off) or _jump("position", motion, off, usual + spare),
+        _jump("height", motion, heights, _HEIGHT_NOISE * usual + spare),
     ]
 
 
-def _jump(which: str, motion: Motion, values: FloatArray, limit: FloatArray) -> Finding:
-    """The worst of all offsets of values (P, D), m, from the line between their neighbours, by its limit."""
-    off = _off_neighbours(motion, values)
+def _jump(which: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Finding:
+    """The worst of offsets (P - 2, D), m, from the line between neighbours, by its limit."""
     size = np.linalg.norm(off, axis=1)
     worst = int(np.argmax(size / limit))
-    if size[worst] > limit[worst] and (jitter := _jitter(motion, off)) is not None:
-        return jitter
     count = int((size > limit).sum())
     # a step shows as half of it before and minus half of it behind.
     beside = off[max(worst - 1, 0) : worst + 2]
@@ -217,16 +221,20 @@ def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
     A lost fix moves a few records, and any way; a late stamp moves each, and only along the way.
     """
     ahead = motion.rotation[1:-1, :2, 0]
-    driven = motion.moving[:-1] & motion.moving[1:]
-    if off.shape[1] != 2 or not driven.any():
+    driven = motion.moving[:-2] & motion.moving[1:-1] & motion.moving[2:]
+    if not driven.any():
         return None
-    along = (off * ahead).sum(axis=1)[driven]
-    across = (off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])[driven]
+    # From one offset to the next, so that steady braking is none.
+    along = np.diff((off * ahead).sum(axis=1))[driven]
+    across = np.diff(off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])[driven]
     along_m, across_m = _robust_sigma(along), _robust_sigma(across)
-    if not 0 < _UNDERSTATED * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
+    surely = float(np.exp(_SURE_JITTER / np.sqrt(len(along))))
+    if not 0 < surely * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
         return None
-    # What lies between two neighbours that err as much is off by sqrt(1 + 1/4 + 1/4) sigmas.
-    jitter_ms = 1e3 * float(np.sqrt((along_m**2 - across_m**2) / 1.5) / np.median(motion.speed_mps))
+    # Four poses that err alike, by -1/2, 3/2, -3/2 and 1/2.
+    jitter_ms = 1e3 * float(np.sqrt((along_m**2 - across_m**2) / 5.0) / np.median(motion.speed_mps))
+    if jitter_ms < _LEAST_JITTER_MS:
+        return None
     says = (
         f"the stamps of the poses jitter by {jitter_ms:.0f} ms: positions scatter {along_m / across_m:.0f} "
         "times as much along the way as across it; stamp poses when they are measured, not when they arrive"

@@ -20,6 +20,7 @@ from v2hdm.mapping.recovery import (
     CONTRADICTED_SIGMAS,
     OBSERVABLE_SIGMA,
     is_contradicted,
+    is_likely,
     is_physical,
     log_odds,
 )
@@ -41,12 +42,14 @@ _EXCLUDED_LIMIT = 0.2
 _REJECTED_LIMIT = 0.06
 # Variance of observations over the detector's statement: clean drives reach .2, no distortion 6.
 _VARIANCE_LIMIT = 3.0
-_WINDOW_LIMIT = 8.0  # the worst window of the route as a multiple of the median one: clean drives reach 2
 # Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
 _POSE_NOISE_LIMIT = 3.0
+# Noise of poses along the way over that across it, from image to image: right drives reach 1.4, stamps that
+# jitter by 20 ms begin at 13; and what stamps may scatter by, s, before it matters.
+_ALONG_LIMIT, _LEAST_JITTER_S = 3.0, 0.005
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
-# Sigma of the point that the poses are of, m, up to which a drive makes it observable.
-_LEVER_OBSERVABLE_M = 0.15
+# Sigma, m, of the point that the poses are of, up to which a drive observes it: the usual accuracy goal.
+_LEVER_OBSERVABLE_M = 0.05
 
 # The check that reports each fault, and the recovery.
 _CHECKS: Mapping[Fault, tuple[str, str]] = {
@@ -93,7 +96,7 @@ _CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no know
 
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
-_MAP_AXES = ("east", "north")
+_MAP_AXES = ("east", "north", "north-east", "north-west")
 
 
 def check_result(
@@ -121,7 +124,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
     causes: list[Finding] = []
     symptoms: list[Finding] = []
     if best.evidence is not None:
-        causes = [*_stamps(best.evidence), *check_inputs(best.evidence)]
+        causes = [*_foreign(best.evidence), *_stamps(best.evidence), *check_inputs(best.evidence)]
         symptoms = [*check_fit(best.evidence), _excluded(best)]
     symptoms += check_doubles(best)
     if len(methods) > 1:
@@ -148,6 +151,9 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     if still:
         # Other inputs would explain part of the same residuals: the one that explains most is named.
         findings.append(_contradicted(still[0], still[1:]) if is_physical(still[0]) else _unknown(still[0]))
+        raised.add(findings[-1].check)
+    elif likely := [one for one in evidence.score_tests if is_likely(one)]:
+        findings.append(_likely(likely[0]))
         raised.add(findings[-1].check)
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.score_tests:
@@ -183,6 +189,11 @@ def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
     return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
 
 
+def _likely(one: Contradiction) -> Finding:
+    says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {_CHECKS[one.fault][1]}"
+    return _input(one, Status.WARN, says)
+
+
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
     check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
     return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
@@ -210,11 +221,13 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
         says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
         yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M})
-    if axes and "survey" not in raised:
-        names = " and ".join(("forward", "left")[axis] for axis in axes)
+    loose = [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
+    if loose and "survey" not in raised:
+        names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
+        worst_m = max(one.sigma for one in loose)
+        sure = f"no better than {200 * worst_m:.0f} cm" if worst_m < 1 else "not"
         says = (
-            f"this drive does not tell how far {names} the cameras sit of the point that the poses are of: "
+            f"this drive tells {sure} how far {names} the cameras sit of the point that the poses are of: "
             "the survey of centre and antenna is relied on; drive a turn"
         )
         yield passed("survey", "all cameras", says)
@@ -236,14 +249,6 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         wrong=f"corners scatter with {factor:.1f} {scatter}: poses, lens and images do not fit together; "
         "check camera_info and the pose_noise first",
     )  # fmt: skip
-    worst = int(np.argmax(evidence.along_route))
-    window = float(evidence.along_route[worst] / max(np.median(evidence.along_route), 1e-12))
-    yield judge(
-        "fit along the route", "map", window, _WINDOW_LIMIT, "",
-        fine="the fit is even along the route",
-        wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the usual "
-        "variance: the position jumps there, or poses are missing; check the fix of the receiver",
-    )  # fmt: skip
     for name, fit in evidence.fits.items():
         percent = 100 * fit.rejected_share
         yield judge(
@@ -261,15 +266,26 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         yield from _poses(evidence)
 
 
+def _foreign(evidence: SolveEvidence) -> Iterator[Finding]:
+    """Images of another place than those before and after them, and than their poses."""
+    begin_s, end_s, gain = evidence.foreign
+    yield judge(
+        "foreign images", "map", max(gain, 0.0), CONTRADICTED_SIGMAS**2 / 2, "",
+        fine="no stretch has markings that the other images lack",
+        wrong=f"from {begin_s:.1f} to {end_s:.1f} s the images show other markings than before and after, as "
+        "those of another drive do: compare the lists of images and poses",
+    )  # fmt: skip
+
+
 def _stamps(evidence: SolveEvidence) -> Iterator[Finding]:
     """Stamps that scatter: the poses err more than stated, from image to image, and only along the way."""
     ratio = evidence.along_over_across
-    if evidence.pose_noise.get("position_m", 0.0) > _POSE_NOISE_LIMIT < ratio:
+    if ratio > _ALONG_LIMIT and evidence.jitter_s > _LEAST_JITTER_S:
         says = (
             f"the stamps of the images jitter by {1e3 * evidence.jitter_s:.0f} ms: poses err {ratio:.0f} "
             "times as much along the way as across it: stamp images when exposed, not when they arrive"
         )
-        yield Finding("image stamps", Status.FAIL, ratio, _POSE_NOISE_LIMIT, "", says, "poses")
+        yield Finding("image stamps", Status.FAIL, ratio, _ALONG_LIMIT, "", says, "poses")
 
 
 def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
@@ -312,20 +328,21 @@ def _words(one: Contradiction) -> str:
     """The error and its size, as a clause."""
     whose, size = " and ".join(one.cameras), abs(one.value)
     cm = 100 * size
-    way = f"{cm:.0f} cm {_WAYS[one.axis][one.value > 0]}"
+    way = f"{cm:.0f} cm {_WAYS[min(one.axis, 2)][one.value > 0]}"
     match one.fault:
         case Fault.CLOCK:
             late = "later" if one.value > 0 else "earlier"
             where = f" {one.about}" if one.about else ""
             return f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than their stamps say"
         case Fault.CLOCK_DRIFT:
-            return (
-                f"the clock of the images of {whose} runs {'slow' if one.value > 0 else 'fast'}: by "
-                f"{1e3 * size:.0f} ms over the drive"
-            )
+            how = f"wanders, as stamps do that are counted: within {1e3 * size:.0f} ms"
+            if one.axis == 0:
+                how = f"runs {'slow' if one.value > 0 else 'fast'}: by {1e3 * size:.0f} ms over the drive"
+            return f"the clock of the images of {whose} {how}"
         case Fault.CROWN:
             way = "falls" if one.value > 0 else "rises"
-            return f"the ground {way} by {100 * size:.1f} % to both sides of the route, as on a crown"
+            side = ("both sides", "the left", "the right")[one.axis]
+            return f"the ground {way} by {100 * size:.1f} % to {side} of the route, as on a crown"
         case Fault.COURSE:
             return (
                 f"the heading is not the vehicle's, but the course of a point {size:.1f} m "

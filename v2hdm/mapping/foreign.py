@@ -1,0 +1,84 @@
+"""Whether the images of a stretch are those of another drive.
+
+Their markings are nowhere else, and the others' are not in them, although both should have been in view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import betaln
+
+from v2hdm.association.ground import Views, easy_views
+from v2hdm.association.sightings import Sightings
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.records import Camera, FloatArray
+
+_ENDS = 60
+"""Places along a session where a stretch may begin or end."""
+
+_PSEUDO_VIEWS = 2.0
+"""Views that the drive's share of found markings counts for in that of one: some are worn or half hidden."""
+
+_BY_MISTAKE = 0.05
+"""Share of its views in which a marking of one place is taken for one of the other."""
+
+_CONFUSED = 0.3
+"""Share of the markings that are a mixture of two, one of either place."""
+
+
+def foreign_stretch(
+    bundle: Bundle, sightings: Sightings, views: Views, cameras: tuple[Camera, ...]
+) -> tuple[float, float, float]:
+    """Find when the likeliest stretch begins and ends, s, and by how much it raises the log likelihood.
+
+    The markings of both places must be missed where they should be in view, so that neither a lorry that
+    hides some nor paint that is worn makes a stretch: the gain is that of the place that says less.
+    """
+    group, image = easy_views(views, bundle.rig, cameras, bundle.corners_map)
+    accepted, size = bundle.inliers, int(views.image.max()) + 1
+    known = bundle.group[accepted] * size + sightings.image[bundle.row[accepted]]
+    found, frame = np.isin(group * size + image, known), views.frame[np.searchsorted(views.image, image)]
+    best = 0.0, 0.0, -np.inf
+    for visit in np.unique(sightings.visit):
+        frames, own = np.flatnonzero(sightings.visit == visit), sightings.visit[frame] == visit
+        own &= np.isin(group, group[own & found])
+        if not own.any():
+            continue
+        ends = np.unique(np.linspace(0, len(frames), _ENDS + 1).astype(np.int64))
+        groups, number = np.unique(group[own], return_inverse=True)
+        counts = np.zeros((2, len(ends), len(groups)))  # of views until then: that found it, and all
+        step = np.searchsorted(ends, frame[own] - frames[0], side="right")
+        for count, views_of_kind in zip(counts, (found[own], np.ones(own.sum())), strict=True):
+            np.add.at(count, (step, number), views_of_kind)
+        counts, share = counts.cumsum(axis=1), float(found[own].mean())
+        for first in range(len(ends) - 1):
+            gains = _gains(counts[:, first + 1 :] - counts[:, first, None], counts[:, -1, None], share)
+            last = first + 1 + int(gains.argmax())
+            gain = float(gains.max() - np.log(len(ends) * (len(ends) - 1) / 2))
+            if gain > best[2]:
+                begin_s, end_s = sightings.stamp_s[frames[[ends[first], ends[last] - 1]]]
+                best = float(begin_s), float(end_s), gain
+    return best
+
+
+def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray:
+    """The gains (E,) of stretches: (2, E, G) views ``within`` that found markings, and all there are."""
+    beyond, together = all_over - within, _log_likelihood(all_over, share)
+    mistake = np.log([_BY_MISTAKE, 1 - _BY_MISTAKE])
+    home, foreign = (
+        _log_likelihood(own, share) + other[0] * mistake[0] + (other[1] - other[0]) * mistake[1] - together
+        for own, other in ((beyond, within), (within, beyond))
+    )
+    home, foreign = np.where(beyond[0] > 0, home, -np.inf), np.where(within[0] > 0, foreign, -np.inf)
+    gain = np.maximum(np.maximum(home, foreign), np.log(_CONFUSED))
+    both = (within[0] > 0) & (beyond[0] > 0)
+    of_home, of_foreign = (
+        np.sum(gain, axis=1, where=~both & one) for one in (home >= foreign, home < foreign)
+    )
+    return np.asarray(np.sum(gain, axis=1, where=both) + np.minimum(of_home, of_foreign))
+
+
+def _log_likelihood(counts: FloatArray, share: float) -> FloatArray:
+    """Of markings found in so many of their views, each by a share of its own (beta-binomial)."""
+    a, b = _PSEUDO_VIEWS * share, _PSEUDO_VIEWS * (1 - share)
+    return np.asarray(betaln(counts[0] + a, counts[1] - counts[0] + b) - betaln(a, b))
