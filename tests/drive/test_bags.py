@@ -331,3 +331,29 @@ def test_memory_does_not_grow_with_the_bag(kind, folder, tmp_path):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0] + 100_000
+
+
+def test_notes_beside_an_import_stay_when_it_is_made_anew(folder, bags, tmp_path):
+    content = described(folder, bags["mcap"])
+    image = read(tmp_path / "drive", content).images[0].path
+    notes = [image.parent / "notes.md", image.parent / "photos" / "a.txt"]
+    for path in notes:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    image.write_bytes(b"damaged")
+    assert read(tmp_path / "drive", content).images[0].path.read_bytes() != b"damaged"
+    assert [path.read_text() for path in notes] == ["mine", "mine"]
+    assert len(list(image.parent.glob("*kept*"))) == 0
+
+
+def test_an_image_of_a_bag_has_one_name_from_wherever_the_cache_is_named(folder, bags, tmp_path, monkeypatch):
+    """Or else the pictures of a report that is made again are those of no image."""
+    root = tmp_path / "drive"
+    root.mkdir()
+    (root / "drive.yaml").write_text(yaml.safe_dump(described(folder, bags["mcap"])))
+    names = []
+    for here, path, cache in ((tmp_path, "drive", "cache"), (root, str(root), str(tmp_path / "cache"))):
+        monkeypatch.chdir(here)
+        drive = read_drive(Path(path), ReadOptions(cache=cache))
+        names.append([drive.name_of(image.path) for image in drive.images])
+    assert names[0] == names[1]

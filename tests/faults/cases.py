@@ -15,6 +15,7 @@ import yaml
 
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
 from tests.faults.judge import Case, Prepare
+from tests.faults.owners import geopackages, owners
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.records import Calibration
@@ -644,4 +645,5 @@ def _run_file(data: bytes) -> Prepare:
 
 def all_cases() -> list[Case]:
     """The table."""
-    return [case for part in (texts, names, images, fields, outputs, arguments, settings) for case in part()]
+    parts = (texts, names, images, fields, outputs, owners, geopackages, arguments, settings)
+    return [case for part in parts for case in part()]

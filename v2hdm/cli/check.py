@@ -33,7 +33,7 @@ def run(arguments: Sequence[str]) -> int:
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
     settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras), "ground": parsed.ground}
-    with result_of(folder, settings) as unfinished:
+    with result_of(folder, f"v2hdm check of {parsed.drive.resolve()}", settings) as unfinished:
         ground = estimate_cameras(drive, parsed.workers) if parsed.ground else {}
         verdict = check_drive(drive, ground=ground)
         write_json(unfinished / "verdict.json", verdict.as_json())
