@@ -52,6 +52,10 @@ class _Patient(io.StringIO):
         self._stream = stream
         self.isatty = stream.isatty  # type: ignore[method-assign]
 
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return getattr(self._stream, "encoding", None) or "utf-8"
+
     def write(self, text: str) -> int:
         try:
             self._stream.write(text)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from backports import zstd
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.drive.bags import (
@@ -357,3 +358,44 @@ def test_an_image_of_a_bag_has_one_name_from_wherever_the_cache_is_named(folder,
         drive = read_drive(Path(path), ReadOptions(cache=cache))
         names.append([drive.name_of(image.path) for image in drive.images])
     assert names[0] == names[1]
+
+
+HOSTILE = {
+    "a constant in parentheses": "module a { module msg { const long X = (1); struct B { long x; }; }; };",
+    "nested parentheses": "@a(b((1))) struct B { long x; };",
+    "a trillion texts": "string[1000000000000] names",
+    "a trillion texts at most": "string[<=1000000000000] names",
+    "more digits than a number has": f"uint8[{'9' * 5000}] data",
+    "nested brackets": "uint8" + "[" * 3000,
+    "four million letters": "uint8 a\n" * 500_000,
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_definition_that_would_be_parsed_for_ever_is_refused(name, folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        values = ("ros2idl" if "struct" in HOSTILE[name] else "ros2msg", HOSTILE[name])
+        database.execute(
+            "UPDATE message_definitions SET encoding = ?, encoded_message_definition = ?", values
+        )
+    database.close()
+    with pytest.raises(DriveError, match="its definition is none of a recording's"):
+        read(tmp_path / "drive", described(folder, bag))
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_zeros_that_would_unpack_to_all_of_the_memory_are_refused(mode, folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3, mode)
+    bomb = zstd.compress(bytes(260_000_000))
+    if mode == CompressionMode.FILE:
+        (file,) = bag.glob("*.zstd")
+        file.write_bytes(bomb)
+    else:
+        (file,) = bag.glob("*.db3")
+        with sqlite3.connect(file) as database:
+            database.execute("UPDATE messages SET data = ?", (bomb,))
+        database.close()
+    with pytest.raises(DriveError, match="unpacks to more than a recording would"):
+        read(tmp_path / "drive", described(folder, bag))

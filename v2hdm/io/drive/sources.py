@@ -6,7 +6,8 @@ All that a drive wants of its bag is gathered first and then imported in one pas
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,15 @@ from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
-from v2hdm.io.safe.pixels import png
+from v2hdm.io.safe.pixels import VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole
 
 _log = logging.getLogger(__name__)
+
+_TAIL_S = 1.0  # sound may go on after the last frame
 
 _Lister = Callable[[], ImageFiles]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -173,6 +176,16 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
     return images
 
 
+@contextmanager
+def _errors_of(av: Any) -> Iterator[None]:
+    """FFmpeg's log holds errors within, and nothing again after."""
+    av.logging.set_level(av.logging.ERROR)
+    try:
+        yield
+    finally:
+        av.logging.set_level(None)
+
+
 def _import_video(path: Path, cache: Path, where: str) -> Path:
     """The folder of the frames of a video as PNG files, decoded by PyAV now unless they were before.
 
@@ -188,10 +201,24 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
     with new_entry(folder) as partial:
         stamps: list[float] = []
         names: list[str] = []
+        complained = ""
         try:
-            with av.open(str(path)) as container:
+            with (
+                _errors_of(av),
+                av.logging.Capture(local=False) as complaints,
+                av.open(str(path), options=VIDEO_OPTIONS) as container,
+            ):
+                promised_s = (container.duration or 0) / av.time_base
                 for frame in container.decode(video=0):
                     where = f"{path}: frame {len(stamps) + 1}"
+                    if frame.rotation:
+                        raise DriveError(
+                            f"{where} says to turn it, and a calibration is of pixels as they are stored: "
+                            "take the rotation out of the video"
+                        )
+                    if (complaints or frame.is_corrupt) and not complained:
+                        complained = complaints[-1][2].strip() if complaints else "corrupt"
+                        _log.warning("%s: the decoder complains (%s); is it damaged?", where, complained)
                     if frame.pts is None:
                         raise DriveError(f"{where} has no time; give stamps, a time a line")
                     stamps.append(float(frame.pts * frame.time_base))
@@ -204,6 +231,8 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
             raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
+        if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):
+            _log.warning("%s: its frames end before its %.1f s do; is it cut off?", path, promised_s)
         write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
     return folder
 
