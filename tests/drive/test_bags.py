@@ -2,6 +2,7 @@
 
 import logging
 import sqlite3
+import struct
 import tracemalloc
 from collections.abc import Callable
 from fractions import Fraction
@@ -27,8 +28,10 @@ from tests.drive.bags import (
     write_ros2,
 )
 from tests.drive.example import make_drive
+from v2hdm.detection.frames import video_frames
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
+from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag.describe import list_topics
 from v2hdm.io.importers.bag.messages import file_of
 from v2hdm.io.importers.bag.streams import ImageStream, import_streams
@@ -399,3 +402,37 @@ def test_zeros_that_would_unpack_to_all_of_the_memory_are_refused(mode, folder, 
         database.close()
     with pytest.raises(DriveError, match="unpacks to more than a recording would"):
         read(tmp_path / "drive", described(folder, bag))
+
+
+def _video(path, frames=20):
+    with av.open(str(path), "w") as container:
+        track = container.add_stream("mpeg4", rate=10)
+        track.width, track.height = 320, 240
+        rng = np.random.default_rng(1)
+        for _ in range(frames):
+            pixels = cv2.resize(rng.integers(0, 255, (24, 32, 3)).astype(np.uint8), (320, 240))
+            container.mux(track.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
+        container.mux(track.encode(None))
+    return path.read_bytes()
+
+
+def test_a_video_that_is_cut_off_turned_or_a_playlist_is_reported(tmp_path, caplog):
+    path = tmp_path / "a.mkv"
+    whole = _video(path)
+    assert len(list(_import_video(path, tmp_path / "whole", "here").glob("*.png"))) == 20
+    assert not caplog.messages
+    path.write_bytes(whole[: len(whole) * 6 // 10])
+    assert len(list(_import_video(path, tmp_path / "cut", "here").glob("*.png"))) < 20
+    assert "is it cut off?" in caplog.text
+    path = tmp_path / "a.mp4"
+    turned = bytearray(_video(path))
+    matrix = turned.index(b"tkhd") + 44  # ISO/IEC 14496-12, 8.3.2
+    turned[matrix : matrix + 36] = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 240 << 16, 0, 1 << 30)
+    path.write_bytes(turned)
+    with pytest.raises(DriveError, match="frame 1 says to turn it"):
+        _import_video(path, tmp_path / "turned", "here")
+    assert len(list(video_frames(path))) == 20
+    assert "turned by 90 degrees" in caplog.text
+    path.write_text("ffconcat version 1.0\nfile a.mkv\n")
+    with pytest.raises(DriveError, match="not readable as a video"):
+        _import_video(path, tmp_path / "list", "here")

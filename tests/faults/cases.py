@@ -16,10 +16,11 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from tests.calibration.site import INFO
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
 from tests.faults.judge import Case, Prepare
 from tests.faults.owners import geopackages, owners
-from v2hdm.io.calibration.writing import write_calibration
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.records import Calibration
 
@@ -343,6 +344,30 @@ def texts() -> Iterator[Case]:
     yield checked("poses: ns", "nanoseconds", write(poses[1], ns))
     late = "\n".join(f"{9100 + 0.1 * n:.1f} {n} 0 0 0 0 0 1" for n in range(30))
     yield checked("poses: of another day", "begin 9000 s later", write(poses[1], late))
+
+
+POINTS = {
+    "a cell of 200000 letters": (f"name,u,v,x,y\n{'P' * 200_000},1,2,3,4\n", "is no table"),
+    "an open quote of 200000 letters": ('name,u,v,x,y\n"' + "P" * 200_000, "is no table"),
+    "one point 3000 times": ("name,u,v,x,y\n" + "P,100,100,8,0\n" * 3000, "have the same pixel"),
+    "a name that moves the cursor": ("name,u,v,x,y\n\x1b[2J,-9,2,3,4\n" + "a,1,1,9,1\n" * 5, r"\?\[2J"),
+    "no number": ("u,v,x,y\n1,2,3,nan\n", "y"),
+    "too few cells": ("u,v,x,y\n1,2,3\n", "3 cells under 4 columns"),
+}
+
+
+def _info(root: Path) -> None:
+    write_camera_info(INFO, root / "camera_info.yaml")
+
+
+def points() -> Iterator[Case]:
+    """Tables of surveyed points."""
+    line = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
+    for name, (text, says) in POINTS.items():
+        prepare = _both(
+            lambda root: write_camera_info(INFO, root / "camera_info.yaml"), write("points.csv", text)
+        )
+        yield Case(f"points: {name}", "v2hdm calibrate points", line, prepare, says)
 
 
 def names() -> Iterator[Case]:
@@ -683,5 +708,5 @@ def _run_file(data: bytes) -> Prepare:
 
 def all_cases() -> list[Case]:
     """The table."""
-    parts = (texts, names, images, fields, outputs, owners, geopackages, arguments, settings)
+    parts = (texts, points, names, images, fields, outputs, owners, geopackages, arguments, settings)
     return [case for part in parts for case in part()]

@@ -74,18 +74,23 @@ class _Target:
                 f"output folder {self.shown} holds files that are no results of ours: give another "
                 f"{self.option}"
             )
-        listed: dict[str, list[str]] = {}
-        head, entries = self.read_list()
-        for entry in entries:
-            if made is None or made == entry.get("made", head):
-                listed.setdefault(entry["file"], []).append(entry["sha256"])
-        if made is not None and made != head:
+        head = self.read_list()[0]
+        if made not in (None, head):
             maker = head or "an earlier version"
             raise ConfigError(
                 f"output folder {self.shown} holds a result of {maker}, not of {made}: move it, or give "
                 f"another {self.option}"
             )
-        return listed
+        return self.digests(made)
+
+    def digests(self, made: str | None) -> dict[str, list[str]]:
+        """The entries of its list by name, only those that were ``made`` so where that is given."""
+        head, entries = self.read_list()
+        found: dict[str, list[str]] = {}
+        for one in entries:
+            if made in (None, one.get("made", head)):
+                found.setdefault(one["file"], []).append(one["sha256"])
+        return found
 
     def read_list(self) -> tuple[str, list[dict[str, str]]]:
         """What has made the folder, and the entries of its list; nothing where there is no list."""
@@ -251,12 +256,8 @@ def listed_files(folder: Path, option: str, made: str) -> Iterator[None]:
     ConfigError where what is to be replaced was not ``made`` by the same, or the folder cannot be written.
     """
     there = _Target(folder, option)
-    head, entries = there.read_list()
-    ours: dict[str, list[str]] = {}
-    for one in entries:
-        if one.get("made", head) == made:
-            ours.setdefault(one["file"], []).append(one["sha256"])
-    others = {} if head == made else {"made": made}
+    ours = there.digests(made)
+    others = {} if there.read_list()[0] == made else {"made": made}
 
     def list_file(new: Path, path: Path) -> None:
         named = (Path(os.path.abspath(one)) for one in (folder, there.path))  # noqa: PTH100  # links stay

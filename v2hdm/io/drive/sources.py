@@ -6,8 +6,7 @@ All that a drive wants of its bag is gathered first and then imported in one pas
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -176,16 +175,6 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
     return images
 
 
-@contextmanager
-def _errors_of(av: Any) -> Iterator[None]:
-    """FFmpeg's log holds errors within, and nothing again after."""
-    av.logging.set_level(av.logging.ERROR)
-    try:
-        yield
-    finally:
-        av.logging.set_level(None)
-
-
 def _import_video(path: Path, cache: Path, where: str) -> Path:
     """The folder of the frames of a video as PNG files, decoded by PyAV now unless they were before.
 
@@ -202,9 +191,9 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
         stamps: list[float] = []
         names: list[str] = []
         complained = ""
+        av.logging.set_level(av.logging.ERROR)
         try:
             with (
-                _errors_of(av),
                 av.logging.Capture(local=False) as complaints,
                 av.open(str(path), options=VIDEO_OPTIONS) as container,
             ):
@@ -229,6 +218,8 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
             raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
+        finally:
+            av.logging.set_level(None)
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
         if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):

@@ -22,10 +22,11 @@ from v2hdm.store.files import load_yaml, take_mapping
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _TIMES, _SPARE_BYTES = 10, 200_000_000  # what a piece may unpack to: so many times its bytes, and these
-_MOST_LETTERS, _MOST_ELEMENTS = 1_000_000, 1_000_000  # of a type's definition, and of an array in it
+_MOST_LETTERS = 1_000_000  # of a type's definition
 _TEXTS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\Z)|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
 _CONSTANT, _LITERAL = re.compile(r"\bconst\b[^=;]*=([^;]*)"), re.compile(r"\s*[-+]?[\w.:]*\s*")
-_LENGTH, _NESTED = re.compile(r"\[[\s<=]*(\d+)"), re.compile(r"\([^()]*\(|\[[^\[\]]*\[")
+_LONG = re.compile(r"\[[\s<=]*\d{8,}")  # an array of ten million elements
+_NESTED = re.compile(r"\([^()]*\(|\[[^\[\]]*\[")
 _MEND = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 
 
@@ -236,13 +237,8 @@ def _check_definition(text: str) -> None:
     """Refuse a type on which rosbags' parser, or what it generates, would take for ever."""
     plain = _TEXTS.sub("", text)
     odd = any(not _LITERAL.fullmatch(one[1]) for one in _CONSTANT.finditer(plain))
-    lengths = [one[1] for one in _LENGTH.finditer(plain)]
-    if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or any(map(_is_long, lengths)):
+    if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or _LONG.search(plain):
         raise DriveError("its definition is none of a recording's; convert it where it was recorded")
-
-
-def _is_long(digits: str) -> bool:
-    return len(digits) > len(str(_MOST_ELEMENTS)) or int(digits) > _MOST_ELEMENTS
 
 
 def _check_database(path: Path) -> None:
