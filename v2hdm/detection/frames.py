@@ -130,8 +130,8 @@ def _capture(source: str | int, refused: str) -> Iterator[cv2.VideoCapture]:
     os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", options)
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        is_camera = isinstance(source, int)
-        capture = cv2.VideoCapture(source, cv2.CAP_ANY if is_camera else cv2.CAP_FFMPEG)
+        backend = () if isinstance(source, int) else (cv2.CAP_FFMPEG,)
+        capture = cv2.VideoCapture(source, *backend)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:
