@@ -1,5 +1,7 @@
 """The commands: a list of them, their versions, and one line for Ctrl-C or a missing library."""
 
+import errno
+import io
 import os
 import re
 import subprocess
@@ -15,6 +17,7 @@ import yaml
 
 from v2hdm import __version__
 from v2hdm.cli.main import COMMANDS, run, version_line
+from v2hdm.progress import patient
 
 ROOT = Path(__file__).parents[1]
 PRESSED_TWICE = """
@@ -89,6 +92,31 @@ def test_help_that_nobody_reads_to_its_end_is_no_error(arguments):
             [sys.executable, "-m", *arguments], cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, timeout=60
         )
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+class FullDisk(io.StringIO):
+    def write(self, text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_terminal_that_fails_stops_no_work_and_is_reported_at_its_end(monkeypatch, capsys):
+    done = []
+
+    def work():
+        out, error = patient(sys.stdout), patient(sys.stderr)
+        for stream in (out, error):
+            for _ in range(3):
+                print("progress", file=stream, flush=True)
+        done.append("all of it")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", FullDisk())
+        assert COMMANDS["map"].guard(work) == 2
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", FullDisk())
+        assert COMMANDS["map"].guard(work) == 0
+    assert done == ["all of it"] * 2
+    assert "error: standard output, when all files were written: No space left" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("given", "expected"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])

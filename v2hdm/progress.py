@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import IO, TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
     from rich.console import Console
@@ -38,6 +40,34 @@ def progress_lines(write: Callable[[str], None]) -> Progress:
             write(f"{task}: {done} of {total}")
 
     return advance
+
+
+failures_of_stdout: list[OSError] = []
+"""The last failure that :func:`patient` has kept back, for the end of the command."""
+
+
+class _Patient(io.StringIO):
+    def __init__(self, stream: IO[str]) -> None:
+        super().__init__()
+        self._stream = stream
+        self.isatty = stream.isatty  # type: ignore[method-assign]
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return getattr(self._stream, "encoding", None) or "utf-8"
+
+    def write(self, text: str) -> int:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError as failure:
+            failures_of_stdout[:] = [failure] if self._stream is sys.stdout else failures_of_stdout
+        return len(text)
+
+
+def patient(stream: IO[str]) -> IO[str]:
+    """A stream that keeps failures back, so that a full disk or a closed pipe behind it stops no work."""
+    return _Patient(stream)
 
 
 @contextmanager

@@ -248,6 +248,11 @@ class Drive:
     unposed: Mapping[str, int] = field(default_factory=dict)
     joined: tuple[Visit, ...] = ()
 
+    def name_of(self, path: Path) -> str:
+        """What files of results call an image: its path below the drive's folder, else its whole path."""
+        path, root = path.absolute(), self.root.absolute()
+        return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
     @property
     def visits(self) -> tuple[Visit, ...]:
         """The drives that it was joined of, or itself alone."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 
@@ -87,6 +88,10 @@ def test_a_damaged_model_is_refused(tmp_path):
         ({"classes": list(PAINT_CLASSES), "multiple": 15, "strides": STRIDES}, "do not divide"),
         ({"classes": list(PAINT_CLASSES), "multiple": 16, "strides": STRIDES | {"kinds": 1}}, "no multiple"),
         ({"classes": list(PAINT_CLASSES), "multiple": "many", "strides": STRIDES}, "no usable 'v2hdm'"),
+        ({"classes": [PAINT_CLASSES[0]] * 2, "multiple": 16, "strides": STRIDES}, "not one for each channel"),
+        ({"classes": list(PAINT_CLASSES), "multiple": 10**9, "strides": STRIDES}, "multiple 1000000000"),
+        ({"classes": list(PAINT_CLASSES), "multiple": 0, "strides": STRIDES}, "multiple 0"),
+        ({"classes": list(PAINT_CLASSES), "multiple": 16, "strides": [2, 4]}, "no usable 'v2hdm'"),
         ({"classes": list(PAINT_CLASSES), "multiple": 16, "stride": 2}, "no usable 'v2hdm' metadata"),
     ],
 )
@@ -94,6 +99,15 @@ def test_a_model_with_wrong_metadata_is_refused(tmp_path, metadata, words):
     save_model(tmp_path / "m.onnx", (0.1, 0.0), KINDS, metadata)
     with pytest.raises(DetectorError, match=words):
         Network(tmp_path / "m.onnx")
+
+
+def test_metadata_nested_deeper_than_any_is_refused_in_one_line(tmp_path):
+    model = onnx.load(brightness_model(tmp_path))
+    (own,) = [one for one in model.metadata_props if one.key == "v2hdm"]
+    own.value = "[" * 3000 + "]" * 3000
+    onnx.save(model, tmp_path / "deep.onnx")
+    with pytest.raises(DetectorError, match="nested deeper"):
+        Network(tmp_path / "deep.onnx")
 
 
 def test_a_model_whose_outputs_disagree_with_its_metadata_is_refused(tmp_path):

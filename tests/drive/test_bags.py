@@ -4,6 +4,7 @@ import json
 import logging
 import re
 import sqlite3
+import struct
 import tracemalloc
 from collections.abc import Callable
 from fractions import Fraction
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from backports import zstd
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.drive.bags import (
@@ -30,10 +32,12 @@ from tests.drive.bags import (
 )
 from tests.drive.example import make_drive
 from v2hdm.cli.main import run
+from v2hdm.detection.frames import video_frames
 from v2hdm.errors import DriveError
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
+from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag.describe import list_topics
 from v2hdm.io.importers.bag.messages import file_of
 from v2hdm.io.importers.bag.streams import ImageStream, import_streams
@@ -370,3 +374,104 @@ def test_memory_does_not_grow_with_the_bag(kind, folder, tmp_path):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0] + 100_000
+
+
+def test_notes_beside_an_import_stay_when_it_is_made_anew(folder, bags, tmp_path):
+    content = described(folder, bags["mcap"])
+    image = read(tmp_path / "drive", content).images[0].path
+    notes = [image.parent / "notes.md", image.parent / "photos" / "a.txt"]
+    for path in notes:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    image.write_bytes(b"damaged")
+    assert read(tmp_path / "drive", content).images[0].path.read_bytes() != b"damaged"
+    assert [path.read_text() for path in notes] == ["mine", "mine"]
+    assert len(list(image.parent.glob("*kept*"))) == 0
+
+
+def test_an_image_of_a_bag_has_one_name_from_wherever_the_cache_is_named(folder, bags, tmp_path, monkeypatch):
+    """Or else the pictures of a report that is made again are those of no image."""
+    root = tmp_path / "drive"
+    root.mkdir()
+    (root / "drive.yaml").write_text(yaml.safe_dump(described(folder, bags["mcap"])))
+    names = []
+    for here, path, cache in ((tmp_path, "drive", "cache"), (root, str(root), str(tmp_path / "cache"))):
+        monkeypatch.chdir(here)
+        drive = read_drive(Path(path), ReadOptions(cache=cache))
+        names.append([drive.name_of(image.path) for image in drive.images])
+    assert names[0] == names[1]
+
+
+HOSTILE = {
+    "a constant in parentheses": "module a { module msg { const long X = (1); struct B { long x; }; }; };",
+    "nested parentheses": "@a(b((1))) struct B { long x; };",
+    "a trillion texts": "string[1000000000000] names",
+    "a trillion texts at most": "string[<=1000000000000] names",
+    "more digits than a number has": f"uint8[{'9' * 5000}] data",
+    "nested brackets": "uint8" + "[" * 3000,
+    "four million letters": "uint8 a\n" * 500_000,
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_definition_that_would_be_parsed_for_ever_is_refused(name, folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        values = ("ros2idl" if "struct" in HOSTILE[name] else "ros2msg", HOSTILE[name])
+        database.execute(
+            "UPDATE message_definitions SET encoding = ?, encoded_message_definition = ?", values
+        )
+    database.close()
+    with pytest.raises(DriveError, match="its definition is none of a recording's"):
+        read(tmp_path / "drive", described(folder, bag))
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_zeros_that_would_unpack_to_all_of_the_memory_are_refused(mode, folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3, mode)
+    bomb = zstd.compress(bytes(260_000_000))
+    if mode == CompressionMode.FILE:
+        (file,) = bag.glob("*.zstd")
+        file.write_bytes(bomb)
+    else:
+        (file,) = bag.glob("*.db3")
+        with sqlite3.connect(file) as database:
+            database.execute("UPDATE messages SET data = ?", (bomb,))
+        database.close()
+    with pytest.raises(DriveError, match="unpacks to more than a recording would"):
+        read(tmp_path / "drive", described(folder, bag))
+
+
+def _video(path, frames=20):
+    with av.open(str(path), "w") as container:
+        track = container.add_stream("mpeg4", rate=10)
+        track.width, track.height = 320, 240
+        rng = np.random.default_rng(1)
+        for _ in range(frames):
+            pixels = cv2.resize(rng.integers(0, 255, (24, 32, 3)).astype(np.uint8), (320, 240))
+            container.mux(track.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
+        container.mux(track.encode(None))
+    return path.read_bytes()
+
+
+def test_a_video_that_is_cut_off_turned_or_a_playlist_is_reported(tmp_path, caplog):
+    path = tmp_path / "a.mkv"
+    whole = _video(path)
+    assert len(list(_import_video(path, tmp_path / "whole", "here").glob("*.png"))) == 20
+    assert not caplog.messages
+    path.write_bytes(whole[: len(whole) * 6 // 10])
+    assert len(list(_import_video(path, tmp_path / "cut", "here").glob("*.png"))) < 20
+    assert "is it cut off?" in caplog.text
+    path = tmp_path / "a.mp4"
+    turned = bytearray(_video(path))
+    matrix = turned.index(b"tkhd") + 44  # ISO/IEC 14496-12, 8.3.2
+    turned[matrix : matrix + 36] = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 240 << 16, 0, 1 << 30)
+    path.write_bytes(turned)
+    with pytest.raises(DriveError, match="frame 1 says to turn it"):
+        _import_video(path, tmp_path / "turned", "here")
+    assert len(list(video_frames(path))) == 20
+    assert "turned by 90 degrees" in caplog.text
+    path.write_text("ffconcat version 1.0\nfile a.mkv\n")
+    with pytest.raises(DriveError, match="not readable as a video"):
+        _import_video(path, tmp_path / "list", "here")

@@ -1,5 +1,6 @@
 """All bad inputs and situations, as a table; `python -m tests.benchmarks.bad_inputs` runs it."""
 
+import io
 import json
 import os
 import re
@@ -9,13 +10,17 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import yaml
+from PIL import Image
 
+from tests.calibration.site import INFO
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
 from tests.faults.judge import Case, Prepare
-from v2hdm.io.calibration.writing import write_calibration
+from tests.faults.owners import geopackages, owners
+from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.records import Calibration
 
@@ -237,11 +242,39 @@ def flipped_png() -> bytes:
     return bytes(data)
 
 
-def with_orientation(data: bytes, orientation: int) -> bytes:
-    """A JPEG with an EXIF orientation."""
-    entry = struct.pack("<HHIHH", 0x112, 3, 1, orientation, 0)
-    exif = b"Exif\0\0" + b"II*\0" + struct.pack("<IH", 8, 1) + entry + bytes(4)
-    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+def turned(kind: str, orientation: int) -> bytes:
+    """A picture of the example's size with an EXIF orientation."""
+    exif, stream = Image.Exif(), io.BytesIO()
+    exif[0x112] = orientation
+    pixels = cv2.imdecode(np.frombuffer(picture(), np.uint8), cv2.IMREAD_COLOR)
+    Image.fromarray(pixels).save(stream, kind, exif=exif)
+    return stream.getvalue()
+
+
+PLAYLISTS: dict[str, str] = {
+    "a list of files": "ffconcat version 1.0\nfile a.mp4\n",
+    "a playlist": "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\na.mp4\n#EXT-X-ENDLIST\n",
+    "a playlist of a host": "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\nhttp://127.0.0.1:9/a.ts\n",
+    "a session of a host": "v=0\no=- 0 0 IN IP4 127.0.0.1\nm=video 9 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+    "a manifest": '<MPD xmlns="urn:mpeg:dash:schema:mpd:2011"><BaseURL>a.mp4</BaseURL></MPD>',
+    "an edit list of FFmpeg's": ";FFMETADATA1\ntitle=x\n",
+    "subtitles": "1\n00:00:00,000 --> 00:00:01,000\na\n",
+}
+
+
+def _video() -> bytes:
+    """Four frames of an MP4, made once a process."""
+    stream = io.BytesIO()
+    with av.open(stream, "w", "mp4") as container:
+        track = container.add_stream("mpeg4", rate=10)
+        track.width, track.height = 320, 240
+        frames = [av.VideoFrame.from_ndarray(np.zeros((240, 320, 3), np.uint8), format="bgr24")] * 4
+        for frame in (*frames, None):
+            container.mux(track.encode(frame))
+    return stream.getvalue()
+
+
+SHORT_VIDEO = _video()
 
 
 IMAGES: dict[str, tuple[bytes, str]] = {
@@ -313,6 +346,30 @@ def texts() -> Iterator[Case]:
     yield checked("poses: of another day", "begin 9000 s later", write(poses[1], late))
 
 
+POINTS = {
+    "a cell of 200000 letters": (f"name,u,v,x,y\n{'P' * 200_000},1,2,3,4\n", "is no table"),
+    "an open quote of 200000 letters": ('name,u,v,x,y\n"' + "P" * 200_000, "is no table"),
+    "one point 3000 times": ("name,u,v,x,y\n" + "P,100,100,8,0\n" * 3000, "have the same pixel"),
+    "a name that moves the cursor": ("name,u,v,x,y\n\x1b[2J,-9,2,3,4\n" + "a,1,1,9,1\n" * 5, r"\?\[2J"),
+    "no number": ("u,v,x,y\n1,2,3,nan\n", "y"),
+    "too few cells": ("u,v,x,y\n1,2,3\n", "3 cells under 4 columns"),
+}
+
+
+def _info(root: Path) -> None:
+    write_camera_info(INFO, root / "camera_info.yaml")
+
+
+def points() -> Iterator[Case]:
+    """Tables of surveyed points."""
+    line = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
+    for name, (text, says) in POINTS.items():
+        prepare = _both(
+            lambda root: write_camera_info(INFO, root / "camera_info.yaml"), write("points.csv", text)
+        )
+        yield Case(f"points: {name}", "v2hdm calibrate points", line, prepare, says)
+
+
 def names() -> Iterator[Case]:
     """Names that are no names."""
     for name, (text, says) in BAD_NAMES.items():
@@ -355,8 +412,15 @@ def images() -> Iterator[Case]:
     yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits")
     yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
     yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
-    turned = with_orientation(picture(), 6)
-    yield checked("image in a drive: turned", "EXIF", write("front/images/000001.jpg", turned))
+    for orientation in range(2, 9):
+        for kind in ("JPEG", "PNG", "TIFF", "WEBP"):
+            data = turned(kind, orientation)
+            name = f"image in a drive: {kind} of orientation {orientation}"
+            yield checked(name, f"EXIF orientation {orientation}", write("front/images/000001.jpg", data))
+    for name, text in PLAYLISTS.items():
+        for ending in (".mp4", ".avi", ".mkv"):
+            files = _both(write("a.mp4", SHORT_VIDEO), write(f"v{ending}", text))
+            yield detects(f"video: {name}, {ending}", f"v{ending}", files, "nor a video|holds no")
 
 
 def _imgs(change: Callable[[Path], object]) -> Prepare:
@@ -644,4 +708,5 @@ def _run_file(data: bytes) -> Prepare:
 
 def all_cases() -> list[Case]:
     """The table."""
-    return [case for part in (texts, names, images, fields, outputs, arguments, settings) for case in part()]
+    parts = (texts, points, names, images, fields, outputs, owners, geopackages, arguments, settings)
+    return [case for part in parts for case in part()]

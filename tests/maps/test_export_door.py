@@ -49,11 +49,42 @@ def test_the_verdict_goes_along(folder):
 
 def test_an_edited_geopackage_becomes_the_geojson_again(folder):
     before = read_geojson(folder / "map.geojson")
-    assert run(["export", "map.gpkg", "--format", "geojson"]) == 0
-    after = read_geojson(folder / "map.geojson")
+    assert run(["export", "map.gpkg", "--format", "geojson", "--output", "edited"]) == 0
+    after = read_geojson(folder / "edited" / "map.geojson")
     for old, new in zip(before.markings, after.markings, strict=True):
         np.testing.assert_array_equal(new.corners_map, old.corners_map)
         assert new.id == old.id
+
+
+EXPORT = ("export", "map.geojson", "--format", "csv", "--format", "lanelet2")
+
+
+def _refused(folder, name, capsys, words=EXPORT):
+    before = (folder / name).read_bytes()
+    assert run(words) == 2
+    assert "move it, or give another --output" in capsys.readouterr().err
+    assert (folder / name).read_bytes() == before
+
+
+def test_an_export_replaces_what_it_has_written_itself_and_nothing_else(folder, capsys):
+    (folder / "map.csv").write_text("of the user's")
+    _refused(folder, "map.csv", capsys)
+    (folder / "map.csv").unlink()
+    for _ in range(2):
+        assert run(EXPORT) == 0
+    osm = folder / "map_lanelet2" / "lanelet2_map.osm"
+    osm.write_text(osm.read_text() + "<!-- edited -->")
+    _refused(folder, "map_lanelet2/lanelet2_map.osm", capsys)
+    osm.unlink()
+    write_geojson(street(), folder / "other" / "map.geojson")  # of the same name, from elsewhere
+    _refused(folder, "map.csv", capsys, ("export", "other/map.geojson", "--format", "csv", "--output", "."))
+    (folder / "map.csv").rename(folder / "elsewhere.csv")
+    (folder / "map.csv").symlink_to("elsewhere.csv")
+    _refused(folder, "map.csv", capsys)
+    (folder / "map.csv").unlink()
+    (folder / "map_lanelet2").rename(folder / "elsewhere")
+    (folder / "map_lanelet2").symlink_to("elsewhere")
+    _refused(folder, "elsewhere/map_projector_info.yaml", capsys)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +98,10 @@ def test_an_edited_geopackage_becomes_the_geojson_again(folder):
         (["none.gpkg", "--format", "csv"], "none.gpkg: no such file"),
         (["none.yaml", "--format", "urdf"], "none.yaml: no such file"),
         (["map.geojson", "--format", "lanelet2", "--projector", "UTM"], "unknown projector 'UTM'"),
-        (["map.geojson", "--format", "csv", "--output", "map.gpkg"], "cannot be written"),
+        (
+            ["map.geojson", "--format", "csv", "--output", "map.gpkg"],
+            "map.gpkg is a file; give another --output",
+        ),
     ],
 )
 def test_what_a_user_must_mend_is_one_line(folder, arguments, message, capsys):

@@ -19,7 +19,9 @@ from v2hdm.pipeline import inspect as inspection
 from v2hdm.pipeline import run as running
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import RunResult, run
+from v2hdm.store.files import replace_text
 from v2hdm.store.pruning import items_of
+from v2hdm.store.results import added_to
 
 SAME = ("map.geojson", "calibration_front.yaml", "trajectory.tum", "excluded.geojson", "residuals.csv")
 
@@ -86,6 +88,17 @@ def test_with_nothing_changed_the_result_is_taken_as_it_lies(site, monkeypatch):
     assert again.metrics["results"].keys() == metrics["results"].keys()
     assert again.verdict.as_json() == metrics["verdict"]
     assert again.headlines
+
+
+def test_a_result_whose_report_was_made_again_and_has_a_mosaic_is_taken_as_it_lies(site, monkeypatch):
+    folder = site / "first" / "short"
+    with added_to(folder, "RESULT"):
+        replace_text(folder / "mosaic.json", "added")
+        replace_text(folder / "report.html", "made again")
+    monkeypatch.setattr(running, "map_and_save", refused)
+    run(config(site, "first"))
+    assert (folder / "mosaic.json").read_text() == "added"
+    assert (folder / "report.html").read_text() == "made again"
 
 
 def test_a_finished_result_is_known_without_torch(site):

@@ -13,8 +13,9 @@ import pytest
 from tests.faults.judge import full_disk
 from v2hdm.errors import ConfigError
 from v2hdm.report.outputs import write_json
-from v2hdm.store.inputs import LIST
-from v2hdm.store.results import added_to, files_of_result, growing_folder, result_folder
+from v2hdm.store.files import replace_text
+from v2hdm.store.inputs import LIST, note_input, protected_inputs
+from v2hdm.store.results import added_to, files_of_result, growing_folder, listed_files, result_folder
 
 ROOT = Path(__file__).parents[2]
 
@@ -203,3 +204,81 @@ def test_a_list_never_ends_in_half_a_line(tmp_path, monkeypatch):
 def test_json_leaves_out_what_does_not_exist(tmp_path):
     write_json(tmp_path / "m.json", {"a": {"recall": float("nan"), "n": np.int64(3)}, "b": [np.float64(1.5)]})
     assert json.loads((tmp_path / "m.json").read_text()) == {"a": {"n": 3}, "b": [1.5]}
+
+
+MADE = "v2hdm map of /data/monday"
+
+
+@pytest.mark.parametrize("other", ["v2hdm check of /data/monday", "v2hdm map of /data/friday", ""])
+def test_a_result_of_another_command_or_another_drive_is_not_replaced(tmp_path, other):
+    with result_folder(tmp_path / "run", made=MADE) as folder:
+        (folder / "map").write_text("of hours")
+    refused = pytest.raises(ConfigError, match=f"holds a result of {MADE}, not of {other}: move it")
+    with refused, result_folder(tmp_path / "run", made=other):
+        pass
+    assert (tmp_path / "run" / "map").read_text() == "of hours"
+
+
+def test_a_result_that_is_an_input_is_not_replaced(tmp_path):
+    write(tmp_path / "run", map="earlier")
+
+    def make(read_before):
+        with protected_inputs():
+            if read_before:
+                note_input(tmp_path / "run" / "map")
+            with result_folder(tmp_path / "run"):
+                assert not read_before
+                note_input(tmp_path / "run" / "map")
+
+    for read_before in (True, False):
+        with pytest.raises(ConfigError, match="is one of the inputs"):
+            make(read_before)
+        assert (tmp_path / "run" / "map").read_text() == "earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_is_put_into_a_result_while_it_is_made_again_is_kept(tmp_path, monkeypatch):
+    """At any instant: while the work is done, and between the last look and the exchange of the folders."""
+    target, replace = tmp_path / "run", Path.replace
+    write(target, map="first")
+
+    def last_moment(self, other):
+        if self == target:
+            (target / "late.md").write_text("mine")
+            (target / "map").write_text("edited")
+        return replace(self, other)
+
+    with result_folder(target) as folder:
+        (folder / "map").write_text("second")
+        (target / "early.md").write_text("mine")
+        monkeypatch.setattr(Path, "replace", last_moment)
+    monkeypatch.undo()
+    texts = {name: (target / name).read_text() for name in names(target)}
+    assert texts == {"map": "second", "map.kept": "edited", "late.md": "mine", "early.md": "mine"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_a_kill_has_left_aside_beside_the_new_result_is_given_to_it(tmp_path):
+    write(tmp_path / ".run.previous", map="first")
+    (tmp_path / ".run.previous" / "notes.md").write_text("mine")
+    write(tmp_path / "run", map="second")
+    with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "run"):
+        print(1 / 0)
+    assert (tmp_path / "run" / "map").read_text() == "second"
+    assert (tmp_path / "run" / "notes.md").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_another_command_has_added_stays_its_own_and_what_is_stale_is_named(tmp_path, caplog):
+    with result_folder(tmp_path / "run", made=MADE) as folder:
+        (folder / "map").write_text("first")
+    with added_to(tmp_path / "run", "RESULT") as folder:
+        write_json(folder / "mosaic.json", {})
+    export = "v2hdm export of map.geojson"
+    for _ in range(2):
+        with listed_files(tmp_path / "run", "--output", export):
+            replace_text(tmp_path / "run" / "map.csv", "exported")
+        with result_folder(tmp_path / "run", made=MADE) as folder:
+            (folder / "map").write_text("second")
+    assert names(tmp_path / "run") == ["map", "map.csv"]
+    assert "gone with it: mosaic.json" in caplog.text

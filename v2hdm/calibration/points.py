@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, one_line
 from v2hdm.io.importers.tables import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
@@ -45,7 +44,7 @@ def read_points(path: Path) -> SurveyedPoints:
     names, labels, rows = [], [], []
     for number, cells in lines:
         row = dict(zip(columns, cells, strict=True))
-        name = row.get(_NAME, "")
+        name = one_line(row.get(_NAME, ""))
         names.append(f"point {name} (line {number})" if name else f"the point of line {number}")
         labels.append(name or f"line {number}")
         rows.append([parse_number(row[column], f"{path}: line {number}: {column}") for column in COLUMNS])
@@ -77,12 +76,14 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
             f"{info.width} x {info.height}; {hint}"
         )
     for what, table in (("pixel", points.points_px), ("place on the ground", points.points_vehicle)):
-        for a, b in combinations(range(len(table)), 2):
-            if np.array_equal(table[a], table[b]):
-                raise DriveError(
-                    f"{points.path}: {points.names[a]} and {points.names[b]} have the same {what}; drop or "
-                    "mend one of them"
-                )
+        _, first, same = np.unique(table, axis=0, return_index=True, return_inverse=True)
+        again = np.flatnonzero(first[same.ravel()] < np.arange(len(table)))
+        if len(again):
+            a, b = first[same.ravel()[again[0]]], again[0]
+            raise DriveError(
+                f"{points.path}: {points.names[a]} and {points.names[b]} have the same {what}; drop or mend "
+                "one of them"
+            )
 
 
 def _columns(header: list[str], path: Path) -> list[str]:

@@ -21,7 +21,8 @@ def run(arguments: Sequence[str]) -> int:
 
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
-    with result_of(folder, {"drive": str(parsed.drive), "cameras": list(drive.cameras)}) as unfinished:
+    settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras)}
+    with result_of(folder, f"v2hdm calibrate ground of {parsed.drive.resolve()}", settings) as unfinished:
         found = calibrate_from_ground(drive, workers=parsed.workers, progress=steps_of("match ground"))
         write_ground_calibration(found, unfinished)
     print(*summary_lines(found), f"results in {folder}", sep="\n")

@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> int:
     folder = parsed.output or Path("outputs") / f"{info.name}-calibrate"
     files = {"points": str(parsed.points), "intrinsics": str(parsed.intrinsics)}
     settings = {**files, "image": None if parsed.image is None else str(parsed.image), **sigmas}
-    with result_of(folder, settings) as unfinished:
+    with result_of(folder, f"v2hdm calibrate points of {parsed.points.resolve()}", settings) as unfinished:
         write_point_calibration(found, unfinished, image)
     print(*summary_lines(found), f"results in {folder}", sep="\n")
     return exit_code(found.verdict)

@@ -57,7 +57,7 @@ def run(arguments: Sequence[str]) -> int:
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
     settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras), "ground": parsed.ground}
-    with result_of(folder, settings) as unfinished:
+    with result_of(folder, f"v2hdm check of {parsed.drive.resolve()}", settings) as unfinished:
         matched = steps_of("match bare ground, cameras")
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)

@@ -78,7 +78,8 @@ def _detect(parsed: argparse.Namespace) -> None:
         stopwatch=stopwatch,
     )
     failure = None
-    folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw")
+    made = f"v2hdm detect of {parsed.source if live else Path(parsed.source).resolve()}"
+    folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", made)
     with folder as drawings, _lines(parsed.output) as stream:
         try:
             for frame, camera, road in frames:

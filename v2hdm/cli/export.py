@@ -35,13 +35,16 @@ def run(arguments: Sequence[str]) -> None:
     )
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
+    from v2hdm.store.results import listed_files
 
     handler, folder = logging.StreamHandler(), parsed.output or parsed.source.parent
     handler.setLevel(logging.INFO)
     export = _export_calibration if parsed.source.suffix.lower() in (".yaml", ".yml") else _export_map
     try:
         with logging_to(handler):
-            print(*export(parsed, folder), sep="\n")
+            with listed_files(folder, "--output", f"v2hdm export of {parsed.source.resolve()}"):
+                files = export(parsed, folder)
+            print(*files, sep="\n")
     except BrokenPipeError:  # the reader of our output has had enough
         raise
     except OSError as error:

@@ -27,7 +27,8 @@ def run(arguments: Sequence[str]) -> int:
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
-    with result_of(folder, settings) as unfinished:
+    made = f"v2hdm localize of {parsed.drive.resolve()} in {path.resolve()}"
+    with result_of(folder, made, settings) as unfinished:
         found = localize(hd_map, drive, calibrations, workers=parsed.workers, progress=steps_of("images"))
         write_localised(found, drive, unfinished)
     print(*summary_lines(found), f"results in {folder}", sep="\n")

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from v2hdm import __version__
 from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, describe, one_line
-from v2hdm.progress import Steps, progress_lines
+from v2hdm.progress import Steps, failures_of_stdout, patient, progress_lines
 
 if TYPE_CHECKING:
     from v2hdm.records import Drive
@@ -54,13 +54,20 @@ class Command:
         try:
             from v2hdm.store.inputs import protected_inputs
 
+            failures_of_stdout.clear()
             with protected_inputs():
                 try:
                     code = work() or 0
                 except SystemExit:  # argparse, after --help
                     sys.stdout.flush()
                     raise
-                sys.stdout.flush()  # while an error of writing can still be reported
+                try:
+                    sys.stdout.flush()  # while an error of writing can still be reported
+                    if failures_of_stdout:
+                        raise failures_of_stdout.pop()
+                except OSError as failure:
+                    failure.filename = "standard output, when all files were written"
+                    raise
                 return code
         except BrokenPipeError:  # the reader of our output has had enough
             _leave_stdout()
@@ -183,18 +190,18 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
 
 
 @contextmanager
-def result_of(folder: Path, settings: Mapping[str, object]) -> Iterator[Path]:
+def result_of(folder: Path, made: str, settings: Mapping[str, object]) -> Iterator[Path]:
     """The unfinished folder of a command's results, with the settings that they were made of."""
     from v2hdm.store.results import result_folder
 
-    with result_folder(folder, "--output") as unfinished:
+    with result_folder(folder, "--output", made) as unfinished:
         (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
         yield unfinished
 
 
 def steps_of(task: str) -> Steps:
     """Progress of a task as lines on stderr."""
-    return partial(progress_lines(partial(print, file=sys.stderr, flush=True)), task)
+    return partial(progress_lines(partial(print, file=patient(sys.stderr), flush=True)), task)
 
 
 def exit_code(verdict: Verdict) -> int:

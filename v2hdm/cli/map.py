@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -30,11 +31,11 @@ def _map(job: Job) -> int:
     from v2hdm.pipeline.config import run_name
     from v2hdm.pipeline.context import logging_to
     from v2hdm.pipeline.run import run
-    from v2hdm.progress import progress_bars
+    from v2hdm.progress import patient, progress_bars
     from v2hdm.report.terminal import changes_table, results_table
     from v2hdm.viewer import RerunViewer, check_viewer
 
-    config, console = job.settings, Console()
+    config, console = job.settings, Console(file=patient(sys.stdout))
     config.output = job.folder(config.output)
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None

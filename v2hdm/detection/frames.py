@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.safe.pixels import read_pixels
+from v2hdm.io.safe.pixels import VIDEO_OPTIONS, read_pixels
 
 _log = logging.getLogger(__name__)
 
@@ -89,6 +89,8 @@ def video_frames(path: Path) -> Iterator[Frame]:
     """
     refused = f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
     with _capture(str(path), refused) as capture:
+        if turned := int(capture.get(cv2.CAP_PROP_ORIENTATION_META)):
+            _log.warning("%s: its frames are turned by %d degrees, as it says; calibrate those", path, turned)
         promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         count = 0
         for count, pixels in enumerate(_pixels(capture), start=1):
@@ -124,9 +126,12 @@ def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[
 def _capture(source: str | int, refused: str) -> Iterator[cv2.VideoCapture]:
     """A capture that keeps OpenCV's and FFmpeg's own complaints off the terminal; the error is ours."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    options = "|".join(f"{key};{value}" for key, value in VIDEO_OPTIONS.items())
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", options)
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        capture = cv2.VideoCapture(source)
+        backend = () if isinstance(source, int) else (cv2.CAP_FFMPEG,)
+        capture = cv2.VideoCapture(source, *backend)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:

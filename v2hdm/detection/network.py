@@ -7,7 +7,6 @@ resolution and near ground in half of it, which halves the time.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -22,6 +21,7 @@ from v2hdm.catalogue import SHIPPED, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError
+from v2hdm.io.safe.texts import parse_json
 from v2hdm.records import SEEN_ACROSS, FloatArray
 
 METADATA_KEY = "v2hdm"
@@ -36,6 +36,7 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
 }
 
 _OVERLAP_PX = 64  # overlap of the two resolutions, so that either has its surroundings where they are joined
+_MOST_MULTIPLE = 1024  # px; images are padded to it, and an encoder halves them at most ten times
 _GRID_PX = 16  # the seam is on the grid of all outputs; the network's own multiple may be larger
 _MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
 """Factors of a lane output (2, h, w), log odds and offset, in the mirror."""
@@ -346,13 +347,14 @@ def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
 
 def _read_info(session: Any, path: Path) -> NetworkInfo:
     try:
-        metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+        text = session.get_modelmeta().custom_metadata_map[METADATA_KEY]
+        metadata = parse_json(text, f"'{METADATA_KEY}' metadata", ConfigError)
         paint, kinds, lanes = (int(metadata["strides"][name]) for name in _OUTPUTS)
         classes = tuple(str(name) for name in metadata["classes"])
         info = NetworkInfo(classes, int(metadata["multiple"]), paint, kinds, lanes, read_catalogue(metadata))
     except ConfigError as error:
         raise DetectorError(f"{path}: {error}") from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise DetectorError(
             f"{path}: no usable '{METADATA_KEY}' metadata ({_one_line(error)}); "
             "this is not a model written by `python -m export`"
@@ -360,10 +362,17 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
     problem = None
     unknown = [name for name in info.classes if name not in info.catalogue.classes]
     names = ([node.name for node in session.get_inputs()], [node.name for node in session.get_outputs()])
+    channels = session.get_outputs()[1].shape[1:2] if len(session.get_outputs()) > 1 else []
     if unknown or not info.classes:
         known = ", ".join(info.catalogue.names)
         problem = f"unknown classes {unknown}, known are {known}; use another model"
-    elif min(info.strides) < 1 or any(info.multiple % stride for stride in info.strides):
+    elif len(set(info.classes)) < len(info.classes) or any(
+        isinstance(count, int) and count != len(info.classes) for count in channels
+    ):
+        problem = f"its {len(info.classes)} classes are not one for each channel of kinds; export it again"
+    elif not 0 < info.multiple <= _MOST_MULTIPLE or min(info.strides) < 1:
+        problem = f"multiple {info.multiple} and strides {info.strides} are none; export it again"
+    elif any(info.multiple % stride for stride in info.strides):
         problem = f"strides {info.strides} do not divide multiple {info.multiple}; export it again"
     elif info.kind_stride % info.paint_stride:
         problem = f"the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,12 +23,13 @@ from v2hdm.experiment.figures import save_figures
 from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.summary import by_port, claims, results_table, write_tables, write_words
+from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.store.files import replace_text
 from v2hdm.store.results import growing_folder, listed_files
 from v2hdm.workers import share_out
 
-_OPTION = "output="
+_OPTION, _MADE = "output=", "v2hdm experiment"
 _PATIENCE_S = 2.0
 _queue: SimpleQueue[Any] | None = None
 
@@ -44,7 +46,7 @@ def run_experiment(
     todo = jobs(config)
     folder = Path(config.output) / config.name
     try:
-        with growing_folder(folder, _OPTION):
+        with growing_folder(folder, _OPTION, _MADE):
             replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
             records = _records(todo, config.workers or os.cpu_count() or 1, progress)
             measured = [measure(record) for record in records]
@@ -96,7 +98,7 @@ def _work(job: Job) -> dict[str, Any]:
         if _queue is not None:
             _queue.put((job.title, task, done, total))
 
-    with listed_files(job.root, _OPTION):
+    with listed_files(job.root, _OPTION, _MADE):
         return drive_record(job, 1, report)
 
 
@@ -105,7 +107,7 @@ _SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")  
 
 def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     """Run an experiment and show how far it is and what came of it."""
-    console = Console()
+    console = Console(file=patient(sys.stdout))
     with drive_bars(console) as progress:
         folder, measured = run_experiment(config, config_yaml, progress)
     for port, drives in by_port(measured).items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from rich.console import Console
 
 from v2hdm.fleet.cluster import LOCAL, NO_GPU, RETRIES, Shares, cluster, wants_gpu
 from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
+from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.results import GrowingFolder, growing_folder
 
@@ -37,7 +39,7 @@ class FleetOptions:
 
 def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: FleetOptions) -> list[Row]:
     """Map a fleet, show how far it is, and its table."""
-    console = Console()
+    console = Console(file=patient(sys.stdout))
     with drive_bars(console, endings=STYLES) as progress:
         rows = run_fleet(files, overrides, options, progress)
     console.print(as_table(rows))
@@ -57,7 +59,7 @@ def run_fleet(
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)
-    with growing_folder(options.folder, "--table") as folder:
+    with growing_folder(options.folder, "--table", "v2hdm fleet") as folder:
         table = _Table(folder, todo.sources, progress)
         for row in todo.refused:
             table.add(row)

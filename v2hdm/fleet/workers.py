@@ -24,7 +24,7 @@ from v2hdm.fleet.cluster import DETECTORS_A_GPU, RETRIES
 from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.run import RunResult, map_and_save, take_or_make
+from v2hdm.pipeline.run import RunResult, made_of, map_and_save, take_or_make
 from v2hdm.progress import Progress
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import Line, StageCache, log_again, recorded
@@ -225,4 +225,4 @@ def _mapped(
     several = len(config.drive.paths) > 1
     executor = RayExecutor(len(detectors), str(Path.cwd())) if several else IN_PROCESS
     context = Context(progress=report, detect=partial(detect_by, detectors), executor=executor)
-    return map_and_save(config, cache, job.config_yaml, context)
+    return map_and_save(config, cache, job.config_yaml, context, made_of(job.config))

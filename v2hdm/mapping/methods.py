@@ -137,10 +137,7 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
     images = [drive.images[i] for i in seen.tolist()]
     return Residuals(
-        image=tuple(
-            path.relative_to(drive.root).as_posix() if path.is_relative_to(drive.root) else str(path)
-            for path in (image.path for image in images)
-        ),
+        image=tuple(drive.name_of(image.path) for image in images),
         camera=tuple(image.camera for image in images),
         taken_s=np.array([image.taken_s for image in images]),
         row_image=row_image.astype(np.int64),

@@ -37,6 +37,7 @@ from v2hdm.store.files import whole_file
 
 LARGEST_PICTURE_PX = 8192  # of either side of the picture: graphics cards of computers and phones draw that
 MULTIPLE_PX = 256  # divides sides of a canvas, so that pictures reduced by up to that factor fit it exactly
+_FINEST_M = 1e-3  # side of a pixel: no camera on a vehicle shows finer ground
 _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
 _SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
@@ -164,8 +165,10 @@ def write_mosaic(
     Raises MapFileError where the folder is no result, or not one of this drive, DriveError where an image is
     missing or damaged, ConfigError where the resolution makes no mosaic.
     """
-    if not resolution_m > 0:
-        raise ConfigError(f"a resolution of {resolution_m:g} m a pixel makes no mosaic; give a positive one")
+    if not _FINEST_M <= resolution_m < np.inf:
+        raise ConfigError(
+            f"a resolution of {resolution_m:g} m a pixel makes no mosaic; give {_FINEST_M} or more"
+        )
     hd_map = read_geojson(folder / "map.geojson")
     ground = ground_of(folder, drive, resolution_m)
     sides = paint_sides(hd_map)

@@ -48,6 +48,11 @@ def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
     return hd_map, tuple(sorted(hd_map.parent.glob("trajectory*.tum"))), hd_map.parent / "excluded.geojson"
 
 
+def made_of_drives(paths: Sequence[str]) -> str:
+    """What has made a result of the drives at some paths or URLs, in words."""
+    return f"v2hdm map of {', '.join(paths)}"
+
+
 def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
     """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
     asked = replace(

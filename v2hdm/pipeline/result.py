@@ -32,7 +32,7 @@ from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.camera_sets import BEST
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
-from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.keys import Contents, made_of_drives
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.figures import save_birdseye, save_growth
@@ -185,7 +185,7 @@ class Result:
         Raises:
             ConfigError: there is something else in the folder, or a format cannot be written.
         """
-        with result_folder(Path(folder), "folder") as partial:
+        with result_folder(Path(folder), "folder", made_of_drives(self.about["drive"]["paths"])) as partial:
             self.write(partial, formats, all_maps, mosaic, Context(seconds=self.seconds))
         return Path(folder)
 

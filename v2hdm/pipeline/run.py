@@ -22,12 +22,13 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit, run_name
 from v2hdm.pipeline.context import Context, Unwatched, Viewer, log_file, logging_to
-from v2hdm.pipeline.keys import Contents, result_key
+from v2hdm.pipeline.keys import Contents, base_files, made_of_drives, result_key
 from v2hdm.progress import Progress, silent
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of
 from v2hdm.store.folders import note_use
+from v2hdm.store.inputs import note_input
 from v2hdm.store.lock import HOST
 from v2hdm.store.pruning import prune_to_limit
 from v2hdm.store.remote import RemoteFolder, is_url, place_of
@@ -105,7 +106,12 @@ def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
     try:
         folder = Path(config.output) / run_name(config)
         entry = _noted(folder, cache)
-        if entry is None or not is_whole(folder, entry.files) or not _is_of(config, entry.key):
+        if entry is None:
+            return None
+        now = files_of_result(folder)  # a report may have been made again, and a mosaic added
+        if not is_whole(folder, {name: now.get(name, "") for name in entry.files}):
+            return None
+        if not _is_of(config, entry.key):
             return None
     except (V2hdmError, OSError):
         return None
@@ -200,24 +206,38 @@ def run(
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
 
-    def work(config: RunConfig, cache: StageCache) -> RunResult:
+    def work(local: RunConfig, cache: StageCache) -> RunResult:
         from v2hdm.detection.network import check_device
 
-        check_device(config.detector.device)
+        check_device(local.detector.device)
         context = Context(progress=progress, viewer=viewer or Unwatched())
-        return map_and_save(config, cache, config_yaml, context)
+        return map_and_save(local, cache, config_yaml, context, made_of(config))
 
     return take_or_make(config, work, config.resume and viewer is None, progress)[0]
 
 
-def map_and_save(config: RunConfig, cache: StageCache, config_yaml: str, context: Context) -> RunResult:
-    """Do what :func:`run` says, with what ``cache`` keeps."""
+def made_of(config: RunConfig) -> str:
+    """What a run makes of what, in words: what may replace its result; ``config`` is as the user gave it."""
+    if config.simulate is not None:
+        return f"v2hdm map of the rendered {config.simulate.name}"
+    given = config.drive.path if isinstance(config.drive.path, list) else [config.drive.path]
+    return made_of_drives(
+        [str(one) if is_url(str(one)) else str(Path(one).resolve()) for one in given if one]
+    )
+
+
+def map_and_save(
+    config: RunConfig, cache: StageCache, config_yaml: str, context: Context, made: str
+) -> RunResult:
+    """Do what :func:`run` says, with what ``cache`` keeps, in place of an earlier result of the same."""
     from v2hdm.pipeline.map_drive import map_drive  # torch and much else, which takes seconds
 
     name = admit(config)
     place = Path(config.output) / name
     with cache.in_use():
-        with result_folder(place) as folder, logging_to(log_file(folder / "run.log")):
+        for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
+            note_input(path)  # before any work is done for nothing
+        with result_folder(place, made=made) as folder, logging_to(log_file(folder / "run.log")):
             _log.info("v2hdm %s, run %s", __version__, name)
             (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
             context = replace(context, cache=cache, workers=config.workers, folder=folder)

@@ -10,8 +10,8 @@ import csv
 import difflib
 import hashlib
 import io
-import os
 import re
+import secrets
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -58,7 +58,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     refuse_input(path)
     if path.exists() and not path.is_file():
         raise ConfigError(f"{path}: is no plain file, and nothing is put in its place; name another output")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         yield partial
         refuse_input(path)

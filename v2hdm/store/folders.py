@@ -7,13 +7,15 @@ damaged one is made anew.
 
 from __future__ import annotations
 
+import filecmp
 import hashlib
 import json
+import logging
 import os
 import secrets
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.safe.texts import read_json
 from v2hdm.store.files import file_digest
 from v2hdm.store.lock import HOST, use_until_exit
+
+_log = logging.getLogger(__name__)
 
 LIST = ".v2hdm-cache.json"  # name of the list in a folder
 _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
@@ -70,6 +74,34 @@ def remove_empty(folder: Path) -> None:
             one.rmdir()
 
 
+def bring_over(old: Path, new: Path, is_ours: Callable[[str], bool]) -> None:
+    """Give what is not ours in the ``old`` folder, as names within it say, to the ``new`` one as well."""
+    for root, folders, files in os.walk(old):
+        here = Path(root)
+        links = [name for name in folders if (here / name).is_symlink()]
+        names = [(here / name).relative_to(old).as_posix() for name in (*files, *links)]
+        theirs = [name for name in names if not is_ours(name)]
+        if theirs or not (files or folders):
+            (new / here.relative_to(old)).mkdir(parents=True, exist_ok=True)
+        for name in theirs:
+            place = new / name
+            while os.path.lexists(place) and not _is_same(old / name, place):
+                place = place.with_name(f"{place.stem}.kept{place.suffix}")
+                _log.warning("%s is not ours; it is kept as %s", old / name, place.name)
+            if os.path.lexists(place):
+                continue
+            try:
+                os.link(old / name, place, follow_symlinks=False)
+            except OSError:  # a file system without links
+                shutil.copy2(old / name, place, follow_symlinks=False)
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    if path.is_symlink() or other.is_symlink():
+        return path.is_symlink() and other.is_symlink() and path.readlink() == other.readlink()
+    return path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False)
+
+
 def _ours(folder: Path) -> list[Path]:
     names = _listed(folder).get("files")
     if not isinstance(names, list | dict):
@@ -101,7 +133,8 @@ def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) 
     source = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     text = json.dumps([_VERSION, source, label, settings], sort_keys=True)
     words = "".join(letter if letter.isalnum() else "_" for letter in f"{files[0].stem}-{label}").strip("_")
-    folder = cache / f"{words[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    # Absolute, so that images are called the same wherever the result is read again.
+    folder = cache.absolute() / f"{words[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     if is_whole(folder):
         note_use(folder)
     return folder
@@ -136,6 +169,8 @@ def finish_entry(folder: Path) -> None:
     try:
         _write_list(partial)
         if folder.exists() and not is_whole(folder):
+            listed = _listed(folder).get("files") or ()
+            bring_over(folder, partial, lambda name: name in (*listed, LIST) or (partial / name).exists())
             shutil.rmtree(folder)
         if folder.exists():  # another process was faster
             shutil.rmtree(partial)

@@ -1,7 +1,8 @@
 """Folders of results: each belongs to one process at a time, and only what is ours is ever replaced.
 
-A folder that we wrote holds a list of our files with their hashes, ``.v2hdm-results.jsonl``. Files that are
-not on the list are the user's and stay through a rerun; where a file on it was changed, the rerun is refused.
+A folder that we wrote holds a list of our files, ``.v2hdm-results.jsonl``, with their hashes and what made
+them, such as ``v2hdm map of /data/monday``. Only the same replaces them. Files that are not on the list are
+the user's and stay through a rerun; where a file on it was changed, the rerun is refused.
 A lock beside the folder is held by the process that writes and released by its end, whatever ends it.
 """
 
@@ -12,15 +13,16 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import file_digest, observed_writes, refuse_url, whole_file
-from v2hdm.store.folders import remove_empty
-from v2hdm.store.inputs import LIST
+from v2hdm.store.folders import bring_over, remove_empty
+from v2hdm.store.inputs import LIST, refuse_input
 from v2hdm.store.lock import HOST, take_lock
 
 _log = logging.getLogger(__name__)
@@ -33,15 +35,13 @@ class _Target:
     """A folder of results, and the option that errors name it by."""
 
     def __init__(self, shown: Path, option: str) -> None:
-        """Where ``shown`` leads; a folder that cannot be put aside is refused before any work."""
+        """Where ``shown`` leads; what is no folder is refused before any work."""
         refuse_url(shown)
         self.shown, self.option = shown, option
         try:
             self.path = shown.resolve()
         except (OSError, RuntimeError, ValueError):
             raise ConfigError(f"output folder {shown}: leads nowhere; give another {option}") from None
-        if self.path.is_mount():
-            raise ConfigError(f"output folder {shown} is a disk of its own; give a folder within it")
         if self.path.exists() and not self.path.is_dir():
             raise ConfigError(f"output folder {shown} is a file; give another {option}")
 
@@ -62,8 +62,11 @@ class _Target:
                 f"free space or give another {self.option}"
             ) from None
 
-    def listed(self) -> dict[str, list[str]] | None:
-        """Digests of our files by name, the last one last; None if it is empty, an error if not ours."""
+    def listed(self, made: str | None = None) -> dict[str, list[str]] | None:
+        """Digests of our files by name, the last one last; None if it is empty, an error if not ours.
+
+        Only of those that were ``made`` so, where that is given; an error where all were made otherwise.
+        """
         if not self.path.exists() or not any(self.path.iterdir()):
             return None
         if not (self.path / LIST).is_file():
@@ -71,14 +74,34 @@ class _Target:
                 f"output folder {self.shown} holds files that are no results of ours: give another "
                 f"{self.option}"
             )
-        listed: dict[str, list[str]] = {}
+        head = self.read_list()[0]
+        if made not in (None, head):
+            maker = head or "an earlier version"
+            raise ConfigError(
+                f"output folder {self.shown} holds a result of {maker}, not of {made}: move it, or give "
+                f"another {self.option}"
+            )
+        return self.digests(made)
+
+    def digests(self, made: str | None) -> dict[str, list[str]]:
+        """The entries of its list by name, only those that were ``made`` so where that is given."""
+        head, entries = self.read_list()
+        found: dict[str, list[str]] = {}
+        for one in entries:
+            if made in (None, one.get("made", head)):
+                found.setdefault(one["file"], []).append(one["sha256"])
+        return found
+
+    def read_list(self) -> tuple[str, list[dict[str, str]]]:
+        """What has made the folder, and the entries of its list; nothing where there is no list."""
+        if not (self.path / LIST).is_file():
+            return "", []
         try:
-            for line in (self.path / LIST).read_text(encoding="utf-8").splitlines()[1:]:
-                entry = json.loads(line)
-                listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
-        except (ValueError, TypeError, LookupError, RecursionError):
+            head, *lines = map(json.loads, (self.path / LIST).read_text(encoding="utf-8").splitlines())
+            entries = [{key: str(one[key]) for key in one.keys() | {"file", "sha256"}} for one in lines]
+            return str(head.get("made", "")), entries
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
             raise ConfigError(f"{self.shown / LIST}: is damaged; give another {self.option}") from None
-        return listed
 
     @contextmanager
     def parents(self) -> Iterator[None]:
@@ -131,66 +154,82 @@ class _Target:
                 raise ConfigError(f"{left}: is in our way, not ours; move it, or give another {self.option}")
         if previous.exists() and not self.path.exists():
             previous.replace(self.path)
-        for left in (unfinished, previous):
-            if left.exists():
-                shutil.rmtree(left)
+        if previous.exists():
+            _remove_previous(previous, self.path, _Target(previous, self.option).listed() or {})
+        if unfinished.exists():
+            shutil.rmtree(unfinished)
 
-    def bring_over(self, new: Path, ours: set[str]) -> None:
-        """Give what the user has put into the earlier result to the ``new`` one as well."""
-        for root, folders, files in os.walk(self.path):
-            here = Path(root)
-            links = [name for name in folders if (here / name).is_symlink()]
-            all_there = map(here.joinpath, (*files, *links))
-            theirs = [path for path in all_there if path.relative_to(self.path).as_posix() not in ours]
-            if theirs or not (files or folders):
-                (new / here.relative_to(self.path)).mkdir(parents=True, exist_ok=True)
-            for path in theirs:
-                place = new / path.relative_to(self.path)
-                while place.exists() or place.is_symlink():
-                    place = place.with_name(f"{place.stem}.kept{place.suffix}")
-                    _log.warning("%s is not ours; it is kept as %s", path, place.name)
-                try:
-                    os.link(path, place, follow_symlinks=False)
-                except OSError:  # a file system without links
-                    shutil.copy2(path, place, follow_symlinks=False)
+
+def _is_ours(folder: Path, ours: Mapping[str, Sequence[str]], name: str) -> bool:
+    path = folder / name
+    known = name in ours and path.is_file() and not path.is_symlink()
+    return name == LIST or (known and file_digest(path) in ours[name])
+
+
+def _remove_previous(previous: Path, new: Path, ours: Mapping[str, Sequence[str]]) -> None:
+    """Remove a result that another has replaced; what was put there until now is given to that as well."""
+    bring_over(previous, new, partial(_is_ours, previous, ours))
+    for path in [one for one in previous.rglob("*") if one.is_symlink() or not one.is_dir()]:
+        name = path.relative_to(previous).as_posix()
+        if name == LIST or name in ours or os.path.lexists(new / name):
+            path.unlink()
+    remove_empty(previous)
 
 
 @contextmanager
-def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
+def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iterator[Path]:
     """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
 
-    An earlier result stays untouched until then; after an error nothing new is left. Files of the user's in
-    an earlier result are kept. Raises ConfigError, which names the ``option`` of the folder, where it cannot
-    be written, holds something that is no earlier result of ours, or another process is writing it.
+    ``made`` says what makes the result, of what. An earlier one of the same stays untouched until then; after
+    an error nothing new is left. What the user, or another command, has put into it is kept. Raises
+    ConfigError, which names the ``option`` of the folder, where it cannot be written, holds anything else or
+    an input, or another process is writing it.
     """
     with _locked(folder, option) as there:
         target, unfinished, previous = there.path, there.hidden("part"), there.hidden("previous")
         with there.explained():
             there.recover(unfinished, previous)
-            listed = there.listed()
+            listed = there.listed(made)
             for name, digests in (listed or {}).items():
+                refuse_input(target / name)
                 if (target / name).is_file() and file_digest(target / name) not in digests:
                     raise ConfigError(
                         f"{folder / name}: was changed after we wrote it: move it, or give another {option}"
                     )
             unfinished.mkdir()
-            _write_list(unfinished, [])
+            _write_list(unfinished, made)
         try:
             with there.explained(_FULL):
                 yield unfinished
             with there.explained():
                 files = sorted(path for path in unfinished.rglob("*") if path.is_file() and path.name != LIST)
-                _write_list(unfinished, files)
+                _write_list(unfinished, made, files)
                 if listed is not None:
-                    there.bring_over(unfinished, {LIST, *listed})
+                    for name in listed:
+                        refuse_input(target / name)
+                    _report_dropped(folder, listed, unfinished)
+                    bring_over(target, unfinished, partial(_is_ours, target, listed))
+                    others = [one for one in there.read_list()[1] if one.get("made", made) != made]
+                    for one in others:
+                        if (unfinished / one["file"]).is_file():
+                            _append(unfinished / LIST, json.dumps(one) + "\n")
                     target.replace(previous)
                 elif target.exists():
                     target.rmdir()
                 unfinished.replace(target)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
-            if target.exists():
-                shutil.rmtree(previous, ignore_errors=True)
+            if previous.exists() and not target.exists():
+                previous.replace(target)
+            elif previous.exists():
+                with suppress(OSError):  # the next run goes on with it
+                    _remove_previous(previous, target, listed or {})
+
+
+def _report_dropped(folder: Path, listed: Mapping[str, object], new: Path) -> None:
+    """Log what was added to the earlier result, such as its mosaic, and is not true of the new one."""
+    if dropped := [name for name in listed if (folder / name).is_file() and not (new / name).exists()]:
+        _log.warning("%s: of the earlier result, and gone with it: %s", folder, ", ".join(sorted(dropped)))
 
 
 @contextmanager
@@ -204,28 +243,38 @@ def added_to(folder: Path, option: str) -> Iterator[Path]:
         with there.explained():
             if there.listed() is None:
                 raise ConfigError(f"{folder}: is no result of ours; give another {option}")
-        with listed_files(folder, option):
+            made = there.read_list()[0]
+        with listed_files(folder, option, made):
             yield there.path
 
 
 @contextmanager
-def listed_files(folder: Path, option: str) -> Iterator[None]:
-    """Within, each file that is written whole into a folder of ours is put on its list before it is there.
+def listed_files(folder: Path, option: str, made: str) -> Iterator[None]:
+    """Within, each file that is written whole into a folder is put on its list before it is there.
 
     Listed first, a file is ours whenever the work is cut off; its content before stays ours as well. Raises
-    ConfigError where a file that is to be replaced is not ours, or the folder cannot be written.
+    ConfigError where what is to be replaced was not ``made`` by the same, or the folder cannot be written.
     """
     there = _Target(folder, option)
-    ours = there.listed() or {}
+    ours = there.digests(made)
+    others = {} if there.read_list()[0] == made else {"made": made}
 
-    def list_file(partial: Path, path: Path) -> None:
-        if not (place := path.resolve()).is_relative_to(there.path):
+    def list_file(new: Path, path: Path) -> None:
+        named = (Path(os.path.abspath(one)) for one in (folder, there.path))  # noqa: PTH100  # links stay
+        if not any(Path(os.path.abspath(path)).is_relative_to(one) for one in named):  # noqa: PTH100
             return
+        place = path.parent.resolve() / path.name
+        if path.is_symlink() or not place.is_relative_to(there.path):
+            raise ConfigError(f"{path}: a link is not replaced; move it, or give another {option}")
         name = place.relative_to(there.path).as_posix()
         if path.exists() and file_digest(path) not in ours.get(name, ()):
-            raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
-        digest = file_digest(partial)
-        _append(there.path / LIST, json.dumps({"file": name, "sha256": digest}) + "\n")
+            maker = f"no unchanged result of {made}" if made else "no file of ours"
+            raise ConfigError(f"{folder / name}: is {maker}; move it, or give another {option}")
+        digest = file_digest(new)
+        if not (there.path / LIST).exists():
+            _write_list(there.path, made)
+        entry = {"file": name, "sha256": digest, **others}
+        _append(there.path / LIST, json.dumps(entry) + "\n")
         ours.setdefault(name, []).append(digest)
 
     with there.explained(_FULL), observed_writes(list_file):
@@ -245,17 +294,17 @@ class GrowingFolder:
 
 
 @contextmanager
-def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
-    """``folder`` to write single files into, each listed first; errors as :func:`result_folder`."""
+def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[GrowingFolder]:
+    """``folder`` to write single files into, each listed first; errors as :func:`listed_files`."""
     with _locked(folder, option) as there:
         target = there.path
         with there.explained():
             is_new = there.listed() is None
             target.mkdir(exist_ok=True)
             if is_new:
-                _write_list(target, [])
+                _write_list(target, made)
         try:
-            with listed_files(folder, option):
+            with listed_files(folder, option, made):
                 yield GrowingFolder(there)
         finally:
             if is_new and not any((target / name).is_file() for name in files_of_result(target)):
@@ -267,6 +316,8 @@ def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
 @contextmanager
 def _locked(folder: Path, option: str) -> Iterator[_Target]:
     there = _Target(folder, option)
+    if there.path.is_mount():
+        raise ConfigError(f"output folder {folder} is a disk of its own; give a folder within it")
     with there.parents(), there.locked():
         yield there
 
@@ -304,9 +355,9 @@ def drop_result(folder: Path) -> None:
         remove_empty(folder)
 
 
-def _write_list(folder: Path, files: list[Path]) -> None:
+def _write_list(folder: Path, made: str, files: Sequence[Path] = ()) -> None:
     entries = [{"file": path.relative_to(folder).as_posix(), "sha256": file_digest(path)} for path in files]
-    text = "".join(json.dumps(entry) + "\n" for entry in [_HEAD, *entries])
+    text = "".join(json.dumps(entry) + "\n" for entry in [_HEAD | {"made": made}, *entries])
     (folder / LIST).write_text(text, encoding="utf-8")
 
 

@@ -24,7 +24,7 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
         "name": drive.name,
         "paths": [str(path.resolve()) for path in paths],
         **{key: getattr(options, key) for key in ("format", "max_gap_s", "limit", "start_s", "end_s")},
-        "cache": str(Path(options.cache).resolve()),
+        "cache": str(Path(options.cache).absolute()),
         **({"kitti": asdict(options.kitti)} if options.format == "kitti" else {}),
         "cameras": list(drive.cameras),
         "images": len(drive.images),

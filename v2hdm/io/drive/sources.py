@@ -22,13 +22,15 @@ from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
-from v2hdm.io.safe.pixels import png
+from v2hdm.io.safe.pixels import VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole
 
 _log = logging.getLogger(__name__)
+
+_TAIL_S = 1.0  # sound may go on after the last frame
 
 _Lister = Callable[[], ImageFiles]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -188,10 +190,24 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
     with new_entry(folder) as partial:
         stamps: list[float] = []
         names: list[str] = []
+        complained = ""
+        av.logging.set_level(av.logging.ERROR)
         try:
-            with av.open(str(path)) as container:
+            with (
+                av.logging.Capture(local=False) as complaints,
+                av.open(str(path), options=VIDEO_OPTIONS) as container,
+            ):
+                promised_s = (container.duration or 0) / av.time_base
                 for frame in container.decode(video=0):
                     where = f"{path}: frame {len(stamps) + 1}"
+                    if frame.rotation:
+                        raise DriveError(
+                            f"{where} says to turn it, and a calibration is of pixels as they are stored: "
+                            "take the rotation out of the video"
+                        )
+                    if (complaints or frame.is_corrupt) and not complained:
+                        complained = complaints[-1][2].strip() if complaints else "corrupt"
+                        _log.warning("%s: the decoder complains (%s); is it damaged?", where, complained)
                     if frame.pts is None:
                         raise DriveError(f"{where} has no time; give stamps, a time a line")
                     stamps.append(float(frame.pts * frame.time_base))
@@ -202,8 +218,12 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
             raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
+        finally:
+            av.logging.set_level(None)
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
+        if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):
+            _log.warning("%s: its frames end before its %.1f s do; is it cut off?", path, promised_s)
         write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
     return folder
 

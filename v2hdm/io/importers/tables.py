@@ -212,8 +212,11 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
             return line.split()
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
 
-    header = split(title)
-    rows = [(number, split(line)) for number, line in lines[1:]]
+    try:
+        header = split(title)
+        rows = [(number, split(line)) for number, line in lines[1:]]
+    except csv.Error as failure:
+        raise DriveError(f"{path}: is no table ({failure}); mend its quotes or its longest cell") from None
     for number, cells in rows:
         if len(cells) != len(header):
             problem = f"{len(cells)} cells under {len(header)} columns"

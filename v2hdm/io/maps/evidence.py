@@ -73,7 +73,10 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
 
 def read_residuals(path: Path) -> Residuals:
     """Read the file of :func:`write_residuals`; raises MapFileError where it is missing or damaged."""
-    rows = list(csv.reader(io.StringIO(files.read_text(path, MapFileError))))
+    try:
+        rows = list(csv.reader(io.StringIO(files.read_text(path, MapFileError))))
+    except csv.Error:
+        rows = []
     if not rows or tuple(rows[0]) != COLUMNS:
         raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
     images: dict[str, tuple[int, str, float]] = {}

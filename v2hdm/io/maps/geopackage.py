@@ -8,7 +8,8 @@ describes the map. With a geodetic origin coordinates are longitude, latitude an
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.extras import need
 from v2hdm.io.maps.features import POINTS, Feature, features_of, properties_of
-from v2hdm.io.maps.reading import EXACT, LAYERS, gdal_errors
+from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HdMap
 from v2hdm.store.files import whole_file
 
@@ -77,7 +78,7 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
             raw.write(str(unfinished), shapes, values, list(columns), layer=layer, driver="GPKG", **options)
 
         try:
-            with gdal_errors(path, "cannot be written", "set another folder"):
+            with _gdal_errors(path):
                 for key, layer in LAYERS.items():
                     mine = [feature for feature in features if feature.key == key]
                     kind = "LineString Z" if key == POINTS else "Polygon Z"
@@ -92,6 +93,16 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
                 unfinished.replace(partial)
         finally:
             unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def _gdal_errors(path: Path) -> Iterator[None]:
+    errors = need("pyogrio.errors", "gis", "the format gpkg", ConfigError)
+    try:
+        yield
+    except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
+        first = str(failure).splitlines()[0]
+        raise MapFileError(f"{path}: cannot be written ({first}); set another folder") from None
 
 
 def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
@@ -133,7 +144,7 @@ def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]
     empty = dict.fromkeys(("f_table_catalog", "f_table_schema", "styleSLD", "owner", "ui"), "")
     return empty | {
         "f_table_name": layer,
-        "f_geometry_column": "geom",
+        "f_geometry_column": GEOMETRY,
         "styleName": f"v2hdm {layer}",
         "styleQML": _STYLE.format(categories, symbols),
         "description": "colours by class",

@@ -7,17 +7,17 @@ it; the stored coordinates stand where they agree with it within the file's roun
 from __future__ import annotations
 
 import logging
-import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import sqlite3
+import struct
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.features import CORNERS, OUTLINE, POINTS, Feature, map_of, unique_ids
@@ -25,6 +25,7 @@ from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.io.safe.texts import parse_json, take_name
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
 from v2hdm.store.files import load_json, take_array, take_mapping, take_number
+from v2hdm.store.inputs import note_input
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ EXACT = ("heights_m", "covariance_m2")  # columns of a GeoPackage with JSON, bes
 LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 """Layers of a GeoPackage by the property that holds the coordinates of their features."""
 
-_SQL = re.compile(r"sqlite3_\w+\(.*\) failed: |Failed to prepare SQL .*: ")
+GEOMETRY = "geom"  # the column of a GeoPackage's layer
 
 
 def read_map(path: Path) -> tuple[HdMap, Verdict]:
@@ -108,10 +109,10 @@ def read_geopackage(path: Path) -> HdMap:
     rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else np.array(_BINARY_ROUNDING)
     reader = _Reader(path, origin, rounding)
     for key, layer in LAYERS.items():
-        for number, (wkb, properties) in enumerate(_layer(path, layer)):
+        for number, properties in enumerate(_layer(path, layer)):
             where = f"{path}: {layer}, row {number + 1}"
             exact = {name: _json(properties.get(name), f"{where}, {name}") for name in (key, *EXACT)}
-            reader.add(properties | exact, _of_wkb(wkb, where), where)
+            reader.add(properties | exact, _of_wkb(properties.get(GEOMETRY), where), where)
     return reader.map()
 
 
@@ -261,54 +262,68 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     return Geometry(positions[:-1] if closed else positions, closed)
 
 
-def _of_wkb(wkb: bytes | None, where: str) -> Geometry | None:
-    """A polygon of one ring, a line, or a Multi... of one of them, from well-known binary."""
-    if wkb is None:
+def _of_wkb(blob: object, where: str) -> Geometry | None:
+    """A polygon of one ring, a line, or a Multi... of one, from GeoPackage's binary (OGC 12-128r19, 2.1.3).
+
+    It is taken apart here: GEOS dies of a geometry that holds another, which holds another, and so on.
+    """
+    if blob is None:
         return None
-    shapely = need("shapely", "gis", "the format gpkg", ConfigError)
-    parts = shapely.get_parts(shapely.from_wkb(wkb))
-    if len(parts) != 1:
-        raise MapFileError(f"{where}: its geometry has several parts; split it")
-    shape = parts[0]
-    if shape.geom_type not in ("LineString", "Polygon"):
-        raise MapFileError(f"{where}: its geometry is none that a map has; draw a polygon or a line")
-    closed, dimensions = shape.geom_type == "Polygon", 3 if shape.has_z else 2
-    if closed and len(shape.interiors):
-        raise MapFileError(f"{where}: its polygon has holes; fill them")
-    positions = shapely.get_coordinates(shape, include_z=shape.has_z).tolist()
-    positions = take_array(positions, (-1, dimensions), f"{where}, geometry", MapFileError)
-    return Geometry(positions[:-1] if closed else positions, closed)
-
-
-@contextmanager
-def gdal_errors(path: Path, problem: str, advice: str) -> Iterator[None]:
-    """Turn an error of GDAL into one line: the first of its own, without the SQL."""
-    errors = need("pyogrio.errors", "gis", "the format gpkg", ConfigError)
     try:
-        yield
-    except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-        first = _SQL.sub("", str(failure).splitlines()[0])
-        raise MapFileError(f"{path}: {problem} ({first}); {advice}") from None
+        data = bytes(memoryview(blob))  # type: ignore[arg-type]
+        kind, count, at = 5, 1, 8 + (0, 32, 48, 48, 64)[data[3] >> 1 & 7]
+        for _ in range(2):  # a Multi..., and what is in it
+            if kind % 1000 in (5, 6) and count == 1:
+                order = "<" if data[at] else ">"
+                kind, count, at = (*struct.unpack_from(f"{order}II", data, at + 1), at + 9)
+        closed, dimensions = kind % 1000 == 3, (2, 3, 3, 4)[kind // 1000]
+        if kind % 1000 not in (2, 3):
+            several = kind % 1000 in (5, 6)
+            problem = "has several parts; split it" if several else "is none that a map has; draw another"
+            raise MapFileError(f"{where}: its geometry {problem}")
+        if closed and count != 1:
+            raise MapFileError(f"{where}: its polygon has holes; fill them")
+        if closed:
+            (count,), at = struct.unpack_from(f"{order}I", data, at), at + 4
+        positions = np.frombuffer(data, f"{order}f8", count * dimensions, at).reshape(count, dimensions)
+    except (TypeError, ValueError, LookupError, struct.error):
+        raise MapFileError(f"{where}: its geometry is damaged; draw it again") from None
+    has_z = kind // 1000 in (1, 3)
+    read = take_array(positions[:, : 3 if has_z else 2], (-1, 2 + has_z), f"{where}, geometry", MapFileError)
+    return Geometry(read[:-1] if closed else read, closed)
 
 
 def _about(path: Path, key: str) -> object:
     """The entry ``key`` of a GeoPackage's table about the map."""
     rows = _layer(path, "v2hdm")
-    return _json(rows[0][1].get(key), f"{path}: {key}") if rows else None
+    return _json(rows[0].get(key), f"{path}: {key}") if rows else None
 
 
-def _layer(path: Path, layer: str) -> list[tuple[bytes | None, dict[str, Any]]]:
-    """Geometry and properties of each row of a GeoPackage's layer; missing numbers are None."""
-    raw = need("pyogrio.raw", "gis", "the format gpkg", ConfigError)
+def _layer(path: Path, layer: str) -> list[dict[str, Any]]:
+    """The rows of a GeoPackage's layer, by SQLite alone: GDAL would open whatever a file says that it is."""
+    note_input(path)
     if not path.is_file():
         raise MapFileError(f"{path}: no such file; check the path or restore it")
-    with gdal_errors(path, "not a map written by v2hdm", "give one that is"):
-        meta, _, geometry, columns = raw.read(str(path), layer=layer)
-    rows = [
-        {name: None if value != value else value for name, value in zip(meta["fields"], row, strict=True)}
-        for row in zip(*(column.tolist() for column in columns), strict=True)
-    ]
-    return list(zip([None] * len(rows) if geometry is None else geometry, rows, strict=True))
+    others = f"{path}: not a map written by v2hdm"
+    journal = path.with_name(f"{path.name}-wal")
+    left = path.stat().st_size + (journal.stat().st_size if journal.is_file() else 0)
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as data:
+            # A view, a virtual table and a generated column would compute without end.
+            about = data.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", [layer]).fetchall()
+            columns = data.execute("SELECT name, hidden FROM pragma_table_xinfo(?)", [layer]).fetchall()
+            plain = [kind == "table" and "VIRTUAL" not in sql.upper()[:20] for kind, sql in about]
+            if plain != [True] or any(hidden for _, hidden in columns):
+                raise MapFileError(f"{others} (it has no plain table '{layer}'); give one that is")
+            rows = []
+            for row in data.execute(f'SELECT * FROM "{layer}"'):
+                left -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
+                if left < 0:
+                    raise MapFileError(f"{others} (its rows are more than its bytes); give one that is")
+                rows.append(dict(zip((name for name, _ in columns), row, strict=True)))
+    except (sqlite3.Error, AttributeError) as failure:
+        raise MapFileError(f"{others} ({failure}); give one that is") from None
+    return rows
 
 
 def _json(text: object, where: str) -> object:

@@ -48,6 +48,11 @@ _UPRIGHT = 1
 _DAMAGE = re.compile(
     r"Corrupt JPEG|Premature end|libpng (error|warning: .*CRC)|Invalid SOS|bad Huffman", re.I
 )
+VIDEO_OPTIONS = {
+    "protocol_whitelist": "file",
+    "format_whitelist": "mov,matroska,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,ivf,obu,asf,flv,ogg,mjpeg,mxf",
+}
+"""FFmpeg's, without which a file of another format, such as a playlist, makes it open other files."""
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
@@ -178,7 +183,7 @@ def _header(data: _Data) -> Header | None:
             return Header(*_unpack("<HH", data, 18))
         width, height = _unpack("<ii", data, 18)
         return Header(width, abs(height))
-    return _webp_header(data[:32])
+    return _webp_header(data)
 
 
 def _unpack(form: str, data: _Data, at: int) -> tuple[int, ...]:
@@ -216,15 +221,21 @@ def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
         at += 12 + length
 
 
-def _webp_header(data: bytes) -> Header:
+def _webp_header(data: _Data) -> Header:
     """The size in the first chunk (RFC 9649, section 2)."""
     kind = data[12:16]
     if kind == b"VP8X":
-        return Header(*(int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27)))
+        at, exif = 12, b""
+        while not exif and at + 8 <= len(data):
+            end = at + 8 + _unpack("<I", data, at + 4)[0]
+            exif = data[at + 8 : end].removeprefix(b"Exif\0\0") if data[at : at + 4] == b"EXIF" else b""
+            at = end + end % 2
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        return Header(width, height, _orientation(exif))
     if kind == b"VP8L":
         bits = int.from_bytes(data[21:25], "little")
         return Header((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
-    width, height = struct.unpack_from("<HH", data, 26)
+    width, height = _unpack("<HH", data, 26)
     return Header(width & 0x3FFF, height & 0x3FFF)
 
 

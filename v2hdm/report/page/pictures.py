@@ -50,11 +50,7 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     """
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
-    root = facts.drive.root
-    images = {  # by their names in residuals.csv
-        image.path.relative_to(root).as_posix() if image.path.is_relative_to(root) else str(image.path): image
-        for image in facts.drive.images
-    }
+    images = {facts.drive.name_of(image.path): image for image in facts.drive.images}
     calibrations = {name: one.calibration for name, one in facts.cameras.items()}
     cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
     cuts = [*_of_markings(facts)]

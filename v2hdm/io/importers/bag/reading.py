@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import re
+from bz2 import BZ2Decompressor
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from v2hdm.errors import DriveError
@@ -16,6 +21,12 @@ from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
+_TIMES, _SPARE_BYTES = 10, 200_000_000  # what a piece may unpack to: so many times its bytes, and these
+_MOST_LETTERS = 1_000_000  # of a type's definition
+_TEXTS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\Z)|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
+_CONSTANT, _LITERAL = re.compile(r"\bconst\b[^=;]*=([^;]*)"), re.compile(r"\s*[-+]?[\w.:]*\s*")
+_LONG = re.compile(r"\[[\s<=]*\d{8,}")  # an array of ten million elements
+_NESTED = re.compile(r"\([^()]*\(|\[[^\[\]]*\[")
 _MEND = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 
 
@@ -123,6 +134,7 @@ class Bag:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         definition = connection.msgdef
+        _check_definition(definition.data)
         if definition.format == MessageDefinitionFormat.NONE:
             return get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
         store = get_typestore(Stores.EMPTY)
@@ -155,6 +167,7 @@ class Bag:
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it."""
     need("rosbags", "ros", f"{path}: a bag", DriveError)
+    _limit_unpacking()
     from rosbags import rosbag1, rosbag2
 
     files = bag_files(path)
@@ -178,6 +191,54 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 readers.sort(key=lambda reader: reader.start_time)
             bag = Bag(path, readers)
         yield bag
+
+
+@cache
+def _limit_unpacking() -> None:
+    """Give rosbags decompressors that stop: some hundred kilobytes of zeros unpack to all of the memory."""
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+    from rosbags.rosbag1 import reader as reader1
+    from rosbags.rosbag2 import reader as reader2
+    from rosbags.rosbag2 import storage_mcap
+
+    def limited(new: Callable[[], Any]) -> Callable[..., bytes]:
+        def unpack(data: bytes, *_: object) -> bytes:
+            stream = new()
+            out: bytes = stream.decompress(data, max_length=_TIMES * len(data) + _SPARE_BYTES)
+            if not stream.eof:
+                raise DriveError("is cut off, or unpacks to more than a recording would")
+            return out
+
+        return unpack
+
+    @contextmanager
+    def limited_file(file: Any, mode: str) -> Iterator[Any]:
+        left = _TIMES * os.fstat(file.fileno()).st_size + _SPARE_BYTES
+
+        def read(count: int) -> bytes:
+            nonlocal left
+            left -= len(data := whole.read(count))
+            if left < 0:
+                raise DriveError(f"{file.name}: unpacks to more than a recording would; unpack it yourself")
+            return bytes(data)
+
+        with zstd.open(file, mode) as whole:
+            yield SimpleNamespace(read=read)
+
+    named: Any = reader2
+    zstd, lz4 = named.zstd, limited(LZ4FrameDecompressor)
+    unpack = limited(zstd.ZstdDecompressor)
+    storage_mcap.DECOMPRESSORS.update(zstd=unpack, lz4=lz4)
+    reader1.decompressors.update(bz2=limited(BZ2Decompressor), lz4=lz4)
+    named.zstd = SimpleNamespace(open=limited_file, decompress=unpack)
+
+
+def _check_definition(text: str) -> None:
+    """Refuse a type on which rosbags' parser, or what it generates, would take for ever."""
+    plain = _TEXTS.sub("", text)
+    odd = any(not _LITERAL.fullmatch(one[1]) for one in _CONSTANT.finditer(plain))
+    if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or _LONG.search(plain):
+        raise DriveError("its definition is none of a recording's; convert it where it was recorded")
 
 
 def _check_database(path: Path) -> None:

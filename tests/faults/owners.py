@@ -1,0 +1,258 @@
+"""Bad inputs of whose a file is: results of other commands, files of the user's, links, and GeoPackages."""
+
+import os
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+from tests.calibration.site import INFO, clicked, mounting, write_table
+from tests.drive.example import make_drive, make_map
+from tests.faults.judge import Case, Prepare
+from v2hdm.io.calibration.reading import read_provenance
+from v2hdm.io.calibration.writing import (
+    CALIBRATION_FORMATS,
+    write_calibration,
+    write_calibration_as,
+    write_camera_info,
+)
+from v2hdm.io.maps.formats import FORMATS, write_map
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.records import Calibration
+from v2hdm.store.results import listed_files, result_folder
+
+COMMANDS = {
+    "v2hdm check": "drive --no-ground --workers 1 --output out",
+    "v2hdm calibrate ground": "drive --workers 1 --output out",
+    "v2hdm calibrate points": "points.csv --intrinsics camera_info.yaml --output out",
+    "v2hdm localize": "map.geojson drive --workers 1 --output out",
+    "v2hdm map": "drive.path=drive output=. name=out workers=1",
+}
+"""Each makes a result in the folder ``out``."""
+
+MAKERS = {
+    "the same of another drive": "{command} of /data/monday",
+    "a map": "v2hdm map of /data/monday",
+    "a check": "v2hdm check of /data/monday",
+    "an experiment": "v2hdm experiment",
+    "exports": "v2hdm export of /data/map.geojson",
+    "drawings": "v2hdm detect of /data/images",
+    "an earlier version": "",
+}
+
+
+def owners() -> Iterator[Case]:
+    """Outputs onto what somebody else has made, or the command reads."""
+    for command, line in COMMANDS.items():
+        for name, made in MAKERS.items():
+            own = made.format(command=command)
+            prepare = _site(lambda root, own=own: _result(root / "out", own))
+            says = "holds a result of .*: move it"
+            yield Case(f"{command} over the result of {name}", command, line.split(), prepare, says)
+    line = "out/map.geojson drive --workers 1 --output out"
+    reads = _site(lambda root: _result(root / "out", "v2hdm map of drive"))
+    yield Case("localize over the map that it reads", "v2hdm localize", line.split(), reads, "move it")
+    for base in ("out/map.geojson", "out", "linked.geojson"):
+        words = (*COMMANDS["v2hdm map"].split(), f"map.base={base}")
+        yield Case(f"map over its base {base}", "v2hdm map", words, _site(_own_base), "one of the inputs")
+    for file, prepare, words in _exports():
+        for name, harm in HARMS.items():
+            says = "move it, or give another --output"
+            case = f"export onto {name}: {words}"
+            yield Case(case, "v2hdm export", words.split(), _both(prepare, _harmed(file, harm)), says)
+
+
+def _site(more: Callable[[Path], None]) -> Prepare:
+    def prepare(root: Path) -> None:
+        make_drive(root / "drive")
+        write_geojson(make_map(), root / "map.geojson")
+        write_camera_info(INFO, root / "camera_info.yaml")
+        write_table(root, *clicked(seed=1))
+        _calibrated(root)
+        more(root)
+
+    return prepare
+
+
+def _calibrated(folder: Path) -> None:
+    write_calibration(Calibration(INFO, mounting()), folder / "calibration_front.yaml")
+
+
+def _result(folder: Path, made: str) -> None:
+    with result_folder(folder, made=made) as partial:
+        write_geojson(make_map(), partial / "map.geojson")
+        _calibrated(partial)
+
+
+def _own_base(root: Path) -> None:
+    _result(root / "out", f"v2hdm map of {(root / 'drive').resolve()}")
+    (root / "linked.geojson").symlink_to("out/map.geojson")
+
+
+def _both(first: Prepare, second: Prepare) -> Prepare:
+    def prepare(root: Path) -> None:
+        first(root)
+        second(root)
+
+    return prepare
+
+
+def _exports() -> Iterator[tuple[str, Prepare, str]]:
+    """A file of each format, what writes it as the command does, and the command's line."""
+    for name in FORMATS:
+        source = "map.gpkg" if name == "geojson" else "map.geojson"
+
+        def write(root: Path, name: str = name, source: str = source) -> None:
+            write_map(make_map(), root, "map", [source.rpartition(".")[2]])
+            with listed_files(root / "there", "--output", f"v2hdm export of {(root / source).resolve()}"):
+                write_map(make_map(), root / "there", "map", [name])
+
+        line = f"{source} --format {name} --output there"
+        yield f"there/{FORMATS[name].file.format(name='map')}", write, line
+    for name, (ending, _) in CALIBRATION_FORMATS.items():
+
+        def put(root: Path, name: str = name) -> None:
+            calibration = Calibration(INFO, mounting())
+            write_calibration(calibration, root / "c.yaml")
+            with listed_files(root / "there", "--output", f"v2hdm export of {(root / 'c.yaml').resolve()}"):
+                about = read_provenance(root / "c.yaml")
+                write_calibration_as(name, calibration, about, root / "there", INFO.name)
+
+        yield f"there/{INFO.name}_{ending}", put, f"c.yaml --format {name} --output there"
+
+
+def _edited(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"edited")
+
+
+def _replaced(path: Path) -> None:
+    path.unlink()
+    path.write_text("of the user's")
+
+
+def _linked(path: Path) -> None:
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to("elsewhere")
+
+
+def _dangling(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("nowhere")
+
+
+def _linked_folder(path: Path) -> None:
+    path.parent.rename(path.parent.with_name("elsewhere"))
+    path.parent.symlink_to("elsewhere")
+    _edited(path)
+
+
+def _twin(path: Path) -> None:
+    """Another name of a file that was edited since."""
+    os.link(path, path.with_name("twin"))
+    _edited(path)
+
+
+def _listless(path: Path) -> None:
+    """What an earlier version has written, or the user."""
+    for one in path.parents:
+        (one / ".v2hdm-results.jsonl").unlink(missing_ok=True)
+
+
+HARMS: dict[str, Callable[[Path], None]] = {
+    "an edited file": _edited,
+    "a file of the user's": _replaced,
+    "a link": _linked,
+    "a link to nowhere": _dangling,
+    "an edited file in a linked folder": _linked_folder,
+    "a file with two names": _twin,
+    "a file on no list": _listless,
+}
+
+
+def _harmed(name: str, harm: Callable[[Path], None]) -> Prepare:
+    return lambda root: harm(root / name)
+
+
+_VRT = (
+    '<OGRVRTDataSource><OGRVRTLayer name="v2hdm"><SrcDataSource>{}</SrcDataSource></OGRVRTLayer>'
+    "</OGRVRTDataSource>"
+)
+OTHERS: dict[str, bytes] = {
+    "a VRT of a file": _VRT.format("/etc/hosts").encode(),
+    "a VRT of a host": _VRT.format("/vsicurl/http://127.0.0.1:9/a.geojson").encode(),
+    "a VRT of itself": _VRT.format("map.gpkg").encode(),
+    "a VRT behind SQLite's name": b"SQLite format 3\0" + _VRT.format("/etc/hosts").encode(),
+    "a GeoJSON": b'{"type": "FeatureCollection", "features": []}',
+    "a CSV": b"WKT,name\n",
+    "a zip": b"PK\3\4" + bytes(60),
+    "a GDALG pipeline": b'{"type": "gdal_streamed_alg", "command_line": "gdal vector read /etc/hosts"}',
+    "nothing": b"",
+    "SQLite's name alone": b"SQLite format 3\0",
+    "SQLite's name and zeros": b"SQLite format 3\0" + bytes(4080),
+}
+_ENDLESS = "WITH RECURSIVE n(geom) AS (SELECT 0 UNION ALL SELECT geom + 1 FROM n) SELECT * FROM n"
+SQL: dict[str, tuple[str, str]] = {
+    "an endless view": (f"DROP TABLE markings; CREATE VIEW markings AS {_ENDLESS}", "no plain table"),
+    "an endless view about it": (f"DROP TABLE v2hdm; CREATE VIEW v2hdm AS {_ENDLESS}", "no plain table"),
+    "a virtual table": ("DROP TABLE markings; CREATE VIRTUAL TABLE markings USING fts5(a)", "no plain table"),
+    "a computed column": ("ALTER TABLE markings ADD x AS (zeroblob(1000000000))", "no plain table"),
+    "no table of markings": ("DROP TABLE markings", "no plain table"),
+    "no table about it": ("DROP TABLE v2hdm", "no plain table"),
+    "a text for a geometry": ("UPDATE markings SET geom = 'a'", "is damaged"),
+    "a number for a geometry": ("UPDATE markings SET geom = 7", "is damaged"),
+    "a short geometry": ("UPDATE markings SET geom = X'47500001'", "is damaged"),
+    "a geometry of zeros": ("UPDATE markings SET geom = zeroblob(200)", "is none that a map has"),
+    "a text for a number": ("UPDATE markings SET sightings = 'many'", "sightings"),
+    "a blob for a class": ("UPDATE markings SET class = X'ff00'", "class"),
+    "text that is no UTF-8": ("UPDATE markings SET class = CAST(X'ff' AS TEXT)", "UTF-8|class"),
+    "coordinates nested 3000 deep": (
+        f"UPDATE markings SET corners_map = '{'[' * 3000}{']' * 3000}'", "nested deeper"
+    ),
+    "an origin that is a list": ("UPDATE v2hdm SET origin = '[1]'", "origin"),
+}  # fmt: skip
+_POINT = struct.pack("<BIdd", 1, 1, 0.0, 0.0)
+GEOMETRIES: dict[str, tuple[bytes, str]] = {
+    "a point": (_POINT, "is none that a map has"),
+    "a Multi within a Multi, 200000 deep": (struct.pack("<BII", 1, 6, 1) * 200_000, "several parts"),
+    "collections, 200000 deep": (struct.pack("<BII", 1, 7, 1) * 200_000, "is none that a map has"),
+    "4 billion polygons": (struct.pack("<BII", 1, 6, 2**32 - 1), "several parts"),
+    "4 billion rings": (struct.pack("<BII", 1, 3, 2**32 - 1), "holes"),
+    "4 billion points": (struct.pack("<BIII", 1, 3, 1, 2**32 - 1), "is damaged"),
+    "a line of 4 billion points": (struct.pack("<BII", 1, 2, 2**32 - 1), "is damaged"),
+    "an unknown kind": (struct.pack("<BII", 1, 2**32 - 1, 1), "is none|is damaged"),
+    "not a number": (
+        struct.pack("<BIII", 1, 3, 1, 5) + struct.pack("<10d", *[float("nan")] * 10), "not finite"
+    ),
+}  # fmt: skip
+
+
+def geopackages() -> Iterator[Case]:
+    """Files that end in .gpkg, and are something else, or compute, or never end."""
+    line = ("map.gpkg", "--format", "csv", "--output", "there")
+    for name, data in OTHERS.items():
+        prepare = _wrote("map.gpkg", data)
+        yield Case(f"geopackage: {name}", "v2hdm export", line, prepare, "not a map written by v2hdm")
+    for name, (sql, says) in SQL.items():
+        yield Case(f"geopackage: {name}", "v2hdm export", line, _executed(sql), says)
+    for name, (wkb, says) in GEOMETRIES.items():
+        blob = b"GP\0\1" + bytes(4) + wkb
+        prepare = _executed(f"UPDATE markings SET geom = X'{blob.hex()}'")
+        yield Case(f"geopackage: {name}", "v2hdm export", line, prepare, says)
+
+
+def _wrote(name: str, data: bytes) -> Prepare:
+    return lambda root: (root / name).write_bytes(data) and None
+
+
+def _executed(sql: str) -> Prepare:
+    def prepare(root: Path) -> None:
+        write_map(make_map(), root, "map", ["gpkg"])
+        with closing(sqlite3.connect(root / "map.gpkg")) as data:
+            triggers = data.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
+            for (name,) in triggers:  # they call functions of GDAL's
+                data.execute(f'DROP TRIGGER "{name}"')
+            data.executescript(sql)
+            data.commit()
+
+    return prepare
