@@ -29,9 +29,6 @@ class _Face:
     upright: bool
     picture: NDArray[np.uint8] | None = None
 
-    def is_turned_to(self, point_map: FloatArray) -> bool:
-        return bool((point_map - self.corners_map[0]) @ self.normal > 1e-3)
-
 
 def draw_boxes(
     boxes: tuple[Box, ...], light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
@@ -50,7 +47,8 @@ def draw_boxes(
 
     # Of stacked boxes the upper comes first: its underside lies behind the one below.
     ordered = sorted(visible, key=lambda b: (distance(b), b.base_m), reverse=True)
-    turned = [(box, face) for box in ordered for face in _faces(box) if face.is_turned_to(centre)]
+    faces = [(box, face) for box in ordered for face in _faces(box)]
+    turned = [one for one in faces if (centre - one[1].corners_map[0]) @ one[1].normal > 1e-3]
     shapes = outlines(view, [view.homogeneous_px(face.corners_map) for _, face in turned])
     for (box, face), shape in zip(turned, shapes, strict=True):
         if shape is not None:

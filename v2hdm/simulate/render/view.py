@@ -98,43 +98,31 @@ def outlines(view: View, polygons: Sequence[FloatArray]) -> list[Outline | None]
     """The outlines of polygons of homogeneous pinhole pixels (N, 3); None for those out of view."""
     if not polygons:
         return []
-    parts = _visible_parts(view, polygons)
-    points, following, begins = _laid_out(polygons)
+    count, points = np.array([len(polygon) for polygon in polygons]), np.concatenate(polygons)
+    ends = np.cumsum(count)
+    parts = _visible_parts(view, polygons, points, ends - count)
+    place = np.arange(1, len(points) + 1)
+    place[ends - 1] = ends - count
+    following = points[place]
     # The cross product by columns: numpy's own takes ten times as long on four rows.
-    edges = points[:, [1, 2, 0]] * points[following][:, [2, 0, 1]]
-    edges -= points[:, [2, 0, 1]] * points[following][:, [1, 2, 0]]
+    edges = points[:, [1, 2, 0]] * following[:, [2, 0, 1]] - points[:, [2, 0, 1]] * following[:, [1, 2, 0]]
     norms = np.hypot(edges[:, 0], edges[:, 1])
     usable = norms > 1e-12
     edges /= np.where(usable, norms, 1.0)[:, None]
     corners = []
     for part in parts:
         own = part[:, :2] / part[:, 2:]
-        span = float(np.ptp(own, axis=0).max()) if len(own) else 0.0
-        steps = _STEPS[int(min(span / 40.0, 8.0))]
+        steps = _STEPS[int(min(float(np.ptp(own, axis=0).max()) / 40.0, 8.0)) if len(own) else 0]
         corners.append((own + steps * (following_row(own) - own)).transpose(1, 0, 2).reshape(-1, 2))
     boundaries = distort_points(view.rays.info, np.concatenate(corners))
-    ends = np.cumsum([len(one) for one in corners])
+    bounds = np.split(boundaries, np.cumsum([len(one) for one in corners])[:-1])
     found: list[Outline | None] = []
-    for polygon, part, begin, boundary in zip(
-        polygons, parts, begins, np.split(boundaries, ends[:-1]), strict=True
-    ):
-        rows = slice(begin, begin + len(polygon))
-        own = edges[rows][usable[rows]]
-        if len(part) < 3 or len(own) < 3:
-            found.append(None)
-            continue
+    for polygon, part, end, bound in zip(polygons, parts, ends.tolist(), bounds, strict=True):
+        own = edges[end - len(polygon) : end][usable[end - len(polygon) : end]]
         inward = (own @ polygon.mean(axis=0)).sum() >= 0
-        found.append(Outline(own if inward else -own, boundary))
+        shown = len(part) >= 3 and len(own) >= 3
+        found.append(Outline(own if inward else -own, bound) if shown else None)
     return found
-
-
-def _laid_out(polygons: Sequence[FloatArray]) -> tuple[FloatArray, IntArray, list[int]]:
-    """Points (N, 3) of all polygons, the place of each one's successor, and where polygons begin."""
-    count = np.array([len(polygon) for polygon in polygons])
-    ends = np.cumsum(count)
-    following = np.arange(1, ends[-1] + 1)
-    following[ends - 1] = ends - count
-    return np.concatenate(polygons), following, (ends - count).tolist()
 
 
 def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:
@@ -157,14 +145,15 @@ def following_row(array: FloatArray) -> FloatArray:
     return np.concatenate([array[1:], array[:1]])
 
 
-def _visible_parts(view: View, polygons: Sequence[FloatArray]) -> list[FloatArray]:
-    """The parts (M, 3) of homogeneous polygons in front of the camera and near the image."""
+def _visible_parts(
+    view: View, polygons: Sequence[FloatArray], points: FloatArray, begins: IntArray
+) -> list[FloatArray]:
+    """The parts (M, 3) of homogeneous polygons, whose ``points`` follow, in front of and near the image."""
     u0, v0, u1, v1 = view.rays.bounds
     sides = [[1.0, 0.0, _MARGIN_PX - u0], [-1.0, 0.0, u1 + _MARGIN_PX]]
     sides += [[0.0, 1.0, _MARGIN_PX - v0], [0.0, -1.0, v1 + _MARGIN_PX]]
     limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
-    points, _, begins = _laid_out(polygons)
     inside = points @ limits.T >= least
     whole = np.logical_and.reduceat(inside, begins).all(axis=1)
     hidden = np.asarray(~np.logical_or.reduceat(inside, begins).all(axis=1))
