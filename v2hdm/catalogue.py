@@ -13,9 +13,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from v2hdm.errors import ConfigError
 from v2hdm.io.safe.texts import read_yaml, shown
-from v2hdm.records import LANE_BOUNDARY
+from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 
@@ -60,23 +62,28 @@ class MarkingClass:
         return self.family in (QUADRILATERAL, STRIPE)
 
     def size_log_likelihood(
-        self, length_m: float, width_m: float, *, whole: bool, log_sigma: float = 0.0
-    ) -> float:
-        """Log likelihood of a size, 0 within the ranges; of a piece that the border cuts only the upper ends.
+        self,
+        length_m: float | FloatArray,
+        width_m: float | FloatArray,
+        *,
+        whole: bool | BoolArray,
+        log_sigma: float | FloatArray = 0.0,
+    ) -> FloatArray:
+        """Log likelihood of sizes, 0 within the ranges; of a piece that the border cuts only the upper ends.
 
-        ``log_sigma`` is the standard deviation of the logarithm of what is measured.
+        ``log_sigma`` is the standard deviation of the logarithm of what is measured; arguments broadcast.
         Sizes are not a number where a piece shows no ground; then they say nothing.
         """
-        if not (math.isfinite(length_m) and math.isfinite(width_m)):
-            return 0.0
-        sizes = ((max(length_m, _TINY_M), self.length_m), (max(width_m, _TINY_M), self.width_m))
-        softness, aspect = (math.hypot(one, log_sigma) for one in (self.softness, _ASPECT_SOFTNESS))
-        off = [math.log(size / high) / softness for size, (_, high) in sizes if high < math.inf]
-        if whole:
-            off += [math.log(max(low, _TINY_M) / size) / softness for size, (low, _) in sizes]
-            if self.family in (STRIPE, LINE):
-                off.append(math.log(_STRIPE_ASPECT * sizes[1][0] / sizes[0][0]) / aspect)
-        return -0.5 * sum(max(one, 0.0) ** 2 for one in off)
+        length, width = (np.log(np.maximum(size, _TINY_M)) for size in (length_m, width_m))
+        softness, aspect = (np.hypot(one, log_sigma) for one in (self.softness, _ASPECT_SOFTNESS))
+        sizes = ((length, self.length_m), (width, self.width_m))
+        off = [(size - math.log(high)) / softness for size, (_, high) in sizes if high < math.inf]
+        below = [(math.log(max(low, _TINY_M)) - size) / softness for size, (low, _) in sizes]
+        if self.family in (STRIPE, LINE):
+            below.append((math.log(_STRIPE_ASPECT) + width - length) / aspect)
+        off += [np.where(whole, one, 0.0) for one in below]
+        total = sum(np.square(np.maximum(one, 0.0)) for one in off)
+        return np.asarray(np.where(np.isfinite(length + width), -0.5 * total, 0.0))
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,9 @@ from v2hdm.records import FloatArray
 _STEP = 1e-3
 """Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""
 
+_NUDGE = 1e-6
+"""Step of one-sided differences from the solution, in the unit of the fault."""
+
 _LEAST_OBSERVABLE = 1e-9
 """Share of a fault's own information, left by all else, below which rounding alone is left of it."""
 
@@ -247,16 +250,12 @@ class _Bench:
 
     def efficient(self, column: Rows) -> Rows:
         """A fault's column less what is estimated in its place: z = J_p - J_y H^-1 J_y' J_p."""
-        engine, step = self.whitening.engine, _STEP * self._coupling(column)
-        high, low = (
-            _rows(engine.arrays, one, engine.residuals(engine.poses(one), one.corners_map) * self.root)
-            for one in (
-                self.whitening.linearised.evaluate(*self.whitening.step(x)).estimate for x in (step, -step)
-            )
-        )
+        engine, step = self.whitening.engine, _NUDGE * self._coupling(column)
+        at = self.whitening.linearised.evaluate(*self.whitening.step(step)).estimate
+        moved = _rows(engine.arrays, at, engine.residuals(engine.poses(at), at.corners_map) * self.root)
         return {
-            name: column.get(name, torch.zeros_like(row)) - (row - low[name]) / (2 * _STEP)
-            for name, row in high.items()
+            name: column.get(name, torch.zeros_like(row)) - (row - self.residuals[name]) / _NUDGE
+            for name, row in moved.items()
         }
 
     def _coupling(self, column: Rows) -> Tensor:

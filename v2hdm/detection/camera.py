@@ -135,14 +135,14 @@ class RoadCamera:
         """Distance on the ground from below the camera; NaN stays NaN."""
         return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
 
-    def log_size_sigma(self, range_m: float) -> float:
-        """Standard deviation of the logarithm of a length on the ground at a distance, m.
+    def log_size_sigma(self, range_m: FloatArray) -> FloatArray:
+        """Standard deviation of the logarithm of lengths on the ground at distances, m.
 
         It is that of lengths along the view, h f / v^2 per px at v px below the horizon; across it half of
         the horizon's part is left, and none of the focal length's.
         """
         horizon_rad, log_focal = self.camera.mounting_sigma
-        return float(np.hypot(2 * horizon_rad * range_m / self._height_m, log_focal))
+        return np.hypot(2 * horizon_rad * range_m / self._height_m, log_focal)
 
     def coarse(self, rows_px: FloatArray) -> BoolArray:
         """Which rows (N,) lie so near that they are looked at in half the resolution."""

@@ -174,16 +174,17 @@ def pixel_weights(
     square = robust * residual * residual
     total, count = square.sum(axis=1), robust.sum(axis=1)
     shared = total / np.maximum(count, 1)
-    by_side = np.stack([square, robust], axis=1) @ lattice.of_side
+    by_side = np.stack([square, robust], axis=1) @ lattice.of_side.swapaxes(1, 2)
     variance = (by_side[:, 0] + _SHARED_PIXELS * shared[:, None]) / (by_side[:, 1] + _SHARED_PIXELS)
     variance = np.maximum(variance.astype(np.float64), _MIN_SCATTER**2)
     inflation = np.ones(len(residual))
-    rows = np.arange(len(residual))[:, None]
-    for neighbour in lattice.neighbours:
-        pair = robust * robust[rows, neighbour] * (neighbour > 0)
-        inflation *= variance_inflation(residual, residual[rows, neighbour], pair, _MAX_CORRELATION)
+    rows = residual.shape[1] * np.arange(len(residual))[:, None]
+    for neighbour in lattice.neighbours.swapaxes(0, 1):
+        at = neighbour + rows
+        pair = robust * robust.take(at) * (neighbour > 0)
+        inflation *= variance_inflation(residual, residual.take(at), pair, _MAX_CORRELATION)
     per_pixel = 1 / (variance * inflation[:, None])
-    weight = robust * (per_pixel.astype(np.float32)[:, None] @ lattice.of_side.swapaxes(1, 2))[:, 0]
+    weight = robust * (per_pixel.astype(np.float32)[:, None] @ lattice.of_side)[:, 0]
     inliers = count / np.maximum(use.sum(axis=1), 1)
     return weight, np.sqrt(variance), inliers.astype(np.float64)
 

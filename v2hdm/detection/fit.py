@@ -24,7 +24,7 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.coverage import add_paint, blurred_coverage, pixel_weights
 from v2hdm.detection.lattice import KNOTS, Lattice, lay_grid, lay_lattice
 from v2hdm.detection.patch import LensFrames, Patches
-from v2hdm.geometry.quadrilateral import Quad, is_convex_px
+from v2hdm.geometry.quadrilateral import Quad, following, is_convex_px
 from v2hdm.records import BoolArray, FloatArray
 
 TYPICAL_BLUR_PX = 0.75
@@ -217,7 +217,7 @@ def fit_quadrilaterals(
 
     lattice = lay_lattice(patches, frames, searched_px)
     found = Quad(searched)
-    inward_px = -_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)
+    inward_px = -_BLOOM * blur_px * np.minimum(lattice.clipped[:, 0] / _MUCH_CLIPPED, 1.0)
     begun = found.moved(np.repeat(inward_px[:, None], 8, axis=1))
     sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA * length_px, _OUTLINE_SIGMA_PX), 2)
     state = _State.at(begun, np.full(len(searched), blur_px), blur_px, sigma_px, frames)
@@ -300,7 +300,14 @@ class _State:
         outline = quad.corners, outline_sigma_px, *_closure(quad.corners, frames)
         contrast, light = np.full(count, _CONTRAST), np.full((count, KNOTS), np.nan)
         return cls(
-            quad, blur_px, expected_blur_px, *outline, contrast, contrast.copy(), light, np.zeros(count)
+            Quad(quad.corners.copy()),
+            blur_px,
+            expected_blur_px,
+            *outline,
+            contrast,
+            contrast.copy(),
+            light,
+            np.zeros(count),
         )
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
@@ -309,22 +316,22 @@ class _State:
         With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
         """
         scatter, settled_px = (_FINAL_SCATTER, _SETTLED_PX) if paint is None else (_WIDE_SCATTER, _FOUND_PX)
-        system = self.step(lattice, paint, scatter)
-        running = np.arange(len(self.blur_px))
-        moving = np.abs(system.by_side).max(axis=1) > settled_px
-        for number in range(1, steps):
-            lattice, running = lattice.take(moving), running[moving]
-            paint = None if paint is None else paint[moving]
-            if not len(running):
-                break
+        count = len(self.blur_px)
+        system = _System(*(np.zeros((count, *shape)) for shape in ((_UNKNOWNS, _UNKNOWNS), (4,), (), (8,))))
+        running = np.arange(count)
+        for number in range(steps):
             now = self._take(running)
             part = now.step(lattice, paint, scatter * 0.5**number)
             _put(self, running, now)
             _put(system, running, part)
-            corners = self.quad.corners.copy()
-            corners[running] = now.quad.corners
-            self.quad = Quad(corners)
-            moving = np.abs(part.by_side).max(axis=1) > settled_px
+            self.quad.corners[running] = now.quad.corners
+            moving = np.flatnonzero(np.abs(part.by_side).max(axis=1) > settled_px)
+            if not len(moving):
+                break
+            if len(moving) < len(running):
+                running, lattice = running[moving], lattice.take(moving)
+                paint = None if paint is None else paint[moving]
+        self.quad = Quad(self.quad.corners)
         return system
 
     def _take(self, rows: np.ndarray) -> _State:
@@ -393,7 +400,7 @@ class _State:
         """Add the outline, the typical blur and contrast, and that light changes little."""
         normal, off = self.quad.normal, self.outline - self.quad.corners
         start = (off * normal).sum(axis=-1)
-        end = (np.roll(off, -1, axis=1) * normal).sum(axis=-1)
+        end = (following(off) * normal).sum(axis=-1)
         stiffness = 1 / self.outline_sigma_px**2
         place = np.arange(8)
         information[:, place, place] += stiffness
@@ -447,7 +454,7 @@ def _statistics(
         "fit_scatter": np.log(np.sqrt((system.scatter**2).mean(axis=1)) / contrast),
         "worst_scatter": np.log(system.scatter.max(axis=1) / contrast),
         "inlier_share": system.inliers,
-        "clipped_share": lattice.clipped,
+        "clipped_share": lattice.clipped[:, 0],
         "blur_px": state.blur_px,
         "log_end_sigma": np.log(end),
         "log_side_sigma": np.log(long),

@@ -9,7 +9,7 @@ import numpy as np
 from v2hdm.detection.network import as_probability
 from v2hdm.detection.patch import LensFrames, Patches
 from v2hdm.geometry.quadrilateral import Quad
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 KNOTS = 6
 """Knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs."""
@@ -38,10 +38,10 @@ class Lattice:
 
     ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values`` (M, N) float32 log grey;
     ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``limited`` (M, N) where the sensor was at its
-    limit; ``clipped`` (M,) the share of those. ``neighbours`` (2, M, N) is the place in the list of the
-    lattice's next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, N, 4) float32
+    limit; ``clipped`` (M, 1) the share of those. ``neighbours`` (M, 2, N) is the place in the list of the
+    lattice's next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, 4, N) float32
     is 1 for the side that is nearest. ``hats`` (M, KNOTS, N) interpolate between knots along the marking,
-    ``across`` (M, N) runs from -1 to 1 across it.
+    ``across`` (M, N) runs from -1 to 1 across it. ``count`` (M, 1) of the N pixels are there, the first ones.
     """
 
     points: np.ndarray
@@ -53,6 +53,7 @@ class Lattice:
     of_side: np.ndarray
     hats: np.ndarray
     across: np.ndarray
+    count: IntArray
 
     @classmethod
     def about(
@@ -62,6 +63,7 @@ class Lattice:
         pixels: FloatArray,
         looked: tuple[np.ndarray, np.ndarray, np.ndarray],
         neighbours: np.ndarray,
+        count: IntArray,
     ) -> Lattice:
         """Pixels (M, N, 2) about quadrilaterals in their frames, of which :meth:`Patches.look` is known."""
         light, used, limited = looked
@@ -69,20 +71,18 @@ class Lattice:
         points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
         outside = quad.outward.astype(np.float32) @ points
         inside = np.asarray(outside.max(axis=1) < 0, dtype=np.float32)
-        of_side = np.asarray(outside.argmax(axis=1)[..., None] == np.arange(4), dtype=np.float32)
+        of_side = np.asarray(outside.argmax(axis=1)[:, None] == np.arange(4)[:, None], dtype=np.float32)
         hats, across = _light_basis(quad, points)
-        clipped = limited.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
+        clipped = limited.sum(axis=1, keepdims=True) / np.maximum(used.sum(axis=1, keepdims=True), 1)
         values = _clearest(light, used, inside)
-        return cls(
-            points, values, used, limited, clipped, neighbours, of_side * used[..., None], hats, across
-        )
+        of_side *= used[:, None]
+        lists = points, values, used, limited, clipped, neighbours, of_side, hats, across
+        return cls(*lists, count[:, None])
 
-    def take(self, rows: BoolArray) -> Lattice:
-        """The markings under the mask (M,)."""
-        if rows.all():
-            return self
-        parts = {name: value[rows] for name, value in vars(self).items() if name != "neighbours"}
-        return Lattice(**parts, neighbours=self.neighbours[:, rows])
+    def take(self, rows: IntArray) -> Lattice:
+        """Some of the markings, in lists that are no longer than they need."""
+        most = int(self.count[rows].max(initial=1))
+        return Lattice(*(value[..., :most].take(rows, axis=0) for value in vars(self).values()))
 
     def median_used(self, values: np.ndarray, use: np.ndarray) -> np.ndarray:
         """Median (M,) of every few values of (M, N) over the pixels of ``use``; 0 where there is none."""
@@ -113,8 +113,8 @@ def lay_grid(
     looked = (light.reshape(3, *shape), use.reshape(shape).astype(np.float32), clipped.reshape(shape))
     paint = as_probability(patches.output.odds_at(pixels)).astype(np.float32)
     spacing = quad.length.max(axis=1) * (1 + 2 * _MARGIN_ALONG) / _SEARCH_ALONG
-    none = np.zeros((0, *shape), dtype=np.intp)
-    return Lattice.about(frames, quad, pixels, looked, none), paint, spacing
+    none, count = np.zeros((shape[0], 0, shape[1]), dtype=np.intp), np.full(shape[0], shape[1])
+    return Lattice.about(frames, quad, pixels, looked, none, count), paint, spacing
 
 
 def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Lattice:
@@ -143,20 +143,20 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     pixels[marking, place] = np.column_stack([u, v])
     place_of_cell = np.zeros(band.size, dtype=np.intp)
     place_of_cell[cell] = np.where(thin[marking] == 1, place, 0)
-    neighbours = np.zeros((2, *shape), dtype=np.intp)
+    neighbours = np.zeros((shape[0], 2, shape[1]), dtype=np.intp)
     for axis, places, at, step in ((0, columns, j, 1), (1, rows, i, across)):
         near = _near_the_next(places, size[:, axis])[marking, at]
-        neighbours[axis, marking, place] = np.where(near, place_of_cell[cell + step], 0)
+        neighbours[marking, axis, place] = np.where(near, place_of_cell[cell + step], 0)
     # Where a band is thinned, the next in its row is the neighbour.
     thinned = np.flatnonzero((thin[marking[:-1]] > 1) & (marking[1:] == marking[:-1]) & (i[1:] == i[:-1]))
-    neighbours[0, marking[thinned], place[thinned]] = place[thinned] + 1
+    neighbours[marking[thinned], 0, place[thinned]] = place[thinned] + 1
     light, use, clipped = patches.look(u, v, marking)
     planes = np.zeros((3, *shape), dtype=np.float32)
     planes[:, marking, place] = light
     used, limited = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
     used[marking, place], limited[marking, place] = use, clipped
     quad = Quad(frames.from_image(corners_px))
-    return Lattice.about(frames, quad, pixels, (planes, used, limited), neighbours)
+    return Lattice.about(frames, quad, pixels, (planes, used, limited), neighbours, count)
 
 
 def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import compress, pairwise
 
 import cv2
 import numpy as np
@@ -153,20 +153,23 @@ def propose(
     """The proposals of one image's pieces of paint."""
     if not blobs:
         return []
-    outlines = camera.undistort(np.concatenate([blob.outline_px for blob in blobs]))
+    points_px = np.concatenate([blob.outline_px for blob in blobs])
+    outlines = camera.undistort(points_px)
     on_ground = camera.ground(outlines)
-    ends = np.cumsum([0, *(len(blob.outline_px) for blob in blobs)]).tolist()
-    found = []
-    for index, (blob, (begin, end)) in enumerate(zip(blobs, pairwise(ends), strict=True)):
-        if sum(blob.class_score.values()) < _LEAST_CERTAINTY:
-            continue
-        ground = on_ground[begin:end]
-        whole = bool(camera.inside(blob.outline_px, _BORDER_PX).all())
-        log_sigma = camera.log_size_sigma(float(camera.range_m(ground.mean(axis=0))))
-        share = _shares(blob, *rectangle_size(ground), catalogue, whole=whole, log_sigma=log_sigma)
-        start = _tightest(outlines[begin:end], camera, max_range_m)
-        found.append(Proposal(blob, index, share, ground, *start))
-    return found
+    count = np.array([len(blob.outline_px) for blob in blobs])
+    begins = np.cumsum(count) - count
+    range_m = camera.range_m(np.add.reduceat(on_ground, begins) / count[:, None])
+    whole = np.logical_and.reduceat(camera.inside(points_px, _BORDER_PX), begins)
+    grounds, pinhole = (np.split(points, begins[1:]) for points in (on_ground, outlines))
+    size_m = np.array([rectangle_size(ground) for ground in grounds])
+    shares = _shares(blobs, size_m, catalogue, whole, camera.log_size_sigma(range_m))
+    starts = _tightest(pinhole, camera, max_range_m)
+    each = enumerate(zip(blobs, shares, grounds, starts, strict=True))
+    return [
+        Proposal(blob, index, share, ground, *start)
+        for index, (blob, share, ground, start) in each
+        if sum(blob.class_score.values()) >= _LEAST_CERTAINTY
+    ]
 
 
 def open_sides(corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
@@ -175,43 +178,41 @@ def open_sides(corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
 
 
 def _shares(
-    blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *, whole: bool, log_sigma: float
-) -> dict[str, float]:
-    """Share of each class of the catalogue, by network and size."""
-    certainty = max(sum(blob.class_score.values()), 1e-9)
-    known = {name: score for name, score in blob.class_score.items() if name in catalogue.classes}
-    groups: dict[str, float] = {}
-    for name, score in known.items():
-        group = catalogue.classes[name].group
-        groups[group] = groups.get(group, 0.0) + score
-    likely = {}
-    for name, score in known.items():
-        described = catalogue.classes[name]
-        odds = score / certainty + _CLASS_DOUBT / len(known)
-        odds += _GROUP_DOUBT * groups[described.group] / certainty
-        size = described.size_log_likelihood(length_m, width_m, whole=whole, log_sigma=log_sigma)
-        likely[name] = odds * float(np.exp(size))
-    total = max(sum(likely.values()), 1e-12)
-    return {name: value / total for name, value in likely.items()}
+    blobs: Sequence[Blob], size_m: FloatArray, catalogue: Catalogue, whole: BoolArray, log_sigma: FloatArray
+) -> list[dict[str, float]]:
+    """Share of each class of the catalogue in every blob, by network and size (B, 2), length and width."""
+    names = [name for name in blobs[0].class_score if name in catalogue.classes]
+    score = np.array([[blob.class_score[name] for name in names] for blob in blobs])
+    certainty = np.array([max(sum(blob.class_score.values()), 1e-9) for blob in blobs])[:, None]
+    described = [catalogue.classes[name] for name in names]
+    alike = np.array([[one.group == other.group for other in described] for one in described])
+    odds = score / certainty + _CLASS_DOUBT / len(names) + _GROUP_DOUBT * (score @ alike) / certainty
+    size = [one.size_log_likelihood(*size_m.T, whole=whole, log_sigma=log_sigma) for one in described]
+    likely = odds * np.exp(np.stack(size, axis=1))
+    likely /= np.maximum(likely.sum(axis=1, keepdims=True), 1e-12)
+    return [dict(zip(names, row, strict=True)) for row in likely.tolist()]
 
 
 def _tightest(
-    outline_pinhole_px: FloatArray, camera: RoadCamera, max_range_m: float
-) -> tuple[FloatArray | None, float]:
-    """The tightest quadrilateral around the hull of an outline (N, 2), and how much of it the hull fills.
+    outlines: Sequence[FloatArray], camera: RoadCamera, max_range_m: float
+) -> list[tuple[FloatArray | None, float]]:
+    """The tightest quadrilateral around the hull of each outline (N, 2), pinhole px, and its share filled.
 
     None where it is not convex, not on the ground or out of range.
     """
-    first = outline_pinhole_px[0]
-    hull = cv2.convexHull((outline_pinhole_px - first).astype(np.float32))
-    quad = quad_from_hull(hull)
-    if quad is None or not is_convex_px(quad + first):
-        return None, 0.0
-    ground = camera.ground(quad + first)
-    if not np.isfinite(ground).all() or camera.range_m(ground.mean(axis=0)) > max_range_m:
-        return None, 0.0
-    area_px2 = float(cv2.contourArea(quad.astype(np.float32)))
-    return quad + first, cv2.contourArea(hull) / max(area_px2, 1e-6)
+    hulls = [cv2.convexHull((outline - outline[0]).astype(np.float32)) for outline in outlines]
+    quads = [quad_from_hull(hull) for hull in hulls]
+    there = [k for k, quad in enumerate(quads) if quad is not None]
+    found: list[tuple[FloatArray | None, float]] = [(None, 0.0)] * len(outlines)
+    if not there:
+        return found
+    corners = np.array([quads[k] for k in there]) + np.array([outlines[k][0] for k in there])[:, None]
+    ground = camera.ground(corners.reshape(-1, 2)).reshape(corners.shape)
+    usable = is_convex_px(corners) & (camera.range_m(ground.mean(axis=1)) <= max_range_m)  # nan is not
+    for k, quad in zip(compress(there, usable), corners[usable], strict=True):
+        area_px2 = float(cv2.contourArea(np.asarray(quads[k], dtype=np.float32)))
+        found[k] = quad, cv2.contourArea(hulls[k]) / max(area_px2, 1e-6)
+    return found
 
 
 class _Groups:
@@ -242,10 +243,10 @@ def find_blobs(
     # A frame of no paint around it lets every outline close.
     level = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
-    cells, score = _class_scores(output, piece, level, len(contours))
+    groups = _Groups(output.classes, catalogue)
+    cells, score, votes = _class_scores(output, piece, level, len(contours), groups)
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
-    groups = _Groups(output.classes, catalogue)
     blobs: list[Blob] = []
     wholes, stats, whole_of = _doubtful(level, contours, cells)
     first_of_whole: dict[int, int] = {}
@@ -260,7 +261,7 @@ def find_blobs(
             blobs.append(replace(_blob(wholes[box] == label, raised, output, box), traced=False))
         box = _framed(*cv2.boundingRect(contours[index]))
         inside = piece[box] == index + 1
-        parts = _split(inside, level[box], output, box, groups)
+        parts = _split(inside, level[box], output, box, groups, votes[index])
         scores = dict(zip(output.classes, score[:, index].tolist(), strict=True))
         outline_px = _origin_px(output, 0, 0) + output.stride * outlines[index]
         signed, origin_px = _signed(inside, level[box]), _origin_px(output, box[0].start, box[1].start)
@@ -319,9 +320,9 @@ def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], n
 
 
 def _class_scores(
-    output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int
-) -> tuple[np.ndarray, FloatArray]:
-    """Sizes (B,) of pieces of paint in cells, and the mean probability (K, B) of each class."""
+    output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int, groups: _Groups
+) -> tuple[np.ndarray, FloatArray, FloatArray]:
+    """Sizes (B,) of pieces in cells, mean probability (K, B) of each class, votes (B, G) of groups."""
     at = np.flatnonzero(piece > 0)
     own = piece.ravel()[at] - 1
     cells = np.bincount(own, minlength=count)
@@ -330,7 +331,10 @@ def _class_scores(
     i, j = np.divmod(at, piece.shape[1])
     probability = output.class_probability(i - 1, j - 1)
     score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
-    return cells, certainty * score
+    several = len(groups.least_share)
+    best = own * several + groups.of_class[probability.argmax(axis=0)]
+    votes = np.bincount(best, minlength=count * several).reshape(count, several)
+    return cells, certainty * score, votes / np.maximum(cells, 1)[:, None]
 
 
 def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
@@ -352,24 +356,29 @@ def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArr
 
 
 def _split(
-    inside: BoolArray, level: np.ndarray, output: NetworkOutput, box: tuple[slice, slice], groups: _Groups
+    inside: BoolArray,
+    level: np.ndarray,
+    output: NetworkOutput,
+    box: tuple[slice, slice],
+    groups: _Groups,
+    votes: FloatArray,
 ) -> list[Blob]:
-    """The parts that a piece (h, w) may be: those of different groups of classes, or else of sure paint."""
-    rows, columns = np.nonzero(inside)
-    probability = output.class_probability(rows + box[0].start - 1, columns + box[1].start - 1)
-    group_of = groups.of_class
-    votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(groups.least_share)) / len(rows)
+    """The parts that a piece (h, w) may be: those of different groups of classes, or else of sure paint.
+
+    ``votes`` (G,) are the shares of its elements that the groups have.
+    """
     present = np.flatnonzero(votes >= groups.least_share)
     levels = [level - _SURE]
     if len(present) > 1:
-        levels = [np.minimum(level, _lead(output, group_of == group, box)) for group in present]
-    parts = []
+        levels = [np.minimum(level, _lead(output, groups.of_class == group, box)) for group in present]
+    masks = []
     for own_level in levels:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(((own_level > 0) & inside).view(np.uint8))
         large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist()
-        parts += [_blob(labels == label, own_level, output, box) for label in large if label]
-    if len(parts) < 2:
+        masks += [(labels == label, own_level) for label in large if label]
+    if len(masks) < 2:
         return []
+    parts = [_blob(mask, own_level, output, box) for mask, own_level in masks]
     touches = any(part.kind in groups.symbols for part in parts)
     return [replace(part, touches_symbol=touches, traced=len(present) > 1) for part in parts]
 

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.records import FloatArray
 from v2hdm.simulate.render.scene import Dapple, Ground, GroundMarks, Paint, Shadow
 from v2hdm.simulate.render.textures import Float32, Tile, fade, noise_tile, photo_tile, sample, smoothstep
-from v2hdm.simulate.render.view import View, coverage, following_row, in_view, outline, windows
+from v2hdm.simulate.render.view import Outline, View, coverage, following_row, in_view, outlines, windows
 
 _FARTHEST_M = 400.0
 _SHADOWS_TO_M = 90.0
@@ -150,22 +151,33 @@ def sun_visibility(
 ) -> Float32:
     """Fraction (H, W) of the sun's light that reaches the ground."""
     out = np.ones_like(field.x_m)
-    for shadow in shadows:
-        if float(np.hypot(*(shadow.polygon_map[0] - view.centre_map[:2]))) < _SHADOWS_TO_M:
-            _cast(shadow, view, field, out)
+    near = [
+        shadow
+        for shadow in shadows
+        if float(np.hypot(*(shadow.polygon_map[0] - view.centre_map[:2]))) < _SHADOWS_TO_M
+    ]
+    for shadow, shape in zip(near, outlines(view, [_penumbra_px(one, view) for one in near]), strict=True):
+        if shape is not None:
+            _cast(shadow, shape, view, field, out)
     for dapple in dapples:
         _dapple(dapple, view, field, out)
     return out
 
 
-def _cast(shadow: Shadow, view: View, field: GroundField, out: Float32) -> None:
+def _penumbra_px(shadow: Shadow, view: View) -> FloatArray:
+    """A shadow's polygon, half its penumbra wider, as homogeneous pinhole pixels (N, 3)."""
     polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
     away = polygon - polygon.mean(axis=0)
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    grown = polygon + 0.5 * shadow.softness_m * away
-    shape = outline(view, view.homogeneous_px(np.column_stack([grown, np.zeros(len(grown))])))
-    if shape is None:
-        return
+    return _on_ground_px(view, polygon + 0.5 * shadow.softness_m * away)
+
+
+def _on_ground_px(view: View, polygon_map: FloatArray) -> FloatArray:
+    return view.homogeneous_px(np.column_stack([polygon_map, np.zeros(len(polygon_map))]))
+
+
+def _cast(shadow: Shadow, shape: Outline, view: View, field: GroundField, out: Float32) -> None:
+    polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
     for window in windows(view, shape, field.first_row):
         part = field.rows(window)
         soft = np.float32(1.0) / (np.float32(shadow.softness_m) + field.footprint_m[part])
@@ -194,7 +206,7 @@ def _dapple(dapple: Dapple, view: View, field: GroundField, out: Float32) -> Non
         region = None
     else:
         region = np.asarray(dapple.region_map, dtype=np.float64)
-        shape = outline(view, view.homogeneous_px(np.column_stack([region, np.zeros(len(region))])))
+        (shape,) = outlines(view, [_on_ground_px(view, region)])
         parts = [] if shape is None else [field.rows(w) for w in windows(view, shape, field.first_row)]
     for part in parts:
         x, y, footprint = field.x_m[part], field.y_m[part], field.footprint_m[part]
@@ -234,9 +246,10 @@ class PaintLayer:
     def draw(self, view: View, field: GroundField, albedo: list[Float32], labels: Labels) -> None:
         """Paint onto the ground field's three planes of ``albedo`` (H', W) and into ``labels`` (H, W)."""
         homogeneous = view.homogeneous_px(self._vertices)
-        for index in in_view(view, homogeneous, _FARTHEST_PAINT_M):
-            paint = self._paints[index]
-            shape = outline(view, homogeneous[index, : len(paint.polygon_map)])
+        seen = in_view(view, homogeneous, _FARTHEST_PAINT_M)
+        paints = [self._paints[index] for index in seen]
+        polygons = [homogeneous[k, : len(one.polygon_map)] for k, one in zip(seen, paints, strict=True)]
+        for paint, shape in zip(paints, outlines(view, polygons), strict=True):
             if shape is None:
                 continue
             label = self._label[paint.kind]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render.scene import Backdrop, Box, Light, box_footprint
 from v2hdm.simulate.render.textures import Float32, noise_tile, sample
-from v2hdm.simulate.render.view import View, Window, coverage, in_view, outline, windows
+from v2hdm.simulate.render.view import Outline, View, Window, coverage, in_view, outlines, windows
 
 _CORRUGATION_M = 0.28
 _DIRT_TILE = noise_tile(17, 6.0, 1.2)
@@ -46,10 +46,13 @@ def draw_boxes(
         return float(np.hypot(*(np.array(box.centre_map) - centre[:2])))
 
     # Of stacked boxes the upper comes first: its underside lies behind the one below.
-    for box in sorted(visible, key=lambda b: (distance(b), b.base_m), reverse=True):
-        for face in _faces(box):
-            if (centre - face.corners_map[0]) @ face.normal > 1e-3:
-                _draw_face(box, face, light, view, radiance, hidden)
+    ordered = sorted(visible, key=lambda b: (distance(b), b.base_m), reverse=True)
+    faces = [(box, face) for box in ordered for face in _faces(box)]
+    turned = [one for one in faces if (centre - one[1].corners_map[0]) @ one[1].normal > 1e-3]
+    shapes = outlines(view, [view.homogeneous_px(face.corners_map) for _, face in turned])
+    for (box, face), shape in zip(turned, shapes, strict=True):
+        if shape is not None:
+            _draw_face(box, face, shape, light, view, radiance, hidden)
 
 
 def _faces(box: Box) -> list[_Face]:
@@ -70,11 +73,14 @@ def _faces(box: Box) -> list[_Face]:
 
 
 def _draw_face(
-    box: Box, face: _Face, light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
+    box: Box,
+    face: _Face,
+    shape: Outline,
+    light: Light,
+    view: View,
+    radiance: Float32,
+    hidden: NDArray[np.bool_],
 ) -> None:
-    shape = outline(view, view.homogeneous_px(face.corners_map))
-    if shape is None:
-        return
     sun = max(float(face.normal @ np.array(light.sun_direction_map)), 0.0)
     sky = 0.55 + 0.45 * face.normal[2]
     lit = [

@@ -7,7 +7,7 @@ Polygon fills of image libraries are not used: they dilate by half a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.records import CameraInfo, FloatArray, IntArray
 from v2hdm.simulate.render.textures import Float32
 
 _GRID_STEP_PX = 8
@@ -26,6 +26,8 @@ _BAND_ROWS = 32
 _BAND_AREA_PX = 4000
 _NEAR_M = 0.05
 _MARGIN_PX = 4.0
+_STEPS = [np.linspace(0.0, 1.0, 2 + more)[:-1, None, None] for more in range(9)]
+"""Shares of a side at which it has points, by its polygon's extent: a lens bends it."""
 
 Window = tuple[slice, slice]
 
@@ -93,27 +95,35 @@ class Outline:
     boundary_px: FloatArray
 
 
-def outline(view: View, homogeneous_px: FloatArray) -> Outline | None:
-    """The outline of a polygon of homogeneous pinhole pixels (N, 3), or None where it is out of view."""
-    clipped = _visible_part(view, homogeneous_px)
-    if len(clipped) < 3:
-        return None
-    following = following_row(homogeneous_px)
+def outlines(view: View, polygons: Sequence[FloatArray]) -> list[Outline | None]:
+    """The outlines of polygons of homogeneous pinhole pixels (N, 3); None for those out of view."""
+    if not polygons:
+        return []
+    count, points = np.array([len(polygon) for polygon in polygons]), np.concatenate(polygons)
+    ends = np.cumsum(count)
+    parts = _visible_parts(view, polygons, points, ends - count)
+    place = np.arange(1, len(points) + 1)
+    place[ends - 1] = ends - count
+    following = points[place]
     # The cross product by columns: numpy's own takes ten times as long on four rows.
-    edges = homogeneous_px[:, [1, 2, 0]] * following[:, [2, 0, 1]]
-    edges -= homogeneous_px[:, [2, 0, 1]] * following[:, [1, 2, 0]]
+    edges = points[:, [1, 2, 0]] * following[:, [2, 0, 1]] - points[:, [2, 0, 1]] * following[:, [1, 2, 0]]
     norms = np.hypot(edges[:, 0], edges[:, 1])
-    edges = edges[norms > 1e-12] / norms[norms > 1e-12, None]
-    if len(edges) < 3:
-        return None
-    if (edges @ homogeneous_px.mean(axis=0)).sum() < 0:
-        edges = -edges
-    corners = clipped[:, :2] / clipped[:, 2:]
-    span = float(np.ptp(corners, axis=0).max())
-    steps = np.linspace(0.0, 1.0, 2 + int(min(span / 40.0, 8.0)))[:-1, None, None]
-    dense = corners + steps * (following_row(corners) - corners)
-    ordered = dense.transpose(1, 0, 2).reshape(-1, 2)
-    return Outline(edges, distort_points(view.rays.info, ordered))
+    usable = norms > 1e-12
+    edges /= np.where(usable, norms, 1.0)[:, None]
+    corners = []
+    for part in parts:
+        own = part[:, :2] / part[:, 2:]
+        steps = _STEPS[int(min(float(np.ptp(own, axis=0).max()) / 40.0, 8.0)) if len(own) else 0]
+        corners.append((own + steps * (following_row(own) - own)).transpose(1, 0, 2).reshape(-1, 2))
+    boundaries = distort_points(view.rays.info, np.concatenate(corners))
+    bounds = np.split(boundaries, np.cumsum([len(one) for one in corners])[:-1])
+    found: list[Outline | None] = []
+    for polygon, part, end, bound in zip(polygons, parts, ends.tolist(), bounds, strict=True):
+        own = edges[end - len(polygon) : end][usable[end - len(polygon) : end]]
+        inward = (own @ polygon.mean(axis=0)).sum() >= 0
+        shown = len(part) >= 3 and len(own) >= 3
+        found.append(Outline(own if inward else -own, bound) if shown else None)
+    return found
 
 
 def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:
@@ -136,21 +146,23 @@ def following_row(array: FloatArray) -> FloatArray:
     return np.concatenate([array[1:], array[:1]])
 
 
-def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
-    """The part (M, 3) of a homogeneous polygon in front of the camera and near the image."""
+def _visible_parts(
+    view: View, polygons: Sequence[FloatArray], points: FloatArray, begins: IntArray
+) -> list[FloatArray]:
+    """The parts (M, 3) of homogeneous polygons, whose ``points`` follow, in front of and near the image."""
     u0, v0, u1, v1 = view.rays.bounds
     sides = [[1.0, 0.0, _MARGIN_PX - u0], [-1.0, 0.0, u1 + _MARGIN_PX]]
     sides += [[0.0, 1.0, _MARGIN_PX - v0], [0.0, -1.0, v1 + _MARGIN_PX]]
     limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
-    inside = polygon @ limits.T >= least
-    if inside.all():
-        return polygon
-    if not inside.any(axis=0).all():
-        return polygon[:0]
-    for line, level in zip(limits, least, strict=True):
-        polygon = clip_half(polygon, polygon @ line - level)
-    return polygon
+    inside = points @ limits.T >= least
+    whole = np.logical_and.reduceat(inside, begins).all(axis=1)
+    hidden = np.asarray(~np.logical_or.reduceat(inside, begins).all(axis=1))
+    parts = [polygon[:0] if out else polygon for polygon, out in zip(polygons, hidden.tolist(), strict=True)]
+    for k in np.flatnonzero(~whole & ~hidden).tolist():
+        for line, level in zip(limits, least, strict=True):
+            parts[k] = clip_half(parts[k], parts[k] @ line - level)
+    return parts
 
 
 def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
