@@ -14,6 +14,7 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.records import Drive, Truth
+from v2hdm.store.results import listed_files
 
 _COPIES = ("mysite", "monday", "friday", "port2_again")
 _PLACES = [
@@ -38,7 +39,8 @@ def furnish(folder: Path) -> None:
     _lay_out_recording(folder, rendered)
     survey_camera(folder, drive, truth)
     shutil.copy(result / "map.geojson", folder)
-    write_geopackage(read_geojson(result / "map.geojson"), folder / "map.gpkg")
+    with listed_files(folder, "--output", "v2hdm export of map.geojson"):
+        write_geopackage(read_geojson(result / "map.geojson"), folder / "map.gpkg")
     shutil.copy(result / "calibration_front.yaml", folder)
     guess = {"front": truth.cam_from_vehicle["front"]}
     write_ros2(folder / "site", messages_of(rendered, mounted=guess))

@@ -105,7 +105,7 @@ def _exports() -> Iterator[tuple[str, Prepare, str]]:
 
         def write(root: Path, name: str = name, source: str = source) -> None:
             write_map(make_map(), root, "map", [source.rpartition(".")[2]])
-            with listed_files(root / "there", "--output", f"v2hdm export of {(root / source).resolve()}"):
+            with listed_files(root / "there", "--output", f"v2hdm export of ../{source}"):
                 write_map(make_map(), root / "there", "map", [name])
 
         line = f"{source} --format {name} --output there"
@@ -115,7 +115,7 @@ def _exports() -> Iterator[tuple[str, Prepare, str]]:
         def put(root: Path, name: str = name) -> None:
             calibration = Calibration(INFO, mounting())
             write_calibration(calibration, root / "c.yaml")
-            with listed_files(root / "there", "--output", f"v2hdm export of {(root / 'c.yaml').resolve()}"):
+            with listed_files(root / "there", "--output", "v2hdm export of ../c.yaml"):
                 about = read_provenance(root / "c.yaml")
                 write_calibration_as(name, calibration, about, root / "there", INFO.name)
 

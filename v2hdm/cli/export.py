@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -42,7 +43,8 @@ def run(arguments: Sequence[str]) -> None:
     export = _export_calibration if parsed.source.suffix.lower() in (".yaml", ".yml") else _export_map
     try:
         with logging_to(handler):
-            with listed_files(folder, "--output", f"v2hdm export of {parsed.source.resolve()}"):
+            source = os.path.relpath(parsed.source.resolve(), folder.resolve())  # both may be moved together
+            with listed_files(folder, "--output", f"v2hdm export of {source}"):
                 files = export(parsed, folder)
             print(*files, sep="\n")
     except BrokenPipeError:  # the reader of our output has had enough
