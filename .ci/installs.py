@@ -1,8 +1,8 @@
 """Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
 The wheel is built once. An environment begins with the base install and grows to ``[map]``; ``[map,ros]`` and
-``[map,video]`` stand beside it, each on top of ``[map]`` alone. A page says in its second line what it needs;
-its commands are run in the environment with just that, on the small drive that the documents' tests use.
+``[map,video]`` stand beside it, each on top of ``[map]`` alone. A page, or a section, begins with what it
+needs; its commands run in the environment with just that, on the small drive of the documents' tests.
 """
 
 from __future__ import annotations
@@ -31,15 +31,12 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 
 PROMISES = {
     "docs/detect.md": ("detect",),
-    "docs/extrinsic.md": ("calibrate ground",),
+    "docs/calibration.md": ("calibrate points", "calibrate ground", "calibrate compare"),
     "docs/exports.md": ("--format csv", "--format kalibr"),
     "docs/cache.md": ("cache list",),
     "docs/check.md": ("check",),
-    "docs/calibrate.md": ("calibrate points",),
-    "docs/calibration.md": ("calibrate compare",),
-    "docs/localize.md": ("localize",),
-    "docs/report.md": ("report",),
-    "docs/mosaic.md": ("mosaic",),
+    "docs/living-map.md": ("localize",),
+    "docs/report.md": ("report", "mosaic"),
     "docs/bags.md": ("--list-topics", "check site"),
 }
 """Words by document: each line of a block with one of them is run."""
@@ -92,14 +89,19 @@ def lines_of(extras: str) -> list[str]:
     """The commands that the documents promise with just these extras."""
     lines = []
     for page, words in PROMISES.items():
-        needs = _NEEDS.search(document(page))
-        assert needs is not None, f"{page}: its second line says what it needs"
-        if (needs.group(1) or "") == extras:
-            listed = [line for block in blocks(page, "sh") for line in block.lines]
-            chosen = [one for one in listed if "v2hdm" in one and any(word in one for word in words)]
-            assert chosen, f"{page}: none of its commands has {words}"
-            lines += [_small(line) for line in chosen]
-    return [*lines, *MORE[extras]]
+        listed = [(line, _needs(page, block.line)) for block in blocks(page, "sh") for line in block.lines]
+        for word in words:
+            chosen = [one for one in listed if "v2hdm" in one[0] and word in one[0]]
+            assert chosen, f"{page}: none of its commands has {word}"
+            lines += [_small(line) for line, needs in chosen if needs == extras]
+    return [*dict.fromkeys(lines), *MORE[extras]]
+
+
+def _needs(page: str, line: int) -> str:
+    """The extras that a page's text before a line says last."""
+    said = _NEEDS.findall("\n".join(document(page).splitlines()[: line - 1]))
+    assert said, f"{page}:{line}: nothing before it says what it needs"
+    return said[-1]
 
 
 def _small(line: str) -> str:

@@ -128,7 +128,7 @@ class TrainConfig:
     ``bfloat16`` has convolutions computed in that where the device is faster so. ``resume`` goes on with
     what ``output`` holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged
     weights and place in the sequence of renders this one starts from: to learn on, or to learn users' own
-    labels. ``catalogue`` is a YAML file of users' own classes, see `docs/own-class.md`; None takes those that
+    labels. ``catalogue`` is a YAML file of users' own classes, see `docs/labels.md`; None takes those that
     ``start`` knows.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Labelled images of rendered ports with paint of own classes, as docs/own-class.md trains from them.
+"""Labelled images of rendered ports with paint of own classes, as docs/labels.md trains from them.
 
     python -m tests.benchmarks.own_class runs/own/labels
 

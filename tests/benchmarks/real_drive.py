@@ -257,7 +257,7 @@ def optimise(drive: Drive, detections: Sequence[ImageDetections]) -> Optimised:
     sightings = collect_sightings(drive, detections, cameras)
     views = views_of(drive, cameras)
     optimiser = Optimiser(sightings, views, drive.cameras, drive.noises, MappingOptions())
-    return optimiser.run(optimiser.initial_tracks())
+    return optimiser.finish(optimiser.settle(optimiser.initial_tracks()))
 
 
 def views_of_images(drive: Drive, optimised: Optimised) -> list[View]:

@@ -233,20 +233,22 @@ def test_options_that_cannot_be_are_one_line(tmp_path, intrinsics, capsys, monke
 
 
 def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, capsys, monkeypatch):
-    text = document("docs/calibrate.md")
-    command, table = blocks("docs/calibrate.md", "sh", "csv")
+    text = document("docs/calibration.md")
+    command, table = blocks("docs/calibration.md", "sh", "csv")[:2]
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text(table.text)
     cv2.imwrite("yard.png", np.zeros((720, 1280, 3), np.uint8))
     assert run_command(shlex.split(command.text)[1:]) == 0
     shown = capsys.readouterr().out
-    quoted = [line.strip() for line in re.findall(r"^    ((?:front:|  ).*)$", text, re.MULTILINE)]
+    section = text.split("## From surveyed points")[1].split("## From bare ground")[0]
+    quoted = [line.strip() for line in re.findall(r"^    ((?:front:|  ).*)$", section, re.MULTILINE)]
     assert quoted
     for line in quoted:
         assert line in shown, shown
-    for name in re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE):
-        place = Path("outputs/front-calibrate") / name.replace("<camera>", "front")
-        assert place.exists() or name not in text.split("## What it writes")[1].split("##")[0], name
+    written = re.findall(r"^- `([^`]+)`:", section.split("It writes\n")[1], re.MULTILINE)
+    assert written
+    for name in written:
+        assert (Path("outputs/front-calibrate") / name.replace("<camera>", "front")).exists(), name
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " "])

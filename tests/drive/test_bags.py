@@ -1,6 +1,8 @@
 """One drive in every container is the same drive; damaged containers end in one line."""
 
+import json
 import logging
+import re
 import sqlite3
 import tracemalloc
 from collections.abc import Callable
@@ -22,11 +24,15 @@ from tests.drive.bags import (
     assert_same_drive,
     assert_same_poses,
     messages_of,
+    mountings,
     write_ros1,
     write_ros2,
 )
 from tests.drive.example import make_drive
+from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
+from v2hdm.geometry.mounting import mounting_angles
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
 from v2hdm.io.importers.bag.describe import list_topics
 from v2hdm.io.importers.bag.messages import file_of
@@ -106,21 +112,54 @@ def test_a_bag_without_description_is_a_drive_where_its_frames_tell_the_mounting
     assert_mounted(got)
 
 
-def test_a_bag_without_mounting_says_which_description_to_write(folder, tmp_path):
+def test_a_bag_without_mounting_asks_for_it_and_becomes_a_drive(folder, tmp_path, monkeypatch, capsys):
+    """Two commands: the first says what the bag does not, the second writes a drive.yaml that is read."""
+    monkeypatch.chdir(tmp_path)
     bag = write_ros2(tmp_path / "site", messages_of(folder, fixed_frames=False))
-    with pytest.raises(DriveError, match="mounting of camera 'front'") as caught:
-        read_drive(bag, ReadOptions(cache=str(tmp_path / "cache")))
+    with pytest.raises(DriveError, match=r"cameras\.front\.mounting.*--write FOLDER") as caught:
+        read_drive(bag)
     assert "\n" not in str(caught.value)
-    content = yaml.safe_load(str(caught.value).split("the bag: ")[1])
-    assert content["poses"]["topic"] == "/odom"
-    # Completed as it asks for, it is a drive.
-    whole = described(folder, bag)
-    content |= {"bag": str(bag), "origin": whole["origin"], "pose_noise": whole["pose_noise"]}
-    content["poses"].pop("lever_arm_m")
-    for name, camera in content["cameras"].items():
-        camera |= {key: whole["cameras"][name][key] for key in ("ipm", "initial_ipm", "roi_vehicle")}
-        camera.pop("cam_from_vehicle")
-    assert_same_drive(read(tmp_path / "drive", content), read_drive(folder))
+    first = ["check", "site", "--no-ground", "--write", "mysite"]
+    assert run(first) == 2
+    asked = re.findall(r"--set (\S+)=", capsys.readouterr().err)
+    assert sorted(asked) == ["cameras.front.mounting", "cameras.rear.mounting", "poses.lever_arm_m"]
+    assert not Path("mysite").exists()
+    (tmp_path / "lens.yaml").write_bytes((folder / "front" / "camera_info.yaml").read_bytes())
+    said = {"poses.lever_arm_m": [0, 0, 0], "cameras.front.camera_info": "lens.yaml"}
+    for name, cam_from_vehicle in mountings().items():
+        angles = np.degrees(mounting_angles(cam_from_vehicle)).round(9).tolist()
+        said[f"cameras.{name}.mounting"] = {
+            "xyz_m": camera_centre(cam_from_vehicle).tolist(),
+            "rpy_deg": angles,
+        }
+    assert run([*first, "--set", *(f"{key}={json.dumps(value)}" for key, value in said.items())]) in (0, 3)
+    got = read_drive("mysite")
+    assert_same_poses(got, read_drive(folder))
+    assert_mounted(got)
+    assert (
+        yaml.safe_load(Path("mysite/drive.yaml").read_text())["cameras"]["front"]["camera_info"]
+        == "../lens.yaml"
+    )
+    written = Path("mysite/drive.yaml").read_bytes()
+    assert run(first) == 2
+    assert "exists; edit it" in capsys.readouterr().err
+    assert Path("mysite/drive.yaml").read_bytes() == written
+
+
+def test_a_drive_that_cannot_be_read_leaves_no_description(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "front").mkdir()
+    for number, image in enumerate(sorted((folder / "front" / "images").iterdir())):
+        (tmp_path / "front" / f"{1715934630 + number}.jpg").write_bytes(image.read_bytes())
+    lens = folder / "front" / "camera_info.yaml"
+    said = [
+        f"cameras.front.camera_info={lens}",
+        "cameras.front.mounting={xyz_m: [0, 0, 2], rpy_deg: [0, 30, 0]}",
+        "poses.tum=nowhere.tum",
+    ]
+    assert run(["check", "front", "--write", "mysite", "--set", *said]) == 2
+    assert "nowhere.tum" in capsys.readouterr().err
+    assert not Path("mysite/drive.yaml").exists()
 
 
 def test_topics_are_listed_with_the_description(bags, tmp_path):

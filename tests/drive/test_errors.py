@@ -106,8 +106,8 @@ CASES: dict[str, tuple[Damage, str]] = {
     "ipm name": (front(ipm={"estimate": SINGULAR}), r"unknown key 'estimate'; did you mean 'estimated'"),
     "initial ipm": (front(initial_ipm="calib"), r"initial_ipm 'calib' is not given"),
     "no initial ipm": (front(initial_ipm=None), r"missing key 'initial_ipm'"),
-    "no ipm": (front(ipm=None), r"give either 'ipm' or 'cam_from_vehicle'"),
-    "both": (front(cam_from_vehicle=ON_THE_GROUND), r"give either 'ipm' or 'cam_from_vehicle'"),
+    "no ipm": (front(ipm=None), r"give one of 'mounting', 'cam_from_vehicle' and 'ipm'"),
+    "both": (front(cam_from_vehicle=ON_THE_GROUND), r"give one of 'mounting', 'cam_from_vehicle' and 'ipm'"),
     "guess": (front(ipm=None, initial_ipm=None, cam_from_vehicle=ON_THE_GROUND), r"0 m above the ground"),
     "no rotation": (
         front(ipm=None, cam_from_vehicle=np.diag([1, 2, 1, 1]).tolist()),

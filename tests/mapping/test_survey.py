@@ -210,7 +210,7 @@ def test_a_joint_solve_keeps_to_the_sizes():
     views = views_of(scene.drive, ("front", "rear"))
     options = MappingOptions(pose_model="heave")
     optimiser = Optimiser(sightings, views, scene.drive.cameras, scene.drive.noises, options)
-    bundle = optimiser.run(optimiser.initial_tracks()).bundle
+    bundle = optimiser.finish(optimiser.settle(optimiser.initial_tracks())).bundle
     spread = []
     for sizes in (SizeOptions(), SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)):
         model = full_model(

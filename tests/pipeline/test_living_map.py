@@ -21,7 +21,7 @@ from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
 
-BOTH, LATER = (" ".join(block.lines) for block in blocks("docs/living-map.md", "sh"))
+BOTH, LATER, _ = (" ".join(block.lines) for block in blocks("docs/living-map.md", "sh"))
 
 
 def write_scene(scene, folder):

@@ -1,4 +1,4 @@
-"""docs/survey.md does what it says: control points mend a drifted map, check points only tell."""
+"""docs/accuracy.md does what it says: control points mend a drifted map, check points only tell."""
 
 import csv
 import io
@@ -27,7 +27,7 @@ from v2hdm.pipeline.run import run
 from v2hdm.records import Trajectory
 from v2hdm.report.metrics import driven_past
 
-(DOCUMENTED,) = blocks("docs/survey.md", "sh")
+(DOCUMENTED,) = blocks("docs/accuracy.md", "sh")
 DRIFT_M = np.array([0.06, -0.05])
 SIGMA_M = 0.005
 

@@ -7,15 +7,13 @@ import pytest
 
 from tests.simulate.conftest import FRONT, tiny_port
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.cli.compose import compose_run_file, conf_dir, to_dataclass
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.pipeline.config import RunConfig
+from v2hdm.library import simulate_port
 from v2hdm.records import DIAMOND, LANE_DASH
-from v2hdm.simulate import simulate_port
 from v2hdm.simulate.port import drive
 from v2hdm.simulate.port.build import build_port, calibrate, cam_from_vehicle, camera_info
 from v2hdm.simulate.port.config import (
@@ -286,23 +284,8 @@ def test_ports_without_stencils_keep_their_folder_in_the_cache(tmp_path, monkeyp
 
 
 def test_a_port_is_rendered_once_per_seed_and_has_its_truth(tmp_path):
-    first, again = (simulate_port(tiny_port(), tmp_path) for _ in range(2))
-    other = simulate_port(tiny_port(), tmp_path, seed=5)
+    first, again = (simulate_port(tmp_path, tiny_port()) for _ in range(2))
+    other = simulate_port(tmp_path, replace(tiny_port(), seed=5))
     assert first.root == again.root != other.root
     assert first.truth_dir is not None
     assert len(first.images) == 22
-
-
-@pytest.mark.parametrize("name", ["port1", "port2"])
-def test_a_shipped_port_is_that_of_its_run_file(name, tmp_path, monkeypatch):
-    rendered = []
-    monkeypatch.setattr(drive, "render_drive", lambda config, *_: rendered.append(config))
-    with pytest.raises(DriveError, match="no such drive"):
-        simulate_port(name, tmp_path)
-    composed = compose_run_file(conf_dir() / "run" / f"{name}.yaml", "map", RunConfig, [])
-    assert rendered == [to_dataclass(composed, RunConfig, "").simulate]
-
-
-def test_an_unknown_port_is_one_line_that_lists_the_shipped_ones(tmp_path):
-    with pytest.raises(ConfigError, match="no port 'port3'; choose from port1, port2"):
-        simulate_port("port3", tmp_path)

@@ -149,7 +149,6 @@ def estimate(name: str = "front", **values: float) -> GroundEstimate:
         shares={Reading.AS_GIVEN: 0.9, Reading.MIRRORED: 0.3},
         reading=Reading.AS_GIVEN,
         calibration=Calibration(camera().info, guess, np.eye(6)),
-        guess_cam_from_vehicle=guess,
         parameters=parameters,
         median_residual=0.35,
         innovations={"heading": 1.2, "position": 1.0},

@@ -19,7 +19,7 @@ from v2hdm.verdict import Status
 from v2hdm.verdict.results.solution import check_inputs, check_solution
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
-FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02, bias_px=0.03)
+FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
 
 
 def contradiction(fault, cameras, axis, about, value, sigma, sigmas):

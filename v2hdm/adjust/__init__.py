@@ -6,13 +6,7 @@ residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them
 """
 
 from v2hdm.adjust.noise import estimate_noise
-from v2hdm.adjust.observability import (
-    Observability,
-    PoseInnovations,
-    observability,
-    observed,
-    pose_innovations,
-)
+from v2hdm.adjust.observability import observability, pose_innovations
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -21,42 +15,16 @@ from v2hdm.adjust.problem import (
     PoseSigma,
     Problem,
     SolveOptions,
-)
+)  # fmt: skip
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_step, score_faults, sigmas_of
-from v2hdm.adjust.selection import MODELS, Model, Selection, predicts_better, select_model, with_model
+from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.validation import Excluded, Verdict
+from v2hdm.adjust.validation import Verdict
 
 __all__ = [
-    "CHANGES",
-    "MODELS",
-    "ControlPoints",
-    "Drift",
-    "Excluded",
-    "Fault",
-    "KnownLengths",
-    "Model",
-    "Observability",
-    "Observations",
-    "PoseInnovations",
-    "PoseSigma",
-    "Problem",
-    "ScoreTest",
-    "Selection",
-    "Solution",
-    "SolveOptions",
-    "Status",
-    "Verdict",
-    "estimate_noise",
-    "height_step",
-    "observability",
-    "observed",
-    "pose_innovations",
-    "predicts_better",
-    "score_faults",
-    "select_model",
-    "sigmas_of",
-    "solve",
-    "with_model",
-]
+    "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
+    "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise", "height_step",
+    "observability", "pose_innovations", "predicts_better", "score_faults", "select_model", "sigmas_of",
+    "solve", "with_model",
+]  # fmt: skip

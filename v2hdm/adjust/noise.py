@@ -31,20 +31,11 @@ from v2hdm.records import FloatArray
 _SPREAD = math.log(2.0)
 """Standard deviation of the logarithm of a true sigma, or distance, about the stated one: a factor of two."""
 
-_MOST = math.log(30.0)
-"""Most that a sigma or distance is scaled by, as a logarithm."""
-
-_DRAWS = 8
-"""Errors drawn from the posterior, each with its mirror image about the mean."""
-
-_ROUNDS = 4
-"""Rounds of drawing and estimating: sigmas move by a tenth in the third."""
-
-_LEAST_STEP_M = 0.02
-"""Step between frames below which a vehicle stands."""
-
-_LEAST_LAGS = 8
-"""Steps of a route below which no distance can be estimated."""
+_MOST = math.log(30.0)  # most that a sigma or distance is scaled by, as a logarithm
+_DRAWS = 8  # errors drawn from the posterior, each with its mirror image about the mean
+_ROUNDS = 4  # rounds of drawing and estimating: sigmas move by a tenth in the third
+_LEAST_STEP_M = 0.02  # step between frames below which a vehicle stands
+_LEAST_LAGS = 8  # steps of a route below which no distance can be estimated
 
 _GROUPS = {"position": (0, 1), "height": (2,), "roll_pitch": (3, 4), "heading": (5,)}
 """Axes of a frame's tangent whose errors are alike."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.adjust.model import state_residual
-from v2hdm.adjust.problem import POSE_STATES, Problem
+from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray, IntArray
 
@@ -55,25 +55,8 @@ class Observability:
 
 def observability(problem: Problem, solution: Solution) -> Sequence[Observability]:
     """How well each camera of ``problem`` is determined by the drive, one record a camera."""
-    sigma = problem.centre_sigma_m
-    return observed(
-        solution.cam_from_vehicle,
-        solution.extrinsic_covariance,
-        np.full((len(solution.cam_from_vehicle), 3), np.inf) if sigma is None else sigma,
-    )
-
-
-def observed(
-    cam_from_vehicle: FloatArray, covariance: FloatArray, centre_sigma_m: FloatArray
-) -> Sequence[Observability]:
-    """How well each of C cameras is determined by a drive.
-
-    Args:
-        cam_from_vehicle: (C, 4, 4) the extrinsics found.
-        covariance: (C, 6, 6) of their left tangents.
-        centre_sigma_m: (C, 3) of the prior of their centres, inf where there is none.
-    """
-    rotation = cam_from_vehicle[:, :3, :3]
+    rotation, covariance = solution.cam_from_vehicle[:, :3, :3], solution.extrinsic_covariance
+    centre_sigma_m = np.inf if problem.centre_sigma_m is None else problem.centre_sigma_m
     # The tangent's axes are the camera's, and its translation is minus the motion of the centre.
     centre = rotation.transpose(0, 2, 1) @ covariance[:, :3, :3] @ rotation
     turn = rotation.transpose(0, 2, 1) @ covariance[:, 3:, 3:] @ rotation
@@ -102,16 +85,6 @@ class PoseInnovations:
             return 1.0
         along, across = np.sqrt(np.mean(self.normalised[:, [ahead[0], left[0]]] ** 2, axis=0))
         return float(along / max(across, 1e-9))
-
-    def rms(self) -> dict[str, float]:
-        """Root mean square by the state's name, the larger one where it has two."""
-        count = max(len(self.normalised), 1)
-        size = np.sqrt(np.sum(self.normalised**2, axis=0) / count)
-        out: dict[str, float] = {}
-        for state, one in zip(self.state, size, strict=True):
-            name = POSE_STATES[state]
-            out[name] = max(out.get(name, 0.0), float(one))
-        return out
 
 
 def pose_innovations(solution: Solution) -> PoseInnovations:

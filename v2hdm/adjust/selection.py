@@ -112,9 +112,7 @@ def with_model(options: SolveOptions, model: Model) -> SolveOptions:
     return replace(options, pose_states=model.pose_states, clock_offset=model.clock_offset)
 
 
-def select_model(
-    problem: Problem, options: SolveOptions, names: Sequence[str] = tuple(MODELS), seed: int = 0
-) -> Selection:
+def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] = tuple(MODELS)) -> Selection:
     """Choose the richest of the models ``names`` that predicts as well as the best.
 
     As well means: within one standard error of the paired difference, by frames, since errors within a frame
@@ -127,7 +125,6 @@ def select_model(
         problem: the drive; its extrinsics are the start, and had better be near already.
         options: how to solve.
         names: of :data:`MODELS`, the simplest first; ``clock`` is left out where twists are not known.
-        seed: draws what is held out.
 
     Raises:
         AdjustError: a name is unknown, or a model's problem cannot be solved.
@@ -140,7 +137,7 @@ def select_model(
     ]
     punctual = [name for name in candidates if not MODELS[name].clock_offset] or candidates
     stretch, _ = restrict(problem, _stretch(problem))
-    held_out = _held_out(stretch.observations, np.random.default_rng(seed))
+    held_out = _held_out(stretch.observations)
     if np.count_nonzero(held_out) < _MIN_HELD_OUT:
         return Selection(punctual[-1], {})
     losses = {name: _losses(stretch, held_out, with_model(options, MODELS[name])) for name in candidates}
@@ -154,7 +151,7 @@ def select_model(
     return Selection(chosen, {name: float(loss.mean()) for name, loss in losses.items()})
 
 
-def predicts_better(problem: Problem, rival: Problem, options: SolveOptions, seed: int = 0) -> bool:
+def predicts_better(problem: Problem, rival: Problem, options: SolveOptions) -> bool:
     """Whether ``problem`` surely predicts held-out observations better than ``rival``, which moves them.
 
     Surely means by more than three standard errors of the paired difference, as in :func:`select_model`.
@@ -163,10 +160,9 @@ def predicts_better(problem: Problem, rival: Problem, options: SolveOptions, see
         problem: the drive; its extrinsics are near already.
         rival: the same observations of the same corners, but for where in the image they are.
         options: how to solve.
-        seed: draws what is held out.
     """
     chosen = _stretch(problem)
-    held_out = _held_out(restrict(problem, chosen)[0].observations, np.random.default_rng(seed))
+    held_out = _held_out(restrict(problem, chosen)[0].observations)
     if np.count_nonzero(held_out) < _MIN_HELD_OUT:
         return False
     own, other = (_losses(restrict(one, chosen)[0], held_out, options) for one in (problem, rival))
@@ -224,8 +220,9 @@ def _stretch(problem: Problem) -> BoolArray:
     return keep if everywhere else np.ones(len(seen.frame), dtype=bool)
 
 
-def _held_out(seen: Observations, rng: np.random.Generator) -> BoolArray:
+def _held_out(seen: Observations) -> BoolArray:
     """A share of the observations (K,); two of each corner stay, and the first and last frames."""
+    rng = np.random.default_rng(0)
     order = rng.permutation(len(seen.corner))
     place = np.empty(len(order), dtype=np.int64)
     by_corner = order[np.argsort(seen.corner[order], kind="stable")]

@@ -7,12 +7,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-import torch
 
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.model import Loss, robustified
-from v2hdm.adjust.problem import Observations
-from v2hdm.adjust.validation import Excluded, Verdict, VerdictArray, excluded
+from v2hdm.adjust.validation import Verdict, VerdictArray
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
@@ -57,7 +54,6 @@ class Solution:
         mahalanobis2: squared residual in standard deviations (K,), chi-square with 2 degrees of
             freedom where model and covariances are right (what was seen of a line is scaled to that).
         verdict: a :class:`v2hdm.adjust.Verdict` on each observation (K,).
-        loss, loss_scale: the robust loss, as in :class:`v2hdm.adjust.SolveOptions`.
         clock_offset_s: (C, V) how much later than stated each camera's images of each visit were taken; 0
             where that is not estimated.
         read_out_s: (C,) the time from the first row of each camera's images to the last; as stated where that
@@ -79,8 +75,6 @@ class Solution:
     residual_px: FloatArray
     mahalanobis2: FloatArray
     verdict: VerdictArray
-    loss: str
-    loss_scale: float
     clock_offset_s: FloatArray
     read_out_s: FloatArray
     cost_terms: Mapping[str, float]
@@ -97,20 +91,9 @@ class Solution:
         return sum(self.cost_terms.values())
 
     @property
-    def weight(self) -> FloatArray:
-        """The weight (K,), 0 to 1, that the robust loss leaves each observation."""
-        robust = Loss(self.loss, self.loss_scale)
-        _, weight = robustified(robust, torch.as_tensor(self.mahalanobis2))
-        return np.asarray(weight.numpy())
-
-    @property
     def accepted(self) -> BoolArray:
         """Which observations (K,) the verdict is for."""
         return np.asarray(self.verdict == Verdict.ACCEPTED)
-
-    def excluded(self, observations: Observations) -> tuple[Excluded, ...]:
-        """The excluded of ``observations``, those of the problem, and why; worst first."""
-        return excluded(observations, self.mahalanobis2, self.verdict)
 
     @property
     def extrinsic_covariance(self) -> FloatArray:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from v2hdm.adjust.problem import Observations
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray
 
 VerdictArray = NDArray[np.int8]
 
@@ -22,45 +22,15 @@ _ROWS = 1 << 18
 
 
 class Verdict(IntEnum):
-    """The verdict on an observation; :attr:`reason` says it in words."""
+    """The verdict on an observation.
+
+    One is unconfirmed where all others of its corner contradict it and one another.
+    """
 
     ACCEPTED = 0
     CONTRADICTS = 1
     UNCONFIRMED = 2
     BEHIND_CAMERA = 3
-
-    @property
-    def reason(self) -> str:
-        """Half a sentence: why."""
-        return _REASONS[self]
-
-
-_REASONS = {
-    Verdict.ACCEPTED: "agrees with the rest",
-    Verdict.CONTRADICTS: "lies where the rest of the drive does not put its corner",
-    Verdict.UNCONFIRMED: "its corner's other observations contradict it and one another",
-    Verdict.BEHIND_CAMERA: "its corner lies behind the camera that is said to have seen it",
-}
-
-
-@dataclass(frozen=True)
-class Excluded:
-    """One observation that was not accepted; ``distance_sigma`` is its residual in standard deviations."""
-
-    observation: int
-    camera: int
-    frame: int
-    corner: int
-    distance_sigma: float
-    verdict: Verdict
-
-    @property
-    def sentence(self) -> str:
-        """One sentence on the observation and the reason."""
-        return (
-            f"observation {self.observation} (corner {self.corner}, camera {self.camera}, "
-            f"frame {self.frame}): {self.verdict.reason} ({self.distance_sigma:.1f} sigma)"
-        )
 
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
@@ -109,25 +79,6 @@ def classify(
             Verdict.UNCONFIRMED
         )
     return verdict
-
-
-def excluded(
-    observations: Observations, mahalanobis2: FloatArray, verdict: VerdictArray
-) -> tuple[Excluded, ...]:
-    """The observations that were not accepted, worst first."""
-    rows: IntArray = np.flatnonzero(verdict != Verdict.ACCEPTED)
-    rows = rows[np.argsort(-mahalanobis2[rows], kind="stable")]
-    return tuple(
-        Excluded(
-            observation=int(k),
-            camera=int(observations.camera[k]),
-            frame=int(observations.frame[k]),
-            corner=int(observations.corner[k]),
-            distance_sigma=float(np.sqrt(mahalanobis2[k])),
-            verdict=Verdict(int(verdict[k])),
-        )
-        for k in rows
-    )
 
 
 # Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.

@@ -1,6 +1,6 @@
 """``v2hdm calibrate ground DRIVE``: one line per camera on stdout and the verdict on the drive.
 
-Calibrations and pictures of the matched ground go into the output folder (docs/extrinsic.md). No torch is
+Calibrations and pictures of the matched ground go into the output folder (docs/calibration.md). No torch is
 needed.
 """
 

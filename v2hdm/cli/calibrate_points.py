@@ -1,6 +1,6 @@
 """``v2hdm calibrate points POINTS.csv --intrinsics FILE``: a camera's mounting and IPM, each with its sigma.
 
-docs/calibrate.md describes it.
+docs/calibration.md describes it.
 """
 
 from __future__ import annotations

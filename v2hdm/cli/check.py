@@ -5,10 +5,12 @@ docs/check.md says what each finding means. No torch is needed.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of
+from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of, steps_of
+from v2hdm.errors import EXIT_USER_ERROR
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -17,6 +19,17 @@ def run(arguments: Sequence[str]) -> int:
     add_drive(parser, "check")
     parser.add_argument("--no-ground", dest="ground", action="store_false", help="match no ground: faster")
     parser.add_argument("--list-topics", action="store_true", help="only list a bag's topics and drive.yaml")
+    parser.add_argument(
+        "--write", type=Path, metavar="DIR", help="write a bag's, video's or image folder's drive.yaml"
+    )
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="with --write: what it asks for",
+    )
     parser.add_argument("--all", action="store_true", help="also print the checks that passed")
     parsed = parser.parse_args(arguments)
     if parsed.list_topics:
@@ -30,11 +43,24 @@ def run(arguments: Sequence[str]) -> int:
     from v2hdm.verdict import check_drive
     from v2hdm.verdict.check import draw_check
 
+    if parsed.set and not parsed.write:
+        parser.error("--set is for --write")
+    if parsed.write:
+        from v2hdm.io.drive.draft import draft_drive
+
+        if missing := draft_drive(parsed.drive, parsed.write, parsed.set):
+            asked = [f"  --set {key}=... {why}" for key, why in missing.items()]
+            print(f"error: {parsed.drive}: nothing written, say this too:", *asked, sep="\n", file=sys.stderr)
+            return EXIT_USER_ERROR
+        print(f"{parsed.write / 'drive.yaml'} written", file=sys.stderr)
+        parsed.drive = parsed.write
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
     settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras), "ground": parsed.ground}
     with result_of(folder, settings) as unfinished:
-        ground = estimate_cameras(drive, parsed.workers) if parsed.ground else {}
+        matched = steps_of("match bare ground, cameras")
+        ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
+        print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
         write_json(unfinished / "verdict.json", verdict.as_json())
         draw_check(drive, unfinished, ground)

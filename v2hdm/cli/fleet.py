@@ -44,6 +44,6 @@ def run(arguments: Sequence[str]) -> int:
     if not files:
         raise ConfigError("no drive is named: give run files, as in v2hdm fleet drives/*.yaml")
     if any(is_url(one) for one in parsed.drives if one not in overrides):
-        raise ConfigError("run files lie on this machine; their drive.path may be a URL (docs/stores.md)")
+        raise ConfigError("run files lie on this machine; their drive.path may be a URL (docs/fleet.md)")
     options = FleetOptions(parsed.table, parsed.workers, parsed.address, parsed.again, parsed.site)
     return exit_code(fleet_on_terminal(files, overrides, options))

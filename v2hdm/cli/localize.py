@@ -1,6 +1,6 @@
 """``v2hdm localize MAP DRIVE``: only the first recorded pose is used; the others show how far off it is.
 
-docs/localize.md describes it.
+docs/living-map.md describes it.
 """
 
 from __future__ import annotations

@@ -177,6 +177,7 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
     check_workers(parsed.workers)
     parsed.workers = parsed.workers or os.cpu_count() or 1
     logging.basicConfig(format="%(message)s")
+    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
     cv2.setNumThreads(1)
     return read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
 

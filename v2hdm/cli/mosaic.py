@@ -1,6 +1,6 @@
 """``v2hdm mosaic RESULT``: the ground from above, as a GeoTIFF and as pictures before and after.
 
-docs/mosaic.md describes it.
+docs/report.md describes it.
 """
 
 from __future__ import annotations

@@ -23,8 +23,7 @@ N = TypeVar("N", bound="Normal")
 _RANK = 1e-12
 """Relative size below which an eigenvalue of the scaled information is rounding: nothing observes it."""
 
-_GIVE_UP = 1e8
-"""Damping from which a cost that still grows is at its minimum but for rounding."""
+_GIVE_UP = 1e8  # damping from which a cost that still grows is at its minimum but for rounding
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
 
 
 def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
-    """The part of a polygon (N, 2) where ``depth`` (N,), linear in the plane, is not negative."""
+    """The part of a polygon (N, D) where ``depth`` (N,), linear in its plane, is not negative."""
     kept: list[FloatArray] = []
     for k in range(len(polygon)):
         before = k - 1
@@ -67,7 +67,7 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
             kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
         if depth[k] >= 0:
             kept.append(polygon[k])
-    return np.array(kept).reshape(-1, 2)
+    return np.array(kept).reshape(-1, polygon.shape[1])
 
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:

@@ -5,20 +5,12 @@ from v2hdm.ground.results import (
     GroundEstimate,
     GroundOptions,
     GroundStatus,
-    MatchedGround,
     Parameter,
     Reading,
     better_start,
-)
+)  # fmt: skip
 
 __all__ = [
-    "GroundEstimate",
-    "GroundOptions",
-    "GroundStatus",
-    "MatchedGround",
-    "Parameter",
-    "Reading",
-    "better_start",
-    "estimate_cameras",
-    "estimate_ground",
-]
+    "GroundEstimate", "GroundOptions", "GroundStatus", "Parameter", "Reading", "better_start",
+    "estimate_cameras", "estimate_ground",
+]  # fmt: skip

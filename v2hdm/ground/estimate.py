@@ -96,7 +96,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
     matcher = Matcher(drive, camera, motion, options)
     readings = try_readings(drive, camera, matcher, stated, options.readings)
-    out, start = _nothing(camera, stated, readings), readings.start
+    out, start = _nothing(camera, readings), readings.start
     if readings.best is Reading.AS_GIVEN:
         solved: _Solved | _Lost = _Lost(start_pairs(stated), start.share)
         if start.mount is not None:
@@ -140,7 +140,7 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
         matched = matcher.match(
             mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m
         )
-        if len(matched.correlation) < _LEAST_MATCHES:
+        if len(matched) < _LEAST_MATCHES:
             return _Lost(pairs[:: stage.every], matched.share)
         used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
         # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
@@ -181,12 +181,11 @@ def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> 
             seen.pair,
             seen.first_px,
             seen.second_px,
-            matched.correlation,
         ),
     )
 
 
-def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
+def _nothing(camera: str, readings: Readings) -> GroundEstimate:
     little = readings.start.sought < _LEAST_PATCHES and readings.best is Reading.AS_GIVEN
     return GroundEstimate(
         camera=camera,
@@ -194,7 +193,6 @@ def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
         shares=readings.shares,
         reading=readings.best,
         calibration=None,
-        guess_cam_from_vehicle=stated.guess.cam_from_vehicle,
         parameters={},
         median_residual=float("nan"),
         innovations={},
@@ -295,22 +293,18 @@ def _sigma(adjusted: Adjusted, k: int, usual: float) -> float:
     return float(np.sqrt(adjusted.covariance[k, k] + max(multiple - 1, 0.0) * data))
 
 
-_worker: tuple[Drive, GroundOptions | None] | None = None
+_worker_drive: Drive | None = None
 
 
 def estimate_cameras(
-    drive: Drive,
-    workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-    options: GroundOptions | None = None,
+    drive: Drive, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, GroundEstimate]:
     """Estimate every camera's mounting from bare ground, each in a process of its own.
 
     Args:
         drive: the drive.
         workers: processes, one thread each; 1 stays in this process.
-        progress: called as ``progress(done, total)`` after each camera.
-        options: of :func:`estimate_ground`.
+        progress: called as ``progress(done, total)`` before the first camera and after each.
 
     Raises:
         DriveError: an image cannot be read.
@@ -324,21 +318,22 @@ def estimate_cameras(
             progress(len(found), len(drive.cameras))
 
     names = list(drive.cameras)
+    if progress:
+        progress(0, len(names))
     if workers <= 1 or len(names) == 1:
         for name in names:
-            take(estimate_ground(drive, name, options))
+            take(estimate_ground(drive, name))
     else:
-        share_out(_work, names, workers, _start_worker, (drive, options), take)
+        share_out(_work, names, workers, _start_worker, (drive,), take)
     return found
 
 
-def _start_worker(drive: Drive, options: GroundOptions | None) -> None:
-    global _worker
+def _start_worker(drive: Drive) -> None:
+    global _worker_drive
     cv2.setNumThreads(1)
-    _worker = drive, options
+    _worker_drive = drive
 
 
 def _work(camera: str) -> GroundEstimate:
-    assert _worker is not None
-    drive, options = _worker
-    return estimate_ground(drive, camera, options)
+    assert _worker_drive is not None
+    return estimate_ground(_worker_drive, camera)

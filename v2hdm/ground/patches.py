@@ -62,13 +62,15 @@ class Matches:
 
     first_px: FloatArray
     second_px: FloatArray
-    correlation: FloatArray
     sought: int
 
     @classmethod
     def none_of(cls, sought: int) -> Matches:
         """No matches at all."""
-        return cls(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), sought)
+        return cls(np.empty((0, 2)), np.empty((0, 2)), sought)
+
+    def __len__(self) -> int:
+        return len(self.first_px)
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ def match_pair(
     at = cells[table[:, 0].astype(np.int64)]
     first_px = first.pixels(sheet.at(at))
     second_px = second.pixels(sheet.at(at + table[:, 1:3] - reach))
-    return _on_one_plane(Matches(first_px, second_px, table[:, 3], sought))
+    return _on_one_plane(Matches(first_px, second_px, sought))
 
 
 def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, options: GroundOptions) -> Matches:
@@ -206,7 +208,7 @@ def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, options: 
     table = np.array(found)
     first_px, second_px = first.pixels(sheet.at(table[:, :2])), second.pixels(sheet.at(table[:, 2:4] + half))
     moving = np.linalg.norm(second_px - first_px, axis=1) > _STILL_PX
-    return _on_one_plane(Matches(first_px[moving], second_px[moving], table[moving, 4], len(in_view)))
+    return _on_one_plane(Matches(first_px[moving], second_px[moving], len(in_view)))
 
 
 def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
@@ -214,8 +216,8 @@ def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
 
 
-def _peak(score: Float32Array) -> tuple[float, float, float] | None:
-    """Row, column and height of the best place, refined by a paraboloid; None for no clear one."""
+def _peak(score: Float32Array) -> tuple[float, float] | None:
+    """Row and column of the best place, refined by a paraboloid; None for no clear one."""
     _, best, _, (column, row) = cv2.minMaxLoc(score)
     rows, columns = score.shape
     if best < _LEAST_CORRELATION or not (0 < row < rows - 1 and 0 < column < columns - 1):
@@ -238,7 +240,7 @@ def _peak(score: Float32Array) -> tuple[float, float, float] | None:
     rest[top : row + _PEAK_CELLS + 1, left : column + _PEAK_CELLS + 1] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None
-    return row + float(down), column + float(right), float(best)
+    return row + float(down), column + float(right)
 
 
 def _on_one_plane(matches: Matches) -> Matches:
@@ -251,7 +253,7 @@ def _on_one_plane(matches: Matches) -> Matches:
     if inlier is None or inlier.sum() < _LEAST_OF_A_PAIR:
         return Matches.none_of(matches.sought)
     keep = inlier.ravel().astype(np.bool_)
-    return Matches(first[keep], second[keep], matches.correlation[known][keep], matches.sought)
+    return Matches(first[keep], second[keep], matches.sought)
 
 
 @dataclass(frozen=True)
@@ -259,9 +261,11 @@ class Round:
     """Matches of all pairs of one round; ``share`` of the patches in view that found a partner."""
 
     observations: Observations
-    correlation: FloatArray
     sought: int
     share: float
+
+    def __len__(self) -> int:
+        return len(self.observations.first)
 
 
 class Matcher:
@@ -290,18 +294,14 @@ class Matcher:
         for first, second in pairs.tolist():
             centres = patch_centres((poses[first], poses[second]), self._roi, self._path, options)
             one, other = (View(self._read(k), mount, poses[k]) for k in (first, second))
-            pair_found = match_pair(one, other, centres, search_m, options) if len(centres) else None
-            found.append(pair_found or Matches.none_of(0))
-        counts = [len(each.correlation) for each in found]
-        pair = np.repeat(np.arange(len(pairs)), counts)
+            own = match_pair(one, other, centres, search_m, options) if len(centres) else Matches.none_of(0)
+            found.append(own)
+        pair = np.repeat(np.arange(len(pairs)), [len(each) for each in found])
         sought = sum(each.sought for each in found)
-        none = Matches.none_of(0)
-        first_px, second_px, correlation = (
-            np.concatenate([getattr(each, name) for each in (none, *found)])
-            for name in ("first_px", "second_px", "correlation")
-        )
+        first_px = np.concatenate([np.empty((0, 2)), *(each.first_px for each in found)])
+        second_px = np.concatenate([np.empty((0, 2)), *(each.second_px for each in found)])
         observations = Observations(pairs[pair, 0], pairs[pair, 1], first_px, second_px, pair)
-        return Round(observations, correlation, sought, sum(counts) / sought if sought else 0.0)
+        return Round(observations, sought, len(pair) / sought if sought else 0.0)
 
     def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> tuple[int, float]:
         """How many patches of first images are found again in the second ones, anywhere, and their share."""
@@ -310,7 +310,7 @@ class Matcher:
             match_anywhere(View(self._read(a), mount, here), View(self._read(b), mount, here), roi, options)
             for a, b in pairs.tolist()
         ]
-        count, sought = sum(len(one.correlation) for one in found), sum(one.sought for one in found)
+        count, sought = sum(map(len, found)), sum(one.sought for one in found)
         return count, count / sought if sought else 0.0
 
     def _read(self, row: int) -> ImageArray:

@@ -95,7 +95,7 @@ class MatchedGround:
 
     ``pair_images`` (P, 2) are indices into ``Drive.images``; ``pair`` (N,) is each match's row of it;
     ``pair_poses`` (P, 2, 4, 4) are the ``map_from_vehicle`` of both with their estimated errors taken in.
-    ``first_px`` and ``second_px`` (N, 2) are where the patch lies in the two images; ``correlation`` (N,).
+    ``first_px`` and ``second_px`` (N, 2) are where the patch lies in the two images.
     """
 
     pair_images: IntArray
@@ -103,7 +103,6 @@ class MatchedGround:
     pair: IntArray
     first_px: FloatArray
     second_px: FloatArray
-    correlation: FloatArray
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,6 @@ class GroundEstimate:
     shares: Mapping[Reading, float]
     reading: Reading
     calibration: Calibration | None
-    guess_cam_from_vehicle: FloatArray
     parameters: Mapping[str, Parameter]
     median_residual: float
     innovations: Mapping[str, float]

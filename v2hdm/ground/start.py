@@ -83,7 +83,7 @@ def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, gue
     surveyed = stated.with_surveyed_height()
     for search_m in _SEARCH_M:
         matched = matcher.match(mount, stated.poses(), pairs, search_m, _GRID_M)
-        if len(matched.correlation) < _LEAST_MATCHES or matched.share < _LEAST_SHARE:
+        if len(matched) < _LEAST_MATCHES or matched.share < _LEAST_SHARE:
             return Start(None, matched.share, matched.sought)
         used, prior, _ = surveyed.prior_of(matched.observations)
         mount = adjust(used, prior, mount, tolerance=_TOLERANCE).mount

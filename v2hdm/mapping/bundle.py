@@ -5,7 +5,7 @@ One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -62,8 +62,6 @@ _UNSURVEYED_CENTRE_SIGMA_M = 0.3
 
 HEAVE_SIGMA_M = 0.01
 """How far, m, a vehicle's body moves up and down on its suspension on paved ground."""
-
-Solve = Callable[[Problem, SolveOptions], Solution]
 
 LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
@@ -175,7 +173,6 @@ def solve_bundle(
     rig: Rig,
     cameras: Mapping[str, Camera],
     model: Model,
-    solve: Solve = solve,
 ) -> Bundle:
     """Estimate extrinsics, poses and the corners of all groups together.
 

@@ -41,14 +41,13 @@ class Evidence:
 class Optimised:
     """The outcome of the joint optimisation.
 
-    ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``;
-    ``usable`` (S, 4) are the accepted corner observations. Reprojection errors are root mean squares
-    over the points seen of the accepted markings, under the optimised and the initial extrinsics.
+    ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``. Reprojection
+    errors are root mean squares over the points seen of the accepted markings, under the optimised and the
+    initial extrinsics.
     ``suspicions`` are of the most suspicious markings, the worst first.
     """
 
     bundle: Bundle
-    usable: BoolArray
     groups: IntArray
     markings: tuple[Marking, ...]
     excluded: tuple[Exclusion, ...]
@@ -99,7 +98,6 @@ def conclude(
     at_start = _residuals_under(initial_rig, evidence.sightings, final, jitter_rad)
     return Optimised(
         bundle=final,
-        usable=evidence.usable,
         groups=classified.accepted,
         markings=markings,
         excluded=classified.exclusions(),

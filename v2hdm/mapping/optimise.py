@@ -69,8 +69,7 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 _GROUND_ROUNDS = 6
 """Solves under better and better cross-sections, at most: four are enough for a crown of 4 %."""
 
-_SETTLED_SLOPE = 5e-4
-"""Change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path."""
+_SETTLED_SLOPE = 5e-4  # change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path
 
 
 def silent(step: str) -> None:
@@ -113,10 +112,6 @@ class Optimiser:
         """Sightings linked from image to image under the initial IPMs."""
         located = self._locate(self.initial_rig)
         return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
-
-    def run(self, tracks: Association, progress: Callable[[str], None] = silent) -> Optimised:
-        """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
-        return self.finish(self.settle(tracks, progress), progress)
 
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""

@@ -76,7 +76,7 @@ class ControlOptions:
 class SurveyOptions:
     """Corners of markings that a survey has measured, as factors of the joint solve.
 
-    ``file`` is a CSV of control points and of check points, which are held out (docs/survey.md); ``crs`` is
+    ``file`` is a CSV of control points and of check points, which are held out (docs/accuracy.md); ``crs`` is
     the projected system of its eastings and northings, such as ``EPSG:32632``, and ``geoid_m`` the height of
     the geoid above the ellipsoid where its heights count from the sea.
     ``points_map`` are x and y of control points, m, in the frame of the recorded poses, as in

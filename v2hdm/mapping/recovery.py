@@ -26,7 +26,7 @@ from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, CROSS_SECTION, INCREMENTAL, MappingOptions, SurveyOptions
-from v2hdm.mapping.results import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction, SolveEvidence
+from v2hdm.mapping.results import WINDOW_OBSERVATIONS, CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.stated import name_of
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray
 
@@ -105,8 +105,6 @@ _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
-
-_CELL_OBSERVATIONS = 40  # observations of a cell from which its median residual counts
 
 
 @dataclass(frozen=True)
@@ -421,15 +419,13 @@ def _point_of(bundle: Bundle, item: int) -> str:
 
 def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     """How well each camera's observations fit ``bundle``, a solve before anything was left out."""
-    seen, solution = bundle.problem.observations, bundle.solution
-    points, fits = bundle.inliers & ~seen.on_line, {}
+    fits = {}
     for name, c in bundle.camera_index.items():
-        own = seen.camera == c
+        own = bundle.problem.observations.camera == c
         fits[name] = CameraFit(
             observations=int(own.sum()),
-            variance_factor=_factor(bundle, solution.mahalanobis2[own]),
+            variance_factor=_factor(bundle, bundle.solution.mahalanobis2[own]),
             rejected_share=float(1 - bundle.inliers[own].mean()),
-            bias_px=_cell_bias(seen.pinhole_px[own & points], solution.residual_px[own & points]),
         )
     return fits
 
@@ -448,21 +444,6 @@ def _along_route(bundle: Bundle, frame: IntArray, stamp_s: FloatArray) -> tuple[
 
 def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:
     return bundle.model.variance_factor * float(np.median(mahalanobis2)) / _MEDIAN_SQUARED
-
-
-def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
-    """Longest median residual of the cells that the places (K, 2) span."""
-    if not len(places_px):
-        return 0.0
-    rows, columns = CELLS
-    low, span = places_px.min(axis=0), np.maximum(np.ptp(places_px, axis=0), 1.0)
-    share = (places_px - low) / span * (1 - 1e-9)
-    cell = (share[:, 1] * rows).astype(np.int64) * columns + (share[:, 0] * columns).astype(np.int64)
-    biases = [
-        float(np.linalg.norm(np.median(residual_px[cell == number], axis=0)))
-        for number in np.flatnonzero(np.bincount(cell) >= _CELL_OBSERVATIONS)
-    ]
-    return max(biases, default=0.0)
 
 
 def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, visits: Sequence[str]) -> str:

@@ -18,9 +18,6 @@ from v2hdm.site.suspicion import Suspicion
 WINDOW_OBSERVATIONS = 200
 """Observations of a window along the route: their median varies by a tenth by chance."""
 
-CELLS = (4, 6)
-"""Rows and columns that an image is divided into for the mean residual of each."""
-
 
 @dataclass(frozen=True)
 class Contradiction:
@@ -52,14 +49,12 @@ class CameraFit:
     """How well one camera's ``observations`` fit.
 
     ``variance_factor`` is how many times as large as stated by the detector their variances are, by the
-    median; ``rejected_share`` of them the rest contradicts; ``bias_px`` is the longest median residual of the
-    cells of its image (see :data:`CELLS`).
+    median; ``rejected_share`` of them the rest contradicts.
     """
 
     observations: int
     variance_factor: float
     rejected_share: float
-    bias_px: float
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ class RunConfig:
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
-        output: folder that takes the results, or the URL of one at an object store (docs/stores.md).
+        output: folder that takes the results, or the URL of one at an object store (docs/fleet.md).
         cache: folder that keeps rendered drives, what is imported from bags and videos, and what each stage
             of a run has found, for the next one (docs/cache.md).
         cache_gb: what the cache may hold, GB (10^9 bytes); what was not used for longest goes first.
@@ -75,8 +75,8 @@ class RunConfig:
         mode: the value that it passes on as ``mapping.mode``, ``batch`` or ``incremental``.
         accuracy_goal_cm: the radius, cm, within which 95 % of the corners, and the calibrations, have to be
             known at 95 %, else the verdict is WARN (docs/verdict.md).
-        mosaic: whether the ground is shown from above, too (docs/mosaic.md).
-        viewer: ``rerun`` shows and records the run while it goes on (docs/live-view.md), ``none`` does not.
+        mosaic: whether the ground is shown from above, too (docs/report.md).
+        viewer: ``rerun`` shows and records the run while it goes on (docs/report.md), ``none`` does not.
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
     """
 

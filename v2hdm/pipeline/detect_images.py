@@ -42,7 +42,6 @@ _LOOKS = 6
 within 6 px."""
 
 _KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard deviation is this
-
 _ROUGH_RANGE_M = 40.0  # distances may be wrong by two without a calibration: none is too far
 
 _Frames = Iterator[tuple[Frame, RoadDetector | None]]

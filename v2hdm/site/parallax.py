@@ -34,7 +34,6 @@ _ONE_VIEW_M = 0.1
 """Way, m, within which images show one view, so that they err alike: the same texture lies along an edge."""
 
 _POSE_SIGMAS = 4.0  # how far apart, in sigmas, the recorded positions of one place may be
-
 _LEVEL_RAD = 1e-5  # sigma, rad, of the attitude where it is taken for exact
 _LEAST_SIGMA_M = 1e-3  # of a point, m, however certain an image states it to be
 _ANYWHERE_M = 1e3  # sigma, m, of where a point lies about its mean

@@ -43,8 +43,7 @@ _KINDS = len(_PRIOR_COUNT)
 _SIZE_SIGMA_M = 1.0
 """Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
 
-_LENGTH_SIGMA_M = 0.3
-"""Sigma, m, of the length of paint that is rolled by the metre: a tenth of a dash's."""
+_LENGTH_SIGMA_M = 0.3  # sigma, m, of the length of paint that is rolled by the metre: a tenth of a dash's
 
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
@@ -66,14 +65,12 @@ _WORN_SHARE = 0.5
 _CUT_SHARE = 0.1
 """Share of the breadth, one sigma, by which a corner of a piece lies off its sides: cuts are not parallel."""
 
-_RUN_ON_M = 1.0
-"""Sigma, m, of an end that runs on into other paint: letters and lines are about as long."""
+_RUN_ON_M = 1.0  # sigma, m, of an end that runs on into other paint: letters and lines are about as long
 
 _RATE_STRENGTH = 4.0
 """Images that the common rate of a class is worth: how alike its markings are in how often they are found."""
 
-_NEGLECTED_SHARE = 0.1
-"""Share of markings that are worn or hidden, and found at any rate."""
+_NEGLECTED_SHARE = 0.1  # share of markings that are worn or hidden, and found at any rate
 
 _CLUTTER_FOUND = (0.5, 2.0)
 """Beta distribution of how often clutter, or part of a symbol, is found in an easy view: a fifth of them."""
@@ -81,8 +78,7 @@ _CLUTTER_FOUND = (0.5, 2.0)
 _BARE_FOUND = (0.05, 10.0)
 """Beta distribution of how often bare ground is taken for a given marking: in one view of two hundred."""
 
-_CLUTTER_REPEATS = 0.7
-"""Probability that clutter which some images have shown is shown by one more."""
+_CLUTTER_REPEATS = 0.7  # probability that clutter which some images have shown is shown by one more
 
 _AGREEING = (0.93, 0.6)
 """Share of the observations of a marking, and of clutter, that agree with the joint solution."""
@@ -93,8 +89,7 @@ CORNERS_OF_IMAGE = 4.0
 _UNDER_SYMBOL = (0.02, 0.5)
 """Share of the images of a marking, and of part of a symbol, in which a symbol lies on it."""
 
-_PASSES = 2
-"""Rounds of expectation maximisation; a third changes no figure of six drives by a hundredth."""
+_PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
 _FIRST, _SECOND = np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5])
 """Of a parallelogram with the sides u and v corner k lies at its centre plus first[k] u + second[k] v."""

@@ -27,8 +27,7 @@ from scipy.stats import chi2
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates
 
-_LEAST_MEMBERS = 8
-"""Markings of one shape from which the shape is one of the class."""
+_LEAST_MEMBERS = 8  # markings of one shape from which the shape is one of the class
 
 _FEWEST_MEMBERS = 3
 """The same where they are half of the class or more, and agree as only one stencil makes them: from three on,
@@ -37,14 +36,9 @@ two agree against a third one. Beside a commoner shape, pieces of it are soon al
 _STENCIL_M = 0.03
 """Sigma of a corner's coordinate about a shape, m, up to which markings agree so: a brush's width."""
 
-_LEAST_SHARE = 0.1
-"""Share of a class's markings from which their shape is one of the class."""
-
-_MEMBER_M = 0.05
-"""A marking of which no corner misses a shape by more, m, is of that shape."""
-
-_MEMBER_SHARE = 0.08
-"""The same as a share of the longer diagonal: large paint is laid out less exactly."""
+_LEAST_SHARE = 0.1  # share of a class's markings from which their shape is one of the class
+_MEMBER_M = 0.05  # a marking of which no corner misses a shape by more, m, is of that shape
+_MEMBER_SHARE = 0.08  # the same as a share of the longer diagonal: large paint is laid out less exactly
 
 SHAPE_SIGMA_M = 0.01
 """How far a painted corner lies from where the stencil would have it, m, at least."""
@@ -52,8 +46,7 @@ SHAPE_SIGMA_M = 0.01
 _ELONGATED = 2.0
 """Paint this many times as long as wide is rolled by the metre: its width is common, its length its own."""
 
-_GAUSS_NEWTON_STEPS = 3
-"""Steps that refine a laid shape."""
+_GAUSS_NEWTON_STEPS = 3  # steps that refine a laid shape
 
 
 @dataclass(frozen=True)
@@ -252,8 +245,7 @@ _EDGE_SIGMA_M = 0.004
 
 A class whose typical marking scatters by more was painted so: that scatter is no error of the map."""
 
-_START = (0.002, 3.0)
-"""Scale, m, and degrees of freedom from which the search starts."""
+_START = (0.002, 3.0)  # scale, m, and degrees of freedom from which the search starts
 
 
 @dataclass(frozen=True)

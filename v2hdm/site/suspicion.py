@@ -14,11 +14,8 @@ from v2hdm.records import FloatArray, IntArray
 from v2hdm.site.candidates import Counts
 from v2hdm.site.posterior import CORNERS_OF_IMAGE
 
-_LISTED = 10
-"""Markings that are listed: as many as a user looks at."""
-
-_LEAST_TO_COMPARE = 3
-"""Markings from which their residuals have a spread."""
+_LISTED = 10  # markings that are listed: as many as a user looks at
+_LEAST_TO_COMPARE = 3  # markings from which their residuals have a spread
 
 _LARGEST = 1e9
 """Variance of residuals, in squared sigmas, beyond which (and below whose inverse) all are alike."""

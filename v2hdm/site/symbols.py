@@ -40,7 +40,6 @@ _PART = 0.25
 """Share of the images' weight from which paint that the others lack is a part that they have missed."""
 
 _MISSED_SIGMAS = 2.0  # paint is missed, not just elsewhere, this many sigmas beside what an image has
-
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
 

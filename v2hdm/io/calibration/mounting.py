@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
+from v2hdm.geometry.mounting import cam_from_mounting
 from v2hdm.geometry.planar import winding
-from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.io.safe.fields import recorded_distance
 from v2hdm.records import BoolArray, CameraInfo, CentrePrior, FloatArray
 from v2hdm.store.files import check_keys, take_array, take_mapping, take_text
 
 IPM_NAMES = ("calibrated", "estimated")
 
+_MOUNTING = ("xyz_m", "rpy_deg")
 _SINGULAR = 1e-12  # reciprocal condition number, rows and columns scaled to unit norm
 _ROTATION_TOLERANCE = 1e-4
 _ROI_SAMPLES = 8  # points along each edge of a region of interest that are looked for in the image
@@ -31,6 +33,14 @@ def take_ipm(content: object, where: str) -> FloatArray:
     if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
         raise DriveError(f"{where}: IPM matrix is not invertible; calibrate it from 4 or more point pairs")
     return np.asarray(ipm / np.linalg.norm(ipm))
+
+
+def take_mounting(content: object, where: str) -> FloatArray:
+    """``cam_from_vehicle`` (4, 4) of a camera's place in m and its roll, pitch (down), yaw (left) in deg."""
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, _MOUNTING, (), where, DriveError)
+    xyz_m, rpy_deg = (take_array(entry[key], (3,), f"{where}, {key}", DriveError) for key in _MOUNTING)
+    return cam_from_mounting(xyz_m, np.deg2rad(rpy_deg))
 
 
 def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str) -> FloatArray:
@@ -92,6 +102,11 @@ def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
     pixels = np.column_stack([rays_cam[:, :2] * scale[:, None], np.ones(len(rays_cam))]) @ info.intrinsic.T
     inside = (pixels[:, :2] > -0.5) & (pixels[:, :2] < np.array([info.width, info.height]) - 0.5)
     return np.asarray(inside.all(axis=1) & (rays_cam[:, 2] > 0))
+
+
+def roi_of_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
+    """The region of interest (4, 2) of a camera for which none is stated."""
+    return roi_ahead(inverse(extrinsic_from_ipm(info, ipm)))
 
 
 def roi_ahead(vehicle_from_cam: FloatArray) -> FloatArray:

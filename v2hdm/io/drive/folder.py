@@ -30,8 +30,18 @@ TRUTH_FOLDER = "truth"
 
 _DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "truth"))
 _CAMERA_KEYS = (
-    ("camera_info", "images", "roi_vehicle"),
-    ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior", "mask", "read_out_s"),
+    ("camera_info", "images"),
+    (
+        "mounting",
+        "cam_from_vehicle",
+        "ipm",
+        "initial_ipm",
+        "roi_vehicle",
+        "centre_prior",
+        "linear_response",
+        "mask",
+        "read_out_s",
+    ),
 )
 
 
@@ -107,8 +117,9 @@ def _name(content: dict[str, Any], path: Path) -> str:
 
 
 def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:
-    if ("ipm" in entry) == ("cam_from_vehicle" in entry):
-        raise DriveError(f"{where}: give either 'ipm' or 'cam_from_vehicle', one of the two")
+    guesses = [key for key in ("mounting", "cam_from_vehicle", "ipm") if key in entry]
+    if len(guesses) != 1:
+        raise DriveError(f"{where}: give one of 'mounting', 'cam_from_vehicle' and 'ipm'; got {len(guesses)}")
     if "ipm" in entry:
         matrices = take_mapping(entry["ipm"], f"{where}, ipm", DriveError)
         check_keys(matrices, (), mounting.IPM_NAMES, f"{where}, ipm", DriveError)
@@ -116,14 +127,18 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         if not ipm:
             raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(mounting.IPM_NAMES)}")
     else:
-        guess_at = f"{where}, cam_from_vehicle"
-        ipm = {"estimated": mounting.ipm_from_guess(info, entry["cam_from_vehicle"], guess_at)}
+        (key,), guess = guesses, entry[guesses[0]]
+        guess = mounting.take_mounting(guess, f"{where}, mounting") if key == "mounting" else guess
+        ipm = {"estimated": mounting.ipm_from_guess(info, guess, f"{where}, {key}")}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
     initial_ipm = mounting.choose_initial(entry.get("initial_ipm"), ipm, where)
-    roi_vehicle = mounting.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+    if "roi_vehicle" in entry:
+        roi_vehicle = mounting.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+    else:
+        roi_vehicle = mounting.roi_of_ipm(info, ipm[initial_ipm])
     mounting.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     return Camera(
         info=info,

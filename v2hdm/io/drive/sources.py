@@ -31,7 +31,7 @@ from v2hdm.store.folders import entry_folder, is_whole
 _log = logging.getLogger(__name__)
 
 _Lister = Callable[[], ImageFiles]
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 @dataclass
@@ -151,9 +151,9 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
     def images() -> ImageFiles:
         if not folder.is_dir():
             raise DriveError(f"{where}: {folder}: no such folder; check the path")
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not paths:
-            raise DriveError(f"{where}: {folder}: no image ({', '.join(_SUFFIXES)}) in this folder")
+            raise DriveError(f"{where}: {folder}: no image ({', '.join(SUFFIXES)}) in this folder")
         if "stamps" in entry:
             stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
             stamp_s = read_stamps(stamps, len(paths), f"images in {folder}")

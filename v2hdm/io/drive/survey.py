@@ -1,4 +1,4 @@
-"""A survey's points in a CSV file with named columns (docs/survey.md): control points and check points.
+"""A survey's points in a CSV file with named columns (docs/accuracy.md): control points and check points.
 
 Coordinates are local metres, latitudes and longitudes, or eastings and northings of any projected system;
 :func:`in_map` brings them into the map.

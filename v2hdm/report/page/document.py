@@ -61,7 +61,7 @@ def document(facts: Facts) -> SimpleNamespace:
 def _summary(facts: Facts) -> str:
     hd_map = facts.hd_map
     if hd_map is None:
-        return "No map came of this drive."
+        return "This drive gave no map."
     words = [in_words(len(hd_map.markings), "marking"), in_words(len(hd_map.lanes), "lane line")]
     if hd_map.symbols:
         words.append(in_words(len(hd_map.symbols), "symbol"))

@@ -95,8 +95,8 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
     lanes = best.get("lanes", {})
     symbols, length = in_words(len(facts.hd_map.symbols), "symbol"), number(lanes.get("length_m"), 0)
     figures = [
-        Figure("Markings", str(len(markings)), "", f"{symbols} besides"),
-        Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m together"),
+        Figure("Markings", str(len(markings)), "", f"and {symbols}"),
+        Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m in total"),
     ]
     for name, values, note in (
         ("Between neighbours", relative_m(markings), "95 % of a corner’s error, relative"),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from v2hdm.records import FloatArray
 
@@ -155,21 +156,9 @@ class Scene:
 
 
 def convex_hull(points: FloatArray) -> FloatArray:
-    """Convex hull (M, 2) of points (N, 2), counter-clockwise, in float64 (Andrew's monotone chain)."""
-    ordered = sorted(map(tuple, np.asarray(points, dtype=np.float64)))
-
-    def turns_left(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> bool:
-        return (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])
-
-    def chain(sequence: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        hull: list[tuple[float, ...]] = []
-        for p in sequence:
-            while len(hull) > 1 and not turns_left(hull[-2], hull[-1], p):
-                hull.pop()
-            hull.append(p)
-        return hull[:-1]
-
-    return np.array(chain(ordered) + chain(ordered[::-1]))
+    """Convex hull (M, 2) of points (N, 2), counter-clockwise from the one of least x."""
+    hull = np.asarray(points, dtype=np.float64)[ConvexHull(points).vertices]
+    return np.roll(hull, -np.lexsort((hull[:, 1], hull[:, 0]))[0], axis=0)
 
 
 def placed(shape: FloatArray, centre_map: FloatArray | tuple[float, float], yaw_rad: float) -> FloatArray:

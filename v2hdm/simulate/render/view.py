@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray, IntArray
 from v2hdm.simulate.render.textures import Float32
@@ -155,28 +156,13 @@ def _visible_parts(
     limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
     inside = points @ limits.T >= least
-    whole = np.logical_and.reduceat(inside, begins).all(axis=1)
-    hidden = np.asarray(~np.logical_or.reduceat(inside, begins).all(axis=1))
-    parts = [polygon[:0] if out else polygon for polygon, out in zip(polygons, hidden.tolist(), strict=True)]
-    for k in np.flatnonzero(~whole & ~hidden).tolist():
+    whole = np.all(np.logical_and.reduceat(inside, begins), axis=1).tolist()
+    near = np.all(np.logical_or.reduceat(inside, begins), axis=1).tolist()
+    parts = [polygon if one else polygon[:0] for polygon, one in zip(polygons, near, strict=True)]
+    for k in [k for k in range(len(parts)) if not whole[k]]:
         for line, level in zip(limits, least, strict=True):
-            parts[k] = _clip(parts[k], line, level)
+            parts[k] = clip_half(parts[k], parts[k] @ line - level)
     return parts
-
-
-def _clip(polygon: FloatArray, line: FloatArray, least: float) -> FloatArray:
-    """The part (M, 3) of a homogeneous polygon (N, 3) where ``line . p >= least`` (Sutherland-Hodgman)."""
-    inside = polygon @ line - least
-    if (inside >= 0).all():
-        return polygon
-    following, inside_next = following_row(polygon), following_row(inside)
-    out: list[FloatArray] = []
-    for p, q, a, b in zip(polygon, following, inside, inside_next, strict=True):
-        if a >= 0:
-            out.append(p)
-        if (a >= 0) != (b >= 0):
-            out.append(p + (q - p) * (a / (a - b)))
-    return np.array(out).reshape(-1, 3)
 
 
 def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:

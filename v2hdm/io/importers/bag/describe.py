@@ -1,7 +1,6 @@
 """A bag without a ``drive.yaml``: its description from its topics and frames, as far as they suffice.
 
-The mounting of the cameras comes from ``/tf_static``. Where something is missing, the error holds the
-description so far, to be completed and put beside the bag.
+The mounting of the cameras comes from ``/tf_static``.
 """
 
 from __future__ import annotations
@@ -11,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
-from v2hdm.io.calibration.mounting import roi_ahead
 from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
@@ -31,6 +29,12 @@ _IMAGE_WORDS = frozenset(
     {"image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "compressed",
      "camera", "cameras", "sensing", "sensors", "raw", "image_raw_compressed"}
 )  # fmt: skip
+LENS = "the lens, a file of ROS, Kalibr, OpenCV or COLMAP: front.yaml"
+MOUNTING = (
+    "where the camera sits, m forward, left, up of the ground under the rear axle; its roll, pitch (down) "
+    "and yaw (left) to some ten degrees: {xyz_m: [2.1, 0, 1.6], rpy_deg: [0, 12, 0]}"
+)
+LEVER_ARM = "m forward, left, up of the ground under the rear axle: [1.2, 0, 1.8]"
 _TURNED = 1e-6  # elements of a rotation that are closer to the identity's are so by rounding
 _DESCRIPTION = "drive.yaml"
 IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
@@ -39,16 +43,15 @@ IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
 def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
     """The content of a ``drive.yaml`` for the bag at ``path``, which names the bag relative to its folder.
 
-    Raises DriveError where the bag does not suffice, on one line with the description so far.
+    Raises DriveError where the bag does not suffice.
     """
     folder = entry_folder(cache, bag_files(path), "drive", ["bare"])
     if not is_whole(folder):
-        description = _Description(path, cache)
+        description = BagDescription(path, cache)
         if description.missing:
-            flow = yaml.safe_dump(description.content, sort_keys=False, default_flow_style=True, width=10**6)
             raise DriveError(
-                f"{path}: says no {', no '.join(description.missing)}; complete this and save it as "
-                f"drive.yaml in a folder beside the bag: {flow.strip()}"
+                f"{path}: says nothing of {', '.join(description.missing)}; "
+                f"v2hdm check {path.name} --write FOLDER asks for it and writes the drive.yaml"
             )
         with new_entry(folder) as partial:
             (partial / _DESCRIPTION).write_text(dump_yaml(description.content), encoding="utf-8")
@@ -63,16 +66,19 @@ def list_topics(path: Path, cache: Path) -> str:
     lines = [f"{topic.name:<{width}}  {topic.messages:>8}  {topic.kind}" for topic in topics]
     if not any(topic.kind in IMAGE_KINDS for topic in topics):
         return "\n".join([*lines, "", "# no topic of images: not a drive"])
-    found = _Description(path, cache)
-    said = f"; still to be said: {', '.join(found.missing)}" if found.missing else ""
+    found = BagDescription(path, cache)
+    said = f"; missing: {', '.join(found.missing)}" if found.missing else ""
     return "\n".join([*lines, "", f"# drive.yaml{said}", dump_yaml(found.content).rstrip()])
 
 
-class _Description:
-    """The ``content`` of a ``drive.yaml`` as far as it is known, and a list of what is ``missing``."""
+class BagDescription:
+    """The ``content`` of a ``drive.yaml`` as far as a bag tells it.
+
+    ``missing`` has the keys that stay "?", dotted, each with what it is asked for.
+    """
 
     def __init__(self, path: Path, cache: Path) -> None:
-        self._missing: list[str] = []
+        self.missing: dict[str, str] = {}
         with open_bag(path) as bag:
             images = _cameras(bag)
             infos = {name: _info_topic(bag, topic) for name, topic in images.items()}
@@ -94,24 +100,23 @@ class _Description:
         cameras = {name: self._camera(name, topic, infos[name]) for name, topic in images.items()}
         about: dict[str, Any] = {"name": path.stem, "bag": path.name}
         self.content = about | {"poses": poses, "cameras": cameras}
-        self.missing = list(dict.fromkeys(self._missing))
 
     def _poses(self, position: Topic | None, heading: Topic | None) -> dict[str, Any]:
         if position is None:
             world = next((name for name in _MAPS if name in self._frames.names), None)
             if world is not None and self._vehicle is not None:
                 return {"topic": TF_TOPIC, "frame": world, "vehicle": self._vehicle}
-            self._missing.append("one topic of poses")
+            self.missing["poses.topic"] = "the topic of poses, of the bag's several or none"
             return {"topic": "?"}
         entry: dict[str, Any] = {"topic": position.name}
         if position.kind == kinds.FIX:
             if heading is None:
-                self._missing.append("topic of headings")
+                self.missing["poses.heading_topic"] = "the topic of headings, such as /imu"
             entry["heading_topic"] = "?" if heading is None else heading.name
         sensor = self._frame_of.get(position.name, "")
         vehicle_from_sensor = self._vehicle_from(sensor)
         if vehicle_from_sensor is None:
-            self._missing.append(f"place of the poses' frame '{sensor}' on the vehicle (lever_arm_m)")
+            self.missing["poses.lever_arm_m"] = f"where '{sensor}' sits in the vehicle frame, {LEVER_ARM}"
             entry["lever_arm_m"] = "?"
             return entry
         entry["lever_arm_m"] = vehicle_from_sensor[:3, 3].tolist()
@@ -119,7 +124,9 @@ class _Description:
         if heading is not None:
             turned = self._vehicle_from(self._frame_of.get(heading.name, ""))
         if turned is None:
-            self._missing.append("turn of the heading's sensor on the vehicle (mounting_rpy_deg)")
+            self.missing["poses.mounting_rpy_deg"] = (
+                "roll, pitch and yaw of the heading's sensor, deg: [0, 0, 0]"
+            )
             entry["mounting_rpy_deg"] = "?"
         elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:
             entry["mounting_rpy_deg"] = np.degrees(euler_from_rotation(turned[:3, :3])).tolist()
@@ -129,16 +136,16 @@ class _Description:
         entry: dict[str, Any] = {"camera_info": {"topic": "?"}, "images": {"topic": topic.name}}
         vehicle_from_cam = None
         if info is None:
-            self._missing.append(f"camera_info of {topic.name}")
+            self.missing[f"cameras.{name}.camera_info"] = LENS
         else:
             entry["camera_info"] = {"topic": info.name}
             vehicle_from_cam = self._vehicle_from(self._frame_of[info.name])
         if vehicle_from_cam is None:
-            self._missing.append(f"mounting of camera '{name}' (cam_from_vehicle, roi_vehicle)")
-            return entry | {"cam_from_vehicle": "?", "roi_vehicle": "?"}
-        entry["cam_from_vehicle"] = inverse(vehicle_from_cam).tolist()
-        entry["roi_vehicle"] = roi_ahead(vehicle_from_cam).tolist()
-        return entry
+            self.missing[f"cameras.{name}.mounting"] = MOUNTING
+            return entry | {"mounting": "?"}
+        angles_deg = np.degrees(mounting_angles(inverse(vehicle_from_cam)))
+        xyz_m, rpy_deg = np.round(vehicle_from_cam[:3, 3], 6), np.round(angles_deg, 6)
+        return entry | {"mounting": {"xyz_m": xyz_m.tolist(), "rpy_deg": rpy_deg.tolist()}}
 
     def _vehicle_from(self, sensor: str) -> FloatArray | None:
         """``vehicle_from_sensor`` where fixed frames lead there."""

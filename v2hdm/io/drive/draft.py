@@ -1,0 +1,107 @@
+"""A recording's first ``drive.yaml``: what the recording tells, what its user adds, and what is missing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from v2hdm.errors import DriveError
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.folder import DRIVE_FILE
+from v2hdm.io.drive.images import ReadOptions
+from v2hdm.io.drive.sources import SUFFIXES
+from v2hdm.io.importers.bag.describe import LENS, MOUNTING, BagDescription
+from v2hdm.io.importers.bag.reading import is_bag
+from v2hdm.io.safe.texts import parse_yaml
+from v2hdm.store.files import dump_yaml, replace_text
+
+_POSES = (
+    "a log of poses, with the antenna's place, m forward, left, up of the ground under the rear axle: "
+    "{nmea: route.nmea, lever_arm_m: [1.2, 0, 1.8]}"
+)
+_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""Least times of this century, by their unit; smaller ones are s."""
+
+
+def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str, str]:
+    """Write the ``drive.yaml`` of a recording into ``folder``, or say what is missing.
+
+    ``source`` is a bag, a video or a folder of images; ``settings`` are ``KEY=VALUE`` with dotted keys and
+    values in YAML, in which names of files count from the working directory. What is missing is returned by
+    its key, with what to give; nothing is written then, nor where the drive cannot be read.
+
+    Raises:
+        DriveError: for a source of no kind, a setting that is none, a ``drive.yaml`` that exists.
+    """
+    where = folder / DRIVE_FILE
+    if where.exists():
+        raise DriveError(f"{where}: exists; edit it, or give --write another folder")
+    content, missing = _told(source, folder)
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not (key and equals):
+            raise DriveError(f"--set {setting}: give KEY=VALUE, such as cameras.front.camera_info=front.yaml")
+        value = parse_yaml(text, f"--set {key}", DriveError)
+        _put(content, key.split("."), _beside(value, folder) if not key.endswith("topic") else value)
+        for asked in [one for one in missing if f"{key}.".startswith(f"{one}.") or one.startswith(f"{key}.")]:
+            del missing[asked]
+    if missing:
+        return missing
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_text(where, dump_yaml(content))
+    try:
+        read_drive(folder)
+    except BaseException:
+        where.unlink()
+        raise
+    return {}
+
+
+def _told(source: Path, folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """The content of ``drive.yaml`` that the recording tells, and its missing keys with what to give."""
+    if is_bag(source):
+        bag = BagDescription(source, Path(ReadOptions().cache))
+        return bag.content | {"name": folder.resolve().name, "bag": _relative(source, folder)}, bag.missing
+    name = source.stem or "camera"
+    missing = {"poses": _POSES}
+    missing |= {f"cameras.{name}.camera_info": LENS, f"cameras.{name}.mounting": MOUNTING}
+    if source.is_dir():
+        images = {"folder": _relative(source, folder)}
+        stems = [path.stem for path in source.iterdir() if path.suffix.lower() in SUFFIXES]
+        if not stems:
+            raise DriveError(
+                f"{source}: neither a bag, nor a video, nor a folder of images; --write is for these"
+            )
+        try:
+            latest = max(map(float, stems))
+            images["unit"] = next((unit for least, unit in _UNITS if latest >= least), "s")
+        except ValueError:
+            missing[f"cameras.{name}.images.stamps"] = "a file with a time in s per image: times.txt"
+    else:
+        images = {"video": _relative(source, folder)}
+        missing[f"cameras.{name}.images.start_s"] = (
+            "the first frame's time on the poses' clock, s: 1715934630.25"
+        )
+    return {"name": folder.resolve().name, "cameras": {name: {"images": images}}}, missing
+
+
+def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:
+    for key in keys[:-1]:
+        if not isinstance(content.get(key), dict):
+            content[key] = {}
+        content = content[key]
+    content[keys[-1]] = value
+
+
+def _beside(value: object, folder: Path) -> object:
+    """``value`` with all names of files that exist relative to ``folder``."""
+    if isinstance(value, dict):
+        return {key: one if key.endswith("topic") else _beside(one, folder) for key, one in value.items()}
+    exists = isinstance(value, str) and len(value) < 4096 and Path(value).exists()
+    return _relative(Path(value), folder) if exists and isinstance(value, str) else value
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
