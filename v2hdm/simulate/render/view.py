@@ -156,10 +156,10 @@ def _visible_parts(
     limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
     inside = points @ limits.T >= least
-    whole = np.logical_and.reduceat(inside, begins).all(axis=1)
-    hidden = np.asarray(~np.logical_or.reduceat(inside, begins).all(axis=1))
-    parts = [polygon[:0] if out else polygon for polygon, out in zip(polygons, hidden.tolist(), strict=True)]
-    for k in np.flatnonzero(~whole & ~hidden).tolist():
+    whole = np.all(np.logical_and.reduceat(inside, begins), axis=1).tolist()
+    near = np.all(np.logical_or.reduceat(inside, begins), axis=1).tolist()
+    parts = [polygon if one else polygon[:0] for polygon, one in zip(polygons, near, strict=True)]
+    for k in [k for k in range(len(parts)) if not whole[k]]:
         for line, level in zip(limits, least, strict=True):
             parts[k] = clip_half(parts[k], parts[k] @ line - level)
     return parts
