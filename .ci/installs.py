@@ -37,7 +37,7 @@ PROMISES = {
     "docs/check.md": ("check",),
     "docs/living-map.md": ("localize",),
     "docs/report.md": ("report", "mosaic"),
-    "docs/bags.md": ("--list-topics", "check site"),
+    "docs/bags.md": ("check site",),
 }
 """Words by document: each line of a block with one of them is run."""
 
@@ -53,7 +53,7 @@ MORE = {
         "v2hdm experiment --cfg job",
         "v2hdm detect images --limit 1",
     ),
-    "map,ros": ("v2hdm detect site --limit 1",),
+    "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),
     "map,video": ("v2hdm check drives/film --no-ground --workers 1", "v2hdm detect drives/film --limit 1"),
 }
 """What no page has as a short command of its own, by extras."""
