@@ -54,7 +54,10 @@ MORE = {
         "v2hdm detect images --limit 1",
     ),
     "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),
-    "map,video": ("v2hdm check drives/film --no-ground --workers 1", "v2hdm detect drives/film --limit 1"),
+    "map,video": (
+        "v2hdm check drives/film --no-ground --workers 1 --output outputs/film-check",
+        "v2hdm detect drives/film --limit 1",
+    ),
 }
 """What no page has as a short command of its own, by extras."""
 
