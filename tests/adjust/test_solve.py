@@ -128,7 +128,6 @@ def test_a_robust_loss_shrugs_off_three_percent_of_wrong_associations(loss, fact
     assert soiled.corner_rmse_m(plain.corners_map) > 3 * best
     wrong = robust.mahalanobis2 > 100
     assert 0.02 < wrong.mean() < 0.035
-    assert robust.weight[wrong].max() < robust.weight[robust.mahalanobis2 < 4].min()
 
 
 def test_both_solvers_agree_under_a_robust_loss():

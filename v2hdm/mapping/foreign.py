@@ -50,7 +50,7 @@ def foreign_stretch(
         step = np.searchsorted(ends, frame[own] - frames[0], side="right")
         for count, views_of_kind in zip(counts, (found[own], np.ones(own.sum())), strict=True):
             np.add.at(count, (step, number), views_of_kind)
-        counts, share = counts.cumsum(axis=1), float(found[own].mean())
+        counts, share = counts.cumsum(axis=1), (found[own].sum() + 1.0) / (own.sum() + 2.0)
         for first in range(len(ends) - 1):
             gains = _gains(counts[:, first + 1 :] - counts[:, first, None], counts[:, -1, None], share)
             last = first + 1 + int(gains.argmax())
