@@ -242,4 +242,4 @@ def assert_mounted(got: Drive) -> None:
     for name, cam_from_vehicle in mountings().items():
         ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
         product = got.cameras[name].ipm["estimated"] @ ground
-        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-6)
+        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)
