@@ -249,7 +249,7 @@ class Drive:
     joined: tuple[Visit, ...] = ()
 
     def name_of(self, path: Path) -> str:
-        """What files of results call an image: its path below the drive's folder, else its whole path."""
+        """Name an image as files of results do: its path below the drive's folder, else its whole path."""
         path, root = path.absolute(), self.root.absolute()
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 

@@ -263,7 +263,7 @@ def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
     spoil = SPOILS[row.spoil]
     wrong = not row.rmse_m <= RIGHT_FACTOR * clean.rmse_m
     said, pattern = [_clause(finding) for finding in row.findings], spoil.cause
-    if spoil.hidden is not None and not said:
+    if row.route == "straight" and spoil.hidden is not None and not said:
         said, pattern = [_clause(finding) for finding in row.untold], spoil.hidden
     if pattern is None or not said:
         return wrong, bool(said), "-"

@@ -79,6 +79,6 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
 
 
 def _log_likelihood(counts: FloatArray, share: float) -> FloatArray:
-    """Of markings found in so many of their views, each by a share of its own (beta-binomial)."""
+    """The log likelihood of how often each marking was found in its views, by a beta-binomial."""
     a, b = _PSEUDO_VIEWS * share, _PSEUDO_VIEWS * (1 - share)
     return np.asarray(betaln(counts[0] + a, counts[1] - counts[0] + b) - betaln(a, b))

@@ -93,7 +93,7 @@ class _Target:
         return found
 
     def read_list(self) -> tuple[str, list[dict[str, str]]]:
-        """What has made the folder, and the entries of its list; nothing where there is no list."""
+        """Read the folder's maker and the entries of its list; nothing where there is no list."""
         if not (self.path / LIST).is_file():
             return "", []
         try:

@@ -23,7 +23,7 @@ class Spoil:
             to the colon, behind which the recovery is; None where the input is only unusual, and the map must
             be right.
         change: spoils a world.
-        hidden: pattern of the check that must say that a drive cannot tell, where it raises nothing.
+        hidden: pattern of the check that must say that a straight drive cannot tell.
     """
 
     name: str
