@@ -217,7 +217,7 @@ def run(
 
 
 def made_of(config: RunConfig) -> str:
-    """Name a run and its drives: only a run of the same name replaces its result; ``config`` is as the user gave it."""
+    """Name a run and its drives: only such a run replaces its result; ``config`` is the user's own."""
     if config.simulate is not None:
         return f"v2hdm map of the rendered {config.simulate.name}"
     given = config.drive.path if isinstance(config.drive.path, list) else [config.drive.path]
