@@ -43,14 +43,11 @@ from v2hdm.adjust.model import (
 from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
-from v2hdm.geometry.tensors import NEAR_M, exp, inverse
+from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray
 
 _STEP = 1e-3
-"""Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""
-
-_NUDGE = 1e-6
-"""Step of one-sided differences from the solution, in the unit of the fault."""
+"""Step of the priors' central differences, in the unit of the fault (s or rad): millimetres of motion."""
 
 _LEAST_OBSERVABLE = 1e-9
 """Share of a fault's own information, left by all else, below which rounding alone is left of it."""
@@ -248,15 +245,59 @@ class _Bench:
         first = self.whitened_px[0] / a
         return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
 
+    @cached_property
+    def poses(self) -> Tensor:
+        """``cam_from_map`` (K, 4, 4) of each observation."""
+        pairs = self.whitening.engine.poses(self.whitening.estimate).flatten(0, 1)
+        return pairs[self.arrays.pair.long()]
+
+    @cached_property
+    def points(self) -> Tensor:
+        """The observed corners (K, 3) in the cameras."""
+        corners = self.whitening.estimate.corners_map[self.arrays.corner.long()]
+        return points_in_camera(self.poses, corners)
+
+    def seen(self, moved_cam: Tensor) -> Tensor:
+        """Derivatives (2, K) of the weighted residuals by motions (K, 3) of the points in the cameras."""
+        depth = self.points[:, 2:].clamp(min=NEAR_M)
+        off = (moved_cam[:, :2] - self.points[:, :2] / depth * moved_cam[:, 2:]) / depth
+        return self.whiten(off.T)
+
+    def turned(self, tangents: Tensor) -> Tensor:
+        """Motions (K, 3) of the points in the cameras under left tangents (C, M, 6) of the pairs."""
+        tangent = tangents.flatten(0, 1)[self.arrays.pair.long()]
+        motion: Tensor = tangent[:, :3] + torch.linalg.cross(tangent[:, 3:], self.points)
+        return motion
+
     def efficient(self, column: Rows) -> Rows:
         """A fault's column less what is estimated in its place: z = J_p - J_y H^-1 J_y' J_p."""
-        engine, step = self.whitening.engine, _NUDGE * self._coupling(column)
-        at = self.whitening.linearised.evaluate(*self.whitening.step(step)).estimate
-        moved = _rows(engine.arrays, at, engine.residuals(engine.poses(at), at.corners_map) * self.root)
-        return {
-            name: column.get(name, torch.zeros_like(row)) - (row - self.residuals[name]) / _NUDGE
-            for name, row in moved.items()
-        }
+        estimated = self._along(self._coupling(column))
+        return {name: column.get(name, torch.zeros_like(row)) - row for name, row in estimated.items()}
+
+    @torch.no_grad()
+    def _along(self, whitened: Tensor) -> Rows:
+        """Derivatives of all residuals along a step of all that is estimated, whitened."""
+        base, arrays = self.whitening.estimate, self.arrays
+        step, tangents, own = self.whitening.step(whitened)
+        # Corners move with a step in proportion to it, so that of a whole step is their derivative.
+        at = self.whitening.linearised.evaluate(step, tangents, own).estimate
+        corners = at.corners_map - base.corners_map
+        along = (self.poses[:, :3, :2] @ corners[arrays.corner.long(), :, None])[..., 0]
+        high, low = (
+            _rows(
+                arrays,
+                Estimate(
+                    rigid(by * step.extrinsic) @ base.cam_from_vehicle,
+                    base.frame_state + by * step.frame_state,
+                    base.corners_map + by * corners,
+                    base.clock_s + by * step.clock_s,
+                ),
+            )
+            for by in (_STEP, -_STEP)
+        )
+        moved = {name: (row - low[name]) / (2 * _STEP) for name, row in high.items()}
+        moved["observations"] = self.seen(self.turned(tangents) + along)
+        return moved
 
     def _coupling(self, column: Rows) -> Tensor:
         """N_yp: what the column has in common with all that is estimated, whitened."""
@@ -532,20 +573,16 @@ def _principal(problem: Problem, camera: int, axis: int) -> Callable[[_Bench], R
 
 
 def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], Rows]:
-    """The column of a motion of the vehicle (C, J, 6) in its own frame, by central differences."""
+    """The column of a motion of the vehicle (C, J, 6) in its own frame."""
 
     def column(bench: _Bench) -> Rows:
-        engine, estimate = bench.whitening.engine, bench.whitening.estimate
-        extrinsic = estimate.cam_from_vehicle[:, None]
-        tangent = bench.arrays.at_moments(motion(bench.arrays), axis=1) * _STEP
-        poses = engine.poses(estimate)
-        high, low = (
-            engine.residuals(
-                extrinsic @ exp(-sign * tangent) @ inverse(extrinsic) @ poses, estimate.corners_map
-            )
-            for sign in (1.0, -1.0)
+        extrinsic = bench.whitening.estimate.cam_from_vehicle[:, None]
+        tangent = bench.arrays.at_moments(motion(bench.arrays), axis=1)
+        shift, turn = (
+            (extrinsic[..., :3, :3] @ one[..., None])[..., 0] for one in (tangent[..., :3], tangent[..., 3:])
         )
-        return {"observations": (high - low) / (2 * _STEP) * bench.root}
+        shift = shift + torch.linalg.cross(extrinsic[..., :3, 3].expand_as(turn), turn)
+        return {"observations": bench.seen(bench.turned(-torch.cat([shift, turn], dim=-1)))}
 
     return column
 
@@ -648,12 +685,7 @@ def _crown(axis: int) -> Callable[[_Bench], Rows]:
 
 def _raised(bench: _Bench, height: Tensor) -> Rows:
     """Corners that each observation (K,) sees so much higher, m, a unit of the value."""
-    arrays, estimate = bench.arrays, bench.whitening.estimate
-    poses = bench.whitening.engine.poses(estimate).flatten(0, 1)[arrays.pair.long()]
-    up, points = poses[:, :3, 2], points_in_camera(poses, estimate.corners_map[arrays.corner.long()])
-    depth = points[:, 2:].clamp(min=NEAR_M)
-    moved = height[:, None] * (up[:, :2] - points[:, :2] / depth * up[:, 2:]) / depth
-    return {"observations": bench.whiten(moved.T)}
+    return {"observations": bench.seen(height[:, None] * bench.poses[:, :3, 2])}
 
 
 def height_step(
