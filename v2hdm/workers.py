@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -21,6 +22,7 @@ from typing import Any, TypeVar
 
 from v2hdm.errors import WorkerError
 
+_TIDY_S = 30.0  # a worker without its parent may take this long to end, whatever it is in
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _Job = TypeVar("_Job")
@@ -88,10 +90,14 @@ def undisturbed_starts() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
-    # Ended by an exception, a process tidies away what is being written.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+def live_with_parent() -> None:
+    """Make this worker process end, tidily, on SIGTERM and when the one that started it dies."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an exception tidies away what is being written
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
+    live_with_parent()
     try:
         start(*arguments)
     except Exception as failure:
@@ -103,6 +109,8 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_TIDY_S)
+    os._exit(1)
 
 
 def _do(work: Callable[[_Job], _Result], job: _Job) -> _Result:
