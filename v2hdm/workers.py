@@ -6,6 +6,7 @@ it dies, which those of ``ProcessPoolExecutor`` do not do by themselves.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -15,12 +16,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from v2hdm.errors import WorkerError
+from v2hdm.progress import Progress
 
 _TIDY_S = 30.0  # a worker without its parent may take this long to end, whatever it is in
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -57,16 +60,100 @@ def share_out(
     except BrokenProcessPool:
         pool.shutdown()
         ends = [one.exitcode for one in ours if one.exitcode not in (0, -signal.SIGTERM)]
-        raise WorkerError(
-            f"a worker process died (exit code {ends[0] if ends else 'unknown'}), perhaps for want of "
-            "memory; set fewer workers="
-        ) from None
+        raise _died("a worker process died", ends[0] if ends else None) from None
     except BaseException:
         for one in ours:
             one.terminate()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def side_by_side(
+    work: Callable[[_Job, Progress], _Result],
+    jobs: Sequence[_Job],
+    processes: int,
+    progress: Callable[[_Job, str, int, int], None],
+) -> Iterator[tuple[int, _Result | WorkerError]]:
+    """Do long jobs in several processes; yields each job's number and result as it is done.
+
+    ``work`` reports its steps to the progress that it is given, and ``progress`` is called with them here. A
+    job whose process dies is begun once more, and a WorkerError is its result where that dies, too. An
+    exception of ``work`` is raised here. Messages go through a pipe per process: one that is killed takes no
+    other's with it, and there is no socket that anybody else could reach.
+    """
+    left, died = list(range(len(jobs)))[::-1], set[int]()
+    others = set(multiprocessing.active_children())
+    idle: list[_Worker] = []
+    doing: dict[object, tuple[_Worker, int]] = {}
+    try:
+        while left or doing:
+            while left and len(doing) < max(1, processes):
+                worker = idle.pop() if idle else _Worker(work)
+                worker.pipe.send(jobs[left[-1]])
+                doing[worker.pipe] = worker, left.pop()
+            for pipe in wait([worker.pipe for worker, _ in doing.values()]):
+                worker, number = doing[pipe]
+                try:
+                    kind, *message = worker.pipe.recv()
+                except (EOFError, OSError):
+                    del doing[pipe]
+                    worker.process.join()
+                    if number in died:
+                        yield number, _died("its process died twice", worker.process.exitcode)
+                    else:
+                        died.add(number)
+                        left.append(number)
+                    continue
+                if kind == "progress":
+                    progress(jobs[number], *message)
+                    continue
+                idle.append(doing.pop(pipe)[0])
+                if kind == "failed":
+                    raise message[0]
+                yield number, message[0]
+    finally:
+        ours = [one for one in multiprocessing.active_children() if one not in others]
+        for process in ours:
+            process.terminate()
+        for process in ours:
+            process.join()
+
+
+class _Worker:
+    """A process that does jobs of :func:`side_by_side`; it ends with the other end of its ``pipe``."""
+
+    def __init__(self, work: Callable[[Any, Progress], Any]) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self.pipe, theirs = spawn.Pipe()
+        self.process = spawn.Process(target=_serve, args=(work, theirs))
+        with undisturbed_starts():
+            self.process.start()
+        theirs.close()
+
+
+def _serve(work: Callable[[Any, Progress], Any], pipe: Connection) -> None:
+    live_with_parent()
+    logging.getLogger("v2hdm").addHandler(logging.NullHandler())  # warnings are the results' to state
+
+    def progress(task: str, done: int, total: int) -> None:
+        pipe.send(("progress", task, done, total))
+
+    with suppress(EOFError, OSError):
+        while True:
+            job = pipe.recv()
+            try:
+                outcome = "done", work(job, progress)
+            except Exception as failure:
+                outcome = "failed", failure
+            pipe.send(outcome)
+
+
+def _died(what: str, code: int | None) -> WorkerError:
+    shown = "unknown" if code is None else code
+    return WorkerError(
+        f"{what} (exit code {shown}), perhaps for want of memory; set fewer workers= (--workers)"
+    )
 
 
 @contextmanager

@@ -44,22 +44,13 @@ def cam_from_vehicle(mount: MountConfig) -> FloatArray:
     return make_transform(turned, -turned @ (mount.x_m, mount.y_m, mount.z_m))
 
 
-@dataclass(frozen=True)
-class ManualCalibration:
-    """The data of a manual calibration, and its result."""
-
-    surveyed_vehicle: FloatArray  # (N, 2) m, the points on the ground as they were measured
-    clicked_px: FloatArray  # (N, 2), the same points as they were clicked in the recorded image
-    ipm: FloatArray  # vehicle_from_pinhole_px (3 x 3)
-    roi_vehicle: FloatArray  # (M, 2) m, its region: the convex hull of the surveyed points
-
-
 def calibrate(
     info: CameraInfo, mount: MountConfig, config: CalibrationConfig, rng: np.random.Generator
-) -> ManualCalibration:
+) -> tuple[FloatArray, FloatArray]:
     """Calibrate a camera by hand: survey points on the ground, click them in the image, solve.
 
-    Raises ConfigError when a point lies outside the image, or the points do not determine a homography.
+    Returns ``vehicle_from_pinhole_px`` (3, 3) and its region (M, 2), the hull of the points, m. Raises
+    ConfigError when a point lies outside the image, or the points do not determine a homography.
     """
     yaw = np.deg2rad(mount.yaw_deg)
     ahead, left = np.array(config.points_ahead_m, dtype=np.float64).T
@@ -80,7 +71,7 @@ def calibrate(
         raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
     ipm = np.linalg.inv(pinhole_from_vehicle)
     unit_ipm = np.asarray(ipm / np.linalg.norm(ipm))
-    return ManualCalibration(surveyed, clicked_px, unit_ipm, convex_hull(surveyed))
+    return unit_ipm, convex_hull(surveyed)
 
 
 _IPMS = ("calibrated", "estimated")
@@ -160,22 +151,21 @@ def _visit_seed(config: PortConfig, part: int) -> list[int]:
     return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
 
 
-def surveyed_cameras(config: PortConfig) -> dict[str, tuple[Camera, ManualCalibration]]:
-    """The cameras of a port as the mapper gets to know them, and the manual calibration of each.
+def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
+    """The cameras of a port as the mapper gets to know them: two IPMs, a region and a surveyed centre.
 
-    Of a camera it knows two IPMs, a region and a surveyed centre. Raises ConfigError when the points of the
-    calibration cannot be used.
+    Raises ConfigError when the points of the manual calibration cannot be used.
     """
     rng = np.random.default_rng([config.seed, _CALIBRATION])
     sigma, surveyed = np.full(3, config.calibration.centre_sigma_m), {}
     for name, camera in sorted(config.cameras.items()):
         info, mount = camera_info(name, camera), camera.mount
-        own = calibrate(info, mount, config.calibration, rng)
-        borrowed = calibrate(info, camera.borrowed_mount, config.calibration, rng)
+        own, own_roi = calibrate(info, mount, config.calibration, rng)
+        borrowed, borrowed_roi = calibrate(info, camera.borrowed_mount, config.calibration, rng)
         prior = CentrePrior(np.array([mount.x_m, mount.y_m, mount.z_m]) + rng.normal(0.0, sigma), sigma)
-        roi_vehicle = (own if config.initial_ipm == "calibrated" else borrowed).roi_vehicle
-        ipm = {"calibrated": own.ipm, "estimated": borrowed.ipm}
-        surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior), own
+        roi_vehicle = own_roi if config.initial_ipm == "calibrated" else borrowed_roi
+        ipm = {"calibrated": own, "estimated": borrowed}
+        surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior)
     return surveyed
 
 
@@ -194,7 +184,7 @@ def build_port(config: PortConfig) -> Port:
     layout = build_layout(config.paint, route, streams[_LAYOUT])
     layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
-    cameras = {name: camera for name, (camera, _) in surveyed_cameras(config).items()}
+    cameras = _surveyed_cameras(config)
     scene, classes = replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,
