@@ -17,7 +17,7 @@ from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre, make_transform, rotation_from_euler
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
-from v2hdm.simulate.port.paint import Alteration, alter, build_layout
+from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_route, drive_along
 from v2hdm.simulate.port.yard import MovingTruck, build_scene, moving_trucks
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
@@ -78,7 +78,7 @@ _IPMS = ("calibrated", "estimated")
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
-_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES, _ALTERED = range(7)
+_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES = range(6)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,6 @@ class Port:
     cameras: dict[str, Camera]
     cam_from_vehicle: dict[str, FloatArray]
     driven: DrivenPoses
-    alterations: tuple[Alteration, ...] = ()
 
     def cam_from_map(self, camera: str, frame: int) -> FloatArray:
         """Where a camera (4 x 4) truly was at an image."""
@@ -175,14 +174,13 @@ def build_port(config: PortConfig) -> Port:
     Raises ConfigError when values are out of range or contradict each other.
     """
     _check(config)
-    streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD, _ALTERED)}
+    streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD)}
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
         problem = f"{route.length_m:g} m in all; give {_SHORTEST_ROUTE_M:g} m or more"
         raise ConfigError(f"port '{config.name}', route.pieces: {problem}")
     layout = build_layout(config.paint, route, streams[_LAYOUT])
-    layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
     cameras = _surveyed_cameras(config)
     scene, classes = replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
@@ -195,19 +193,16 @@ def build_port(config: PortConfig) -> Port:
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
         driven=drive_along(route, config.route, config.disturbance, anew[_POSES]),
-        alterations=tuple(alterations),
     )
 
 
 def _check(config: PortConfig) -> None:
     """Refuse what would fail far from its cause."""
-    altered, route, pieces = config.altered, config.route, config.route.pieces
+    route, pieces = config.route, config.route.pieces
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),
         (config.initial_ipm in _IPMS, "initial_ipm: choose 'calibrated' or 'estimated'"),
         (config.visit >= 0, "visit: must be 0 or more"),
-        (min(altered.moved, altered.removed, altered.added) >= 0, "altered: numbers must be 0 or more"),
-        (len(altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
         (pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
         (all(len(p) == 2 and p[0] > 0 for p in pieces), "route.pieces: each is [length_m > 0, turn_deg]"),
         (route.speed_mps > 0, "route.speed_mps: must be positive"),
