@@ -41,14 +41,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Matched:
-    """Markings of a map with a true counterpart: ``true`` (M,) indexes it, ``mapped`` (M,) the map.
+    """Markings of a map with a true counterpart, which ``true`` (M,) indexes, in the order of the route.
 
-    ``errors_m`` (M, 4, 2) are the error vectors of their corners, in the order in which the vehicle passed
-    them.
+    ``errors_m`` (M, 4, 2) are the error vectors of their corners.
     """
 
     true: IntArray
-    mapped: IntArray
     errors_m: FloatArray
 
 
@@ -112,7 +110,7 @@ def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matc
     order = np.argsort(passed[other], kind="stable")
     mapped, other = mapped[order], other[order]
     errors = corner_errors([hd_map.markings[m] for m in mapped], [true[t] for t in other])
-    return Matched(other, mapped, errors.reshape(-1, 4, 2))
+    return Matched(other, errors.reshape(-1, 4, 2))
 
 
 def _row(
