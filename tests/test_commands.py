@@ -47,7 +47,7 @@ NEEDED = {
     "v2hdm calibrate points points.csv --intrinsics a.yaml": ("map", "torch", "kornia"),
     "v2hdm mosaic outputs/port2": ("map", "torch", "kornia"),
     "v2hdm report results": ("map", "cv2", "jinja2"),
-    "v2hdm fleet drive.yaml": ("fleet", "ray", "ray"),
+    "v2hdm fleet drive.yaml": ("map", "omegaconf", "omegaconf"),
     "v2hdm detect images": ("", "cv2", ""),
     "v2hdm export map.geojson --format csv": ("", "cv2", ""),
     "train": ("train", "torch", "tensorboard"),

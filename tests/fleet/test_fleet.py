@@ -2,205 +2,116 @@
 
 import csv
 import json
+import multiprocessing
 import os
 import re
 import signal
-import threading
-from contextlib import contextmanager
+import subprocess
+import sys
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.fleet.run_files import written
-
-pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
-
-from v2hdm.detection import network
-from v2hdm.detection.batch import detect_all, with_own_vehicle
-from v2hdm.detection.detector import Detector
-from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import ConfigError, DriveError, WorkerError
-from v2hdm.fleet.cluster import DETECTORS_A_GPU, Shares
+from v2hdm.cli.main import run as command
+from v2hdm.errors import ConfigError
 from v2hdm.fleet.plan import Row, exit_code, plan, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.workers import DetectorActor, ProgressActor, detect_by, map_drive, open_detectors
 from v2hdm.io.drive import read_drive
-from v2hdm.pipeline.config import RunConfig
-from v2hdm.pipeline.run import run
-from v2hdm.records import ImageDetections
+from v2hdm.pipeline.run import run, take_or_run
+
+ROOT = Path(__file__).parents[2]
 
 
-def detectors_of(ray, count, **options):
-    return [
-        ray.remote(DetectorActor).options(num_cpus=0.1, **options).remote(str(Path.cwd()))
-        for _ in range(count)
-    ]
+def written(folder, name, drive):
+    """The run file of one drive, which may be too short for a map of centimetres."""
+    path = folder / f"{name}.yaml"
+    path.write_text(f"# @package _global_\nname: {name}\naccuracy_goal_cm: 100\ndrive:\n  path: {drive}\n")
+    return path
 
 
-def found_by(detectors, drive, **settings):
-    options, found = DetectorOptions(**settings), []
-    whole = with_own_vehicle(read_drive(drive), Detector.load(options=options))
-    detect_by(detectors, whole, options, range(len(whole.images)), 1, found.append)
-    return repr(found)
-
-
-def test_actors_find_what_processes_find_also_when_one_is_killed(ray, drive, monkeypatch):
-    monkeypatch.setattr("v2hdm.fleet.workers.IMAGES_A_BATCH", 2)
-    detectors = detectors_of(ray, 2, max_restarts=-1, max_task_retries=3)
-    killed = ray.get(detectors[0].process.remote())
-    expected = repr(detect_all(read_drive(drive), DetectorOptions()))
-    threading.Timer(0.3, os.kill, (killed, signal.SIGKILL)).start()
-    assert found_by(detectors, drive) == expected
-    assert ray.get(detectors[0].process.remote()) != killed
-    for one in detectors:
-        ray.kill(one)
-
-
-def test_what_is_wrong_with_an_image_is_told_as_by_the_mapping_door(ray, drive):
-    whole = read_drive(drive)
-    detectors = detectors_of(ray, 1)
-    image = whole.images[2].path
-    content = image.read_bytes()
-    try:
-        image.write_bytes(content[: len(content) // 2])
-        with pytest.raises(DriveError, match=image.name):
-            detect_by(detectors, whole, DetectorOptions(), range(len(whole.images)), 1, print)
-    finally:
-        image.write_bytes(content)
-        ray.kill(detectors[0])
-
-
-def test_an_actor_that_dies_again_and_again_is_told(ray, drive):
-    class Blind(DetectorActor):
-        def detect(self, *_):
-            os.kill(os.getpid(), signal.SIGKILL)
-            return []
-
-    detectors = [ray.remote(Blind).options(num_cpus=0.1).remote(str(Path.cwd()))]
-    with pytest.raises(WorkerError, match="died again and again"):
-        found_by(detectors, drive)
-
-
-def test_actors_share_a_gpu(ray, drive, monkeypatch):
-    class OnGpu(DetectorActor):
-        def __init__(self, folder):
-            # There is no GPU here: what is asked for there is done on the CPU.
-            network._PROVIDERS["cuda"] = network._PROVIDERS["cpu"]
-            super().__init__(folder)
-
-        def gpus(self):
-            ids: list[Any] = ray.get_gpu_ids()
-            return ids
-
-    monkeypatch.setattr("v2hdm.fleet.workers.DetectorActor", OnGpu)
-    cuda = RunConfig(detector=DetectorOptions(device="cuda"))
-    shares = Shares.of([cuda])
-    detectors = open_detectors({"cuda"}, 2, 1, shares.detector, str(Path.cwd()), 0)["cuda"]
-    assert [ray.get(one.gpus.remote()) for one in detectors] == [[0], [0]]
-    assert ray.available_resources()["GPU"] == 1 - 2 * shares.detector
-    whole = with_own_vehicle(read_drive(drive), Detector.load())
-    found: list[ImageDetections] = []
-    detect_by(detectors, whole, cuda.detector, range(3), 1, found.append)
-    assert repr(found) == repr(detect_all(read_drive(drive), DetectorOptions())[:3])
-    for one in detectors:
-        ray.kill(one)
-
-
-def test_all_that_shares_a_gpu_fits_on_it():
-    detects = RunConfig(detector=DetectorOptions(device="cuda"))
-    maps = RunConfig(device="cuda")
-    assert Shares.of([detects, RunConfig()]).detector * DETECTORS_A_GPU == 1
-    assert Shares.of([maps, RunConfig()]).mapping == 1
-    both = Shares.of([detects, maps])
-    assert both.detector * DETECTORS_A_GPU + both.mapping == 1
-
-
-def test_a_drive_that_wants_a_gpu_where_there_is_none_is_a_row(ray, drive, tmp_path, monkeypatch):
-    class WithoutGpus:
-        def __getattr__(self, name):
-            return (lambda: {"CPU": 1.0}) if name == "cluster_resources" else getattr(ray, name)
-
-    @contextmanager
-    def here(address, workers):
-        yield WithoutGpus()
-
-    monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
-    for setting in ("device=cuda", "detector.device=cuda"):
-        files, options = [written(tmp_path, "good", drive)], FleetOptions(tmp_path / "table")
-        (row,) = run_fleet(files, [setting], options, lambda *_: None)
-        assert (row.status, "none of Ray's machines has a GPU" in row.says) == ("ERROR", True)
+@pytest.fixture(scope="session")
+def alone(drive, tmp_path_factory):
+    """The result of the drive by the mapping door, in one process, of one thread as a fleet's are."""
+    folder = tmp_path_factory.mktemp("alone")
+    settings = [f"output={folder / 'out'}", f"cache={folder / 'cache'}", "workers=1"]
+    (job,) = plan([written(folder, "good", drive)], settings).jobs
+    return run(job.config, job.config_yaml).folder
 
 
 @pytest.mark.slow
-def test_a_drive_and_results_at_an_object_store_make_the_same_map(ray, s3, drive, tmp_path):
+def test_a_drive_and_results_at_an_object_store_make_the_same_map(s3, drive, alone, tmp_path):
     for path in drive.rglob("*"):
         if path.is_file():
             s3.upload_file(str(path), "bucket", f"drives/tiny/{path.relative_to(drive).as_posix()}")
-    settings = ["output=s3://bucket/results", f"cache={tmp_path / 'cache'}"]
+    settings = ["output=s3://bucket/results", f"cache={tmp_path / 'cache'}", "workers=1"]
     (job,) = plan([written(tmp_path, "good", "s3://bucket/drives/tiny")], settings).jobs
     assert job.place == "s3://bucket/results/good"
-    detectors, progress = detectors_of(ray, 1), ray.remote(ProgressActor).options(num_cpus=0).remote()
     for kept in (False, True):
-        row, trace = map_drive(job, detectors, progress, str(Path.cwd()))
-        assert (row.status, row.kept, row.folder) == ("PASS", kept, job.place), (row, trace)
-    ray.kill(detectors[0])
-
-    # Another drive's folder of the same content: what was detected is in the cache.
-    settings = [f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
-    (job,) = plan([written(tmp_path, "good", drive)], settings).jobs
-    row, trace = map_drive(job, [], progress, str(Path.cwd()))
-    assert row.status == "PASS", (row, trace)
+        result, taken = take_or_run(job.config, job.config_yaml, lambda *_: None)
+        assert (result.place, taken) == (job.place, kept)
     for name in ("map.geojson", "calibration_front.yaml"):
         there = s3.get_object(Bucket="bucket", Key=f"results/good/{name}")["Body"].read()
-        assert there == (tmp_path / "out" / "good" / name).read_bytes()
+        assert there == (alone / name).read_bytes()
 
 
 @pytest.mark.slow
-def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_what_fails(
-    ray, drive, tmp_path, monkeypatch
+def test_a_fleet_outlives_its_processes_keeps_what_is_finished_and_goes_on_past_what_fails(
+    drive, alone, tmp_path
 ):
-    @contextmanager
-    def here(address, workers):
-        yield ray
-
-    def dies_once(*arguments):
-        if not (tmp_path / "died").exists():
-            (tmp_path / "died").touch()
-            threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGKILL)).start()
-        return map_drive(*arguments)
-
-    monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
-    monkeypatch.setattr("v2hdm.fleet.workers.map_drive", dies_once)
     good, nowhere = written(tmp_path, "good", drive), written(tmp_path, "nowhere", tmp_path / "absent")
-    typo = written(tmp_path, "typo", drive)
+    doomed, typo = written(tmp_path, "doomed", drive), written(tmp_path, "typo", drive)
     typo.write_text(typo.read_text() + "mapping: {max_rang_m: 3}\n")
     overrides = [f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
     told: list[tuple[str, str, int, int]] = []
+    killed: list[str] = []
+
+    def kills(*message):
+        told.append(message)
+        if message[1] in ("check", "detect") and (message[0] == "doomed" or "good" not in killed):
+            killed.append(message[0])
+            (process,) = multiprocessing.active_children()
+            os.kill(process.pid, signal.SIGKILL)
 
     def fleet(*files):
-        options = FleetOptions(tmp_path / "table")
-        return run_fleet(files, overrides, options, lambda *message: told.append(message))
+        return run_fleet(files, overrides, FleetOptions(tmp_path / "table", workers=1), kills)
 
-    rows = fleet(good, nowhere, typo)
-    assert (tmp_path / "died").exists()
+    rows = fleet(good, nowhere, doomed, typo)
+    assert set(killed) == {"good", "doomed"}
     images = len(read_drive(drive).images)
-    assert [row.status for row in rows] == ["PASS", "ERROR", "ERROR"]
+    assert [row.status for row in rows] == ["PASS", "ERROR", "ERROR", "ERROR"], rows
     assert (rows[0].images, rows[0].kept) == (images, False)
     assert "no such drive folder" in rows[1].says
-    assert re.search("did you mean .*mapping.max_range_m", rows[2].says)
+    assert "died twice over the same work (exit code -9)" in rows[2].says
+    assert re.search("did you mean .*mapping.max_range_m", rows[3].says)
     assert ("good", "detect", images, images) in told
     table = list(csv.DictReader(StringIO((tmp_path / "table" / "fleet.csv").read_text())))
-    assert [row["drive"] for row in table] == ["good", "nowhere", "typo"]
+    assert [row["drive"] for row in table] == ["good", "nowhere", "doomed", "typo"]
     assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
-    (job,) = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"]).jobs
-    alone = run(job.config, job.config_yaml).folder
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name[0] != "."] == ["good"]
     for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory.tum"):
         assert (tmp_path / "out" / "good" / name).read_bytes() == (alone / name).read_bytes(), name
-
     assert fleet(good)[0].kept
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_a_fleet_that_is_ended_takes_its_processes_with_it(end, drive, tmp_path):
+    file = written(tmp_path, "good", drive)
+    arguments = [str(file), f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}", "--workers", "1"]
+    begun = subprocess.Popen(
+        [sys.executable, "-m", "v2hdm", "fleet", *arguments, "--table", str(tmp_path / "table")],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert begun.stdout.readline().startswith("good: check")  # a process is at work
+    os.kill(begun.pid, end)
+    _, errors = begun.communicate(timeout=60)  # returns when the last process has closed its end
+    assert (begun.returncode, errors[:18]) in [(2, "error: interrupted"), (-9, "")]
+    assert errors.count("\n") == (end == signal.SIGTERM)
+    assert not list((tmp_path / "out").glob("*"))
 
 
 def test_two_run_files_never_write_one_folder(tmp_path, drive):
@@ -209,6 +120,22 @@ def test_two_run_files_never_write_one_folder(tmp_path, drive):
     planned = plan(files, [])
     assert [job.name for job in planned.jobs] == ["one"]
     assert "name one otherwise" in planned.refused[0].says
+
+
+def test_shares_are_all_drives_together_and_never_two_of_one_folder(tmp_path, drive):
+    files = [written(tmp_path, name, drive) for name in ("a", "b", "c", "d", "e")]
+    shares = [plan(files, [], (k, 2)) for k in (1, 2)]
+    assert [[job.name for job in one.jobs] for one in shares] == [["a", "c", "e"], ["b", "d"]]
+    assert shares[1].sources == [str(files[1]), str(files[3])]
+    files[3].write_text(files[0].read_text())
+    assert "name one otherwise" in plan(files, [], (2, 2)).refused[0].says
+    assert not plan(files, [], (1, 2)).refused
+
+
+@pytest.mark.parametrize("given", ["0/4", "5/4", "1/0", "2", "1/4 --site port"])
+def test_a_share_that_cannot_be_is_one_line(given, capsys):
+    assert command(["fleet", "a.yaml", "--share", *given.split()]) == 2
+    assert re.fullmatch("error: .*--share.*\n", capsys.readouterr().err)
 
 
 def test_the_drives_of_run_files_become_one_site(tmp_path):

@@ -1,6 +1,5 @@
-"""The four methods on a made-up yard: all at once, marking by marking, by an executor, through kornia."""
+"""The four methods on a made-up yard: all at once, marking by marking, through kornia."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +10,8 @@ from tests.mapping.scene import MATCH_M, SceneOptions, make_scene, match, rotati
 from v2hdm.association.ground import locate
 from v2hdm.association.sightings import collect_sightings
 from v2hdm.errors import ConfigError, MappingError
-from v2hdm.executor import InProcess
 from v2hdm.geometry import ipm, tensors
 from v2hdm.geometry.ipm import extrinsic_from_ipm
-from v2hdm.io.drive import join_drives
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import initial_rig
 from v2hdm.mapping.options import MappingOptions
@@ -218,34 +215,6 @@ def test_how_large_the_map_is_is_told_as_it_grows():
     assert len(growing) >= 2
     assert growing == sorted(growing)
     assert growing[0] >= 12
-
-
-class ByPost(InProcess):
-    """An executor to which all work is posted, as to another process; notes what it was."""
-
-    def __init__(self):
-        self.begun: list[str] = []
-
-    def begin(self, work):
-        self.begun.append(getattr(work, "func", work).__name__)
-        result = pickle.dumps(pickle.loads(pickle.dumps(work))())
-        return lambda: pickle.loads(result)
-
-
-def test_an_executor_links_each_visit_by_itself_and_the_map_is_the_same_to_the_last_bit(tmp_path):
-    options = SceneOptions(length_m=50.0, cameras=("front",), seed=21)
-    scenes = [make_scene(options), make_scene(replace(options, seed=22))]
-    drives = [replace(one.drive, name=str(n), root=tmp_path / str(n)) for n, one in enumerate(scenes)]
-    count = len(drives[0].images)
-    seen = [*scenes[0].detections, *(replace(d, image=d.image + count) for d in scenes[1].detections)]
-    given = join_drives(drives), seen, ("front",), MappingOptions(pose_model="heave")
-    executor = ByPost()
-    methods, together = run_methods(*given, executor=executor), run_methods(*given)
-    assert executor.begun.count("_link") >= 2 * 2
-    for name, one in methods.items():
-        assert repr(one.hd_map) == repr(together[name].hd_map), name
-    theirs, ours = ([one.corners_map for one in m["Opt"].hd_map.markings] for m in (together, methods))
-    np.testing.assert_array_equal(ours, theirs)
 
 
 CAMERAS = ("front", "rear")

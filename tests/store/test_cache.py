@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from hypothesis.extra import numpy as npst
 
 from tests.drive.example import make_map
 from v2hdm.cli.main import run
-from v2hdm.errors import DriveError
 from v2hdm.ground import GroundStatus, Reading
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
@@ -125,33 +123,6 @@ def test_a_use_is_an_entrys_time_of_change(tmp_path):
     os.utime(cache.path("stage", KEY), (1, 1))
     made(cache, [2])
     assert cache.path("stage", KEY).stat().st_mtime > 1
-
-
-def test_of_several_results_the_missing_ones_are_begun_before_one_is_waited_for(tmp_path):
-    cache, order = StageCache(tmp_path), list[str]()
-    made(cache, [7])
-
-    def begin(value):
-        def wait():
-            order.append(f"wait {value}")
-            if value < 0:
-                raise DriveError("unreadable")
-            return [value]
-
-        order.append(f"begin {value}")
-        return wait
-
-    jobs = [(key, partial(begin, value)) for key, value in (("a", 1), (KEY, 2), ("b", 3))]
-    found = cache.get_or_make_each("stage", list[int], jobs)
-    assert next(found) == [1]
-    assert order == ["begin 1", "begin 3", "wait 1"]
-    assert cache.get("stage", "a", list[int]) == [1]
-    assert list(found) == [[7], [3]]
-    with pytest.raises(DriveError, match="unreadable"):
-        list(
-            cache.get_or_make_each("stage", list[int], [("c", partial(begin, 4)), ("d", partial(begin, -1))])
-        )
-    assert cache.get("stage", "c", list[int]) == [4]
 
 
 def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_needs(tmp_path):

@@ -8,7 +8,6 @@ grows with the motion between the images, and only later compared across gaps, l
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -17,7 +16,6 @@ from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Sightings
-from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -62,21 +60,16 @@ def build_tracks(
     rig: Rig,
     uncertainty: Uncertainty,
     options: AssociationOptions,
-    executor: Executor = IN_PROCESS,
 ) -> Association:
     """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
 
     A sighting continues at most one track and a track takes at most one sighting of an image. A
     sighting that continues none starts its own. Sightings with fewer than two valid corners on the
-    ground belong to no track. No track outlives its visit: each visit is linked by itself, by ``executor``.
+    ground belong to no track. No track outlives its visit: each visit is linked by itself.
     """
     visit = sightings.visit[sightings.frame]
     rows = [np.flatnonzero(visit == own) for own in np.unique(visit)]
-    begun = [
-        executor.begin(partial(_link, *_of_visit(sightings, located, rig, own), uncertainty, options))
-        for own in rows
-    ]
-    linked = [wait() for wait in begun]
+    linked = [_link(*_of_visit(sightings, located, rig, own), uncertainty, options) for own in rows]
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
     # Tracks are numbered camera by camera, and of each visit by visit.

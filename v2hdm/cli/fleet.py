@@ -1,4 +1,4 @@
-"""``v2hdm fleet drives/*.yaml``: many drives on the cores of this machine or of a cluster, by Ray.
+"""``v2hdm fleet drives/*.yaml``: many drives on the cores of this machine, or a share of them.
 
 A drive whose result is finished and was made of the same is not done again; one that fails is a row of the
 table that says why, and the others go on. With --site all drives are mapped together (docs/fleet.md).
@@ -6,6 +6,7 @@ table that says why, and the others go on. With --site all drives are mapped tog
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,9 +20,6 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
     parser.add_argument("--workers", type=int, default=0, help="cores of this machine; 0 (default): all")
     parser.add_argument(
-        "--address", default="local", help="of a running Ray cluster, or auto (default: a new one)"
-    )
-    parser.add_argument(
         "--table",
         type=Path,
         default=Path("outputs/fleet"),
@@ -29,10 +27,11 @@ def run(arguments: Sequence[str]) -> int:
         help="takes the table of verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
     )
     parser.add_argument("--site", metavar="NAME", help="map all drives together, as one site of that name")
+    parser.add_argument(
+        "--share", metavar="K/N", help="map every N-th drive, from the K-th on; its table is FOLDER-K-of-N"
+    )
     parser.add_argument("--again", action="store_true", help="do what is finished again")
     parsed = parser.parse_intermixed_args(arguments)
-    import ray  # noqa: F401  # its absence is reported before that of what is built on it
-
     from v2hdm.fleet.plan import exit_code
     from v2hdm.fleet.run import FleetOptions, fleet_on_terminal
     from v2hdm.settings import check_workers
@@ -45,5 +44,19 @@ def run(arguments: Sequence[str]) -> int:
         raise ConfigError("no drive is named: give run files, as in v2hdm fleet drives/*.yaml")
     if any(is_url(one) for one in parsed.drives if one not in overrides):
         raise ConfigError("run files lie on this machine; their drive.path may be a URL (docs/fleet.md)")
-    options = FleetOptions(parsed.table, parsed.workers, parsed.address, parsed.again, parsed.site)
+    table, share = parsed.table, (1, 1)
+    if parsed.share is not None:
+        share = _share(parsed.share)
+        table = table.with_name(f"{table.name}-{share[0]}-of-{share[1]}")
+        if parsed.site is not None:
+            raise ConfigError("a site is mapped as a whole: leave out --share or --site")
+    options = FleetOptions(table, parsed.workers, parsed.again, parsed.site, share)
     return exit_code(fleet_on_terminal(files, overrides, options))
+
+
+def _share(given: str) -> tuple[int, int]:
+    numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", given, re.ASCII)
+    k, n = (int(one) for one in numbers.groups()) if numbers else (0, 0)
+    if not 1 <= k <= n:
+        raise ConfigError(f"--share {given}: say which share of how many, from 1/4 to 4/4")
+    return k, n

@@ -100,9 +100,9 @@ _SAYS = {
     "export": "Convert a map or a calibration to other formats.",
     "experiment": "Compare all methods on both ports, as the paper does.",
     "cache": "List or prune the cache of runs.",
-    "fleet": "Map many drives, each described by a run file, on Ray.",
+    "fleet": "Map many drives, each described by a run file.",
 }
-_EXTRAS = {"detect": None, "export": None, "cache": None, "fleet": "fleet"}
+_EXTRAS = {"detect": None, "export": None, "cache": None}
 _INTERRUPTED = {
     "map": "interrupted; what was found so far is kept in the cache, no result was written",
     "detect": "interrupted before the last image; no --output was written",

@@ -1,1 +1,1 @@
-"""Many drives on Ray: detection by actors that keep the model loaded, one mapping task per drive."""
+"""Many drives: side by side in processes of this machine, and shared out among machines."""

@@ -117,8 +117,12 @@ class Plan:
     sources: list[str]
 
 
-def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
-    """The drives of run files, each by itself; ``overrides`` are ``key=value`` for all of them."""
+def plan(files: Sequence[Path], overrides: Sequence[str], share: tuple[int, int] = (1, 1)) -> Plan:
+    """The drives of run files, each by itself; ``overrides`` are ``key=value`` for all of them.
+
+    Of ``share`` = (k, n) only every n-th file, beginning with the k-th, is planned; results of all must go to
+    different places nevertheless.
+    """
     jobs: list[Job] = []
     refused: list[Row] = []
     taken: dict[str, Path] = {}
@@ -136,7 +140,9 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
             jobs.append(job)
         except V2hdmError as error:
             refused.append(Row.of_error(file.stem, str(file), str(error)))
-    return Plan(jobs, refused, [str(file) for file in files])
+    sources = [str(file) for file in files][share[0] - 1 :: share[1]]
+    mine = [one for one in jobs if one.source in sources]
+    return Plan(mine, [one for one in refused if one.source in sources], sources)
 
 
 def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Plan:

@@ -1,40 +1,41 @@
-"""A fleet from its run files to its table: drives side by side, each retried when its worker dies."""
+"""A fleet from its run files to its table: drives side by side, each in a process of this machine."""
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from v2hdm.fleet.cluster import LOCAL, NO_GPU, RETRIES, Shares, cluster, wants_gpu
+from v2hdm.errors import WorkerError, describe
 from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
-from v2hdm.progress import patient
+from v2hdm.pipeline.run import take_or_run
+from v2hdm.progress import Progress, patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.results import GrowingFolder, growing_folder
+from v2hdm.workers import side_by_side
 
 ALL = "fleet"  # in place of a drive's name, for the progress of the fleet
-_LOOK_EVERY_S = 0.3
 
 
 @dataclass(frozen=True)
 class FleetOptions:
     """The choices of a user beside the drives.
 
-    ``workers`` are the cores that are used on this machine, 0 for all; ``address`` is that of a cluster.
-    ``folder`` takes the table; ``again`` does what is finished again. ``site`` names the
-    one that all drives are of; without a name each is mapped by itself.
+    ``workers`` are the cores that are used, 0 for all. ``folder`` takes the table; ``again`` does what is
+    finished again. ``site`` names the one that all drives are of; without a name each is mapped by itself.
+    ``share`` = (k, n) maps every n-th drive, beginning with the k-th; other machines map the others.
     """
 
     folder: Path
     workers: int = 0
-    address: str = LOCAL
     again: bool = False
     site: str | None = None
+    share: tuple[int, int] = (1, 1)
 
 
 def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: FleetOptions) -> list[Row]:
@@ -55,17 +56,16 @@ def run_fleet(
 ) -> list[Row]:
     """Map the drives of run files: a row for each file, in their order, or one for a site.
 
-    The table is written anew whenever a drive is done. Raises V2hdmError where it cannot, or without Ray.
+    The table is written anew whenever a drive is done. Raises V2hdmError where it cannot.
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
-    todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)
+    site, share = options.site, options.share
+    todo = plan(files, settings, share) if site is None else plan_site(files, settings, site)
     with growing_folder(options.folder, "--table", "v2hdm fleet") as folder:
         table = _Table(folder, todo.sources, progress)
         for row in todo.refused:
             table.add(row)
-        if todo.jobs:
-            with cluster(options.address, options.workers) as ray:
-                _map_all(ray, todo.jobs, table, progress)
+        _map_all(todo.jobs, options.workers or os.cpu_count() or 1, table, progress)
         return table.rows
 
 
@@ -92,42 +92,24 @@ class _Table:
         self._progress(ALL, "drives", len(self._rows), len(self._sources))
 
 
-def _map_all(ray: Any, todo: Sequence[Job], table: _Table, progress: DriveProgress) -> None:
-    from v2hdm.fleet.workers import ProgressActor, map_drive, open_detectors
-
-    cores, gpus = (int(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
-    cores, here = max(cores, 1), str(Path.cwd())
-    for job in [one for one in todo if gpus == 0 and wants_gpu(one.config)]:
-        table.add(Row.of_error(job.name, job.source, NO_GPU))
-    todo = [job for job in todo if gpus or not wants_gpu(job.config)]
-    shares = Shares.of([job.config for job in todo])
-    devices = {job.config.detector.device for job in todo}
-    detectors = open_detectors(devices, cores, gpus, shares.detector, here, RETRIES)
-    reports = ray.remote(ProgressActor).options(num_cpus=0, max_restarts=-1).remote()
-    left = list(todo)[::-1]
-    doing: dict[Any, Job] = {}
-    while left or doing:
-        while left and len(doing) < cores:
-            job = left.pop()
-            share = shares.mapping if job.config.device == "cuda" else 0
-            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=share, max_retries=RETRIES)
-            doing[mapping.remote(job, detectors[job.config.detector.device], reports, here)] = job
-        done, _ = ray.wait(list(doing), num_returns=1, timeout=_LOOK_EVERY_S)
-        with suppress(ray.exceptions.RayError):  # the actor died, and is being restarted
-            for report in ray.get(reports.take.remote()):
-                progress(*report)
-        for reference in done:
-            table.add(*_outcome(ray, reference, doing.pop(reference)))
+def _map_all(jobs: Sequence[Job], cores: int, table: _Table, progress: DriveProgress) -> None:
+    """Map drives side by side; where they are fewer than cores, each takes several."""
+    count = max(1, min(cores, len(jobs)))
+    todo = [replace(one, config=replace(one.config, workers=cores // count)) for one in jobs]
+    for number, found in side_by_side(_mapped, todo, count, lambda job, *step: progress(job.name, *step)):
+        if isinstance(found, WorkerError):
+            found = Row.of_error(jobs[number].name, jobs[number].source, str(found)), ""
+        table.add(*found)
 
 
-def _outcome(ray: Any, reference: Any, job: Job) -> tuple[Row, str]:
+def _mapped(job: Job, progress: Progress) -> tuple[Row, str]:
+    """Map one drive and write its results; its row, and the traceback where it met a bug of ours."""
     try:
-        outcome: tuple[Row, str] = ray.get(reference)
-    except ray.exceptions.RayError as error:
-        # Whatever map_drive raises is a row already: this is its process, again and again.
-        line = (
-            f"its worker process died {RETRIES + 1} times ({type(error).__name__}), perhaps for want of "
-            "memory; set fewer --workers"
-        )
-        return Row.of_error(job.name, job.source, line), str(error)
-    return outcome
+        result, kept = take_or_run(job.config, job.config_yaml, progress)
+    except Exception as error:  # a drive that fails is a row, and the others go on
+        line = describe(error)
+        if line is not None:
+            return Row.of_error(job.name, job.source, line), ""
+        line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
+        return Row.of_error(job.name, job.source, line), traceback.format_exc()
+    return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""

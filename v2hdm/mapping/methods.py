@@ -20,7 +20,6 @@ from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.errors import ConfigError
-from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
@@ -164,7 +163,6 @@ def run_methods(
     progress: Callable[[str], None] = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
-    executor: Executor = IN_PROCESS,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -176,7 +174,6 @@ def run_methods(
         progress: gets the name of each step as it begins.
         base: an earlier map that ``Opt`` brings up to date.
         grey: reads the grey values (H, W) of an image, to look where ``base`` has paint.
-        executor: does what belongs to one visit of several.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -190,7 +187,7 @@ def run_methods(
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
     progress("linking sightings")
-    given = Inputs(drive, detections, cameras, options, executor)
+    given = Inputs(drive, detections, cameras, options)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
         progress(name)

@@ -36,7 +36,6 @@ from v2hdm.association.groups import Association, attach, fuse_groups, in_view, 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.tensors import extrinsic_from_ipm
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
@@ -86,10 +85,9 @@ class Optimiser:
         cameras: Mapping[str, Camera],
         pose_noise: Sequence[PoseNoise],
         options: MappingOptions,
-        executor: Executor = IN_PROCESS,
     ) -> None:
         """``pose_noise`` is that of each visit; gates take the largest of each kind."""
-        self._executor, self._seen, self._views = executor, sightings, views
+        self._seen, self._views = sightings, views
         self.sightings = sightings
         """As if all that they show lay on a plane."""
         self.cross_section: CrossSection | None = None
@@ -239,9 +237,7 @@ class Optimiser:
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         noise = self._pose_noise
         uncertainty = Uncertainty(direction_rad, noise.roll_pitch_rad, noise.position_m)
-        return build_tracks(
-            self.sightings, located, rig, uncertainty, self._options.association, self._executor
-        )
+        return build_tracks(self.sightings, located, rig, uncertainty, self._options.association)
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""

@@ -19,7 +19,6 @@ from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faul
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Sightings, collect_sightings
-from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
@@ -120,7 +119,6 @@ class Inputs:
     detections: Sequence[ImageDetections]
     cameras: Sequence[str]
     options: MappingOptions
-    executor: Executor = IN_PROCESS
 
     @cached_property
     def sightings(self) -> Sightings:
@@ -132,7 +130,7 @@ class Inputs:
         """Of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, self.executor)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options)
 
     @cached_property
     def tracks(self) -> Association:

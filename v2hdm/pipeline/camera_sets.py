@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
@@ -55,21 +54,16 @@ def map_camera_sets(
     against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
     no map can be made, AdjustError where the adjustment fails.
     """
-    sets, cache, executor = camera_sets(drive), context.cache, context.executor
+    sets, cache = camera_sets(drive), context.cache
     begun = cache.key(drive_key, list(detections), survey.mapping)
-    # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
-    elsewhere = executor if len(sets) > 1 and survey.mapping.device == "cpu" else IN_PROCESS
-    jobs = []
+    context.progress("map", 0, len(sets))
+    found: dict[str, MappedSet] = {}
     for name, cameras in sets.items():
         last = name == list(sets)[-1]
         now = base if last else None
-        work = partial(_map_set, drive, detections, name, cameras, survey, now, last, executor)
+        work = partial(_map_set, drive, detections, name, cameras, survey, now, last)
         key = cache.key(begun, name, cameras, (base, survey.check) if last else None)
-        jobs.append((key, partial(elsewhere.begin, work)))
-    context.progress("map", 0, len(sets))
-    found = {}
-    for name, mapped in zip(sets, cache.get_or_make_each(STAGE, MappedSet, jobs), strict=True):
-        found[name] = mapped
+        found[name] = mapped = cache.get_or_make(STAGE, key, MappedSet, work)
         context.viewer.mapped(name, mapped.methods)
         context.progress("map", len(found), len(sets))
     return found
@@ -83,10 +77,9 @@ def _map_set(
     survey: Survey,
     base: Base | None,
     last: bool,
-    executor: Executor,
 ) -> MappedSet:
     log, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(drive, detections, cameras, survey.mapping, log, base, grey_reader(drive), executor)
+    methods = run_methods(drive, detections, cameras, survey.mapping, log, base, grey_reader(drive))
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None
     # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from v2hdm.executor import IN_PROCESS, Executor
 from v2hdm.progress import Progress, Steps, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
@@ -61,7 +60,6 @@ class Context:
     progress: Progress = silent
     viewer: Viewer = field(default_factory=Unwatched)
     detect: Detect | None = None
-    executor: Executor = IN_PROCESS
     workers: int = 0
     folder: Path = Path()
     seconds: dict[str, float] = field(default_factory=dict)

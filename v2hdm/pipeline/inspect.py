@@ -62,12 +62,13 @@ def inspect_each(
     drives: Sequence[Drive], contents: Contents, max_gap_s: float, context: Context
 ) -> list[Inspection]:
     """As :func:`inspect` of each drive, or what it found before of the same, with the same log."""
-    jobs, cache = [], context.cache
+    inspections, cache = [], context.cache
     for drive in drives:
         steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
         work = partial(inspect, drive, max_gap_s, context.processes, steps)
-        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(context.executor.begin, work)))
-    return list(cache.get_or_make_each("check", Inspection, jobs))
+        key = cache.key(contents.key(drive), max_gap_s)
+        inspections.append(cache.get_or_make("check", key, Inspection, work))
+    return inspections
 
 
 def join(inspections: Sequence[Inspection]) -> Inspection:

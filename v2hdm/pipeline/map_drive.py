@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
@@ -132,20 +131,13 @@ def map_drive(
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
-    """Read several drives, each by the executor of ``context``, and join them; raises DriveError."""
+    """Read several drives and join them; raises DriveError."""
     with context.timed("read"):
-        begun = [context.executor.begin(partial(_read_one, one, options)) for one in sources]
-        found = [wait() for wait in begun]
-    for drive, _ in found:
+        drives = tuple(as_drive(one, options) for one in sources)
+        contents = Contents.of(drives)
+    for drive in drives:
         _log.info("drive %s: %d images of %s", drive.name, len(drive.images), ", ".join(drive.cameras))
-    drives = tuple(drive for drive, _ in found)
-    digests = {path: digest for _, contents in found for path, digest in contents.digests.items()}
-    return Read(drives, join_drives(drives), Contents(digests))
-
-
-def _read_one(source: Source, options: ReadOptions) -> tuple[Drive, Contents]:
-    drive = as_drive(source, options)
-    return drive, Contents.of([drive])
+    return Read(drives, join_drives(drives), contents)
 
 
 def _detect(

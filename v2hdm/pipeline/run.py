@@ -205,6 +205,13 @@ def run(
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
+    return take_or_run(config, config_yaml, progress, viewer)[0]
+
+
+def take_or_run(
+    config: RunConfig, config_yaml: str, progress: Progress, viewer: Viewer | None = None
+) -> tuple[RunResult, bool]:
+    """As :func:`run`, and whether a finished result of the same was taken."""
 
     def work(local: RunConfig, cache: StageCache) -> RunResult:
         from v2hdm.detection.network import check_device
@@ -213,7 +220,7 @@ def run(
         context = Context(progress=progress, viewer=viewer or Unwatched())
         return map_and_save(local, cache, config_yaml, context, made_of(config))
 
-    return take_or_make(config, work, config.resume and viewer is None, progress)[0]
+    return take_or_make(config, work, config.resume and viewer is None, progress)
 
 
 def made_of(config: RunConfig) -> str:

@@ -153,24 +153,11 @@ class StageCache:
 
     def get_or_make(self, stage: str, key: str, kind: type[_Value], make: Callable[[], _Value]) -> _Value:
         """The result of a stage, of type ``kind``: its entry, or else what ``make`` makes."""
-        return next(self.get_or_make_each(stage, kind, [(key, lambda: make)]))
-
-    def get_or_make_each(
-        self, stage: str, kind: type[_Value], jobs: Sequence[tuple[str, Callable[[], Callable[[], _Value]]]]
-    ) -> Iterator[_Value]:
-        """Several results of a stage, in order; all that are missing are begun before one is waited for.
-
-        A job is a key, and what begins to make the result and returns what waits for it.
-        """
-        found = [self.get(stage, key, kind) for key, _ in jobs]
-        begun = [begin() if one is None else None for one, (_, begin) in zip(found, jobs, strict=True)]
-        for one, wait, (key, _) in zip(found, begun, jobs, strict=True):
-            if wait is not None:
-                with recorded() as lines:
-                    value = wait()
-                yield self.put(stage, key, kind, value, lines)
-            elif one is not None:
-                yield one
+        if (found := self.get(stage, key, kind)) is not None:
+            return found
+        with recorded() as lines:
+            value = make()
+        return self.put(stage, key, kind, value, lines)
 
     def get(self, stage: str, key: str, kind: type[_Value]) -> _Value | None:
         """The entry of a stage under ``key``; None where there is none that is whole."""

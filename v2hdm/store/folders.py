@@ -15,8 +15,8 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -149,50 +149,34 @@ def is_whole(folder: Path) -> bool:
         return False
 
 
-def begin_entry(folder: Path) -> Path:
-    """An empty hidden folder to fill for ``folder``; those that killed processes have left are removed."""
-    partial = _partial(folder)
+@contextmanager
+def new_entry(folder: Path) -> Iterator[Path]:
+    """A hidden folder to fill, which takes the place of the entry ``folder`` when the block succeeds.
+
+    What killed processes have left is removed. Raises DriveError where nothing can be written.
+    """
+    partial = folder.with_name(f".{folder.name}.{_WRITER}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         for left in folder.parent.glob(f".{folder.name}.*.part"):
             if left == partial or is_stale(left):
                 shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
-    except OSError as failure:
-        raise cannot_write(folder, failure) from None
-    return partial
-
-
-def finish_entry(folder: Path) -> None:
-    """Put the folder that was filled in its place, with its list."""
-    partial = _partial(folder)
-    try:
+        yield partial
         _write_list(partial)
         if folder.exists() and not is_whole(folder):
             listed = _listed(folder).get("files") or ()
             bring_over(folder, partial, lambda name: name in (*listed, LIST) or (partial / name).exists())
             shutil.rmtree(folder)
-        if folder.exists():  # another process was faster
-            shutil.rmtree(partial)
-        else:
+        if not folder.exists():  # else another process was faster
             partial.replace(folder)
         note_use(folder)
     except OSError as failure:
-        raise cannot_write(folder, failure) from None
-
-
-def drop_entry(folder: Path) -> None:
-    """Remove what was filled for ``folder`` so far."""
-    shutil.rmtree(_partial(folder), ignore_errors=True)
-
-
-def cannot_write(folder: Path, failure: OSError) -> DriveError:
-    """The error of an import that finds no place."""
-    return DriveError(f"{folder}: cannot be written ({failure.strerror}); free space or set drive.cache")
-
-
-def _partial(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}.{_WRITER}.part")
+        raise DriveError(
+            f"{folder}: cannot be written ({failure.strerror}); free space or set drive.cache"
+        ) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def is_stale(folder: Path) -> bool:

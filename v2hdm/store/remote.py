@@ -23,7 +23,7 @@ from urllib.parse import unquote
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.extras import need
 from v2hdm.store.files import file_digest
-from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, finish_entry, is_whole, note_use
+from v2hdm.store.folders import is_whole, new_entry, note_use
 from v2hdm.store.inputs import LIST
 
 Report = Callable[[int, int], None]  # called as report(done, total) with numbers of objects
@@ -225,20 +225,14 @@ def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
         return entry / called
     size_mb = sum(one.size for one in there.values()) / 1e6
     _log.info("%s: copying %d objects of %.1f MB to %s", drive, len(there), size_mb, entry)
-    partial = begin_entry(entry) / called
-    try:
+    with new_entry(entry) as partial:
         for begin in range(0, len(names), _AT_ONCE):
             some = names[begin : begin + _AT_ONCE]
-            drive.fetch({name: partial / name for name in some})
+            drive.fetch({name: partial / called / name for name in some})
             for name in some:
-                if (partial / name).stat().st_size != there[name].size:
+                if (partial / called / name).stat().st_size != there[name].size:
                     raise DriveError(f"{drive}/{name}: changes while it is copied; start again")
             report(begin + len(some), len(names))
-        finish_entry(entry)
-    except OSError as failure:
-        raise cannot_write(entry, failure) from None
-    finally:
-        drop_entry(entry)
     return entry / called
 
 

@@ -18,7 +18,6 @@ from v2hdm.extras import need
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles
-from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
@@ -26,7 +25,7 @@ from v2hdm.io.safe.pixels import VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
-from v2hdm.store.folders import entry_folder, is_whole
+from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
 _log = logging.getLogger(__name__)
 

@@ -14,14 +14,13 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
-from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
 from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of, import_streams
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
 from v2hdm.records import FloatArray
 from v2hdm.store.files import dump_yaml, load_yaml
-from v2hdm.store.folders import entry_folder, is_whole
+from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
 _VEHICLES = ("base_footprint", "base_link")  # frames, the one on the ground first (REP-105, REP-120)
 _MAPS = ("map", "odom")

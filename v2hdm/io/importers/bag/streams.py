@@ -21,7 +21,6 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
-from v2hdm.io.importers import new_entry
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
@@ -31,7 +30,7 @@ from v2hdm.io.importers.tables import Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
-from v2hdm.store.folders import entry_folder, is_whole
+from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
 _log = logging.getLogger(__name__)
 
