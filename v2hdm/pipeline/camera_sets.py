@@ -16,6 +16,8 @@ from v2hdm.pipeline.survey import Survey, compare_survey
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
 from v2hdm.site.changes import Base
+from v2hdm.store.cache import Line, log_again, recorded
+from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
 
@@ -54,39 +56,85 @@ def map_camera_sets(
     against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
     no map can be made, AdjustError where the adjustment fails.
     """
-    sets, cache = camera_sets(drive), context.cache
+    cache, sets = context.cache, camera_sets(drive)
     begun = cache.key(drive_key, list(detections), survey.mapping)
-    context.progress("map", 0, len(sets))
-    found: dict[str, MappedSet] = {}
-    for name, cameras in sets.items():
-        last = name == list(sets)[-1]
-        now = base if last else None
-        work = partial(_map_set, drive, detections, name, cameras, survey, now, last)
-        key = cache.key(begun, name, cameras, (base, survey.check) if last else None)
-        found[name] = mapped = cache.get_or_make(STAGE, key, MappedSet, work)
-        context.viewer.mapped(name, mapped.methods)
+    *single, last = sets
+    keys = {name: cache.key(begun, name, sets[name], None) for name in single}
+    keys[last] = cache.key(begun, last, sets[last], (base, survey.check))
+    known = {name: cache.get(STAGE, key, MappedSet) for name, key in keys.items()}
+    found = {name: mapped for name, mapped in known.items() if mapped is not None}
+    context.progress("map", len(found), len(sets))
+
+    def take(made: tuple[str, MappedSet, list[Line]]) -> None:
+        name, mapped, lines = made
+        if elsewhere:
+            log_again(lines)
+        found[name] = cache.put(STAGE, keys[name], MappedSet, mapped, lines)
         context.progress("map", len(found), len(sets))
-    return found
+
+    work = _Work(drive, detections, survey, base, last)
+    todo = [name for name in sets if name not in found]
+    elsewhere = len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and work.is_large
+    if elsewhere:  # the largest set first
+        jobs = [(name, sets[name]) for name in sorted(todo, key=lambda name: -len(sets[name]))]
+        share_out(_work_elsewhere, jobs, context.processes, _start_worker, (work,), take)
+    else:
+        for name in todo:
+            take(work.do((name, sets[name])))
+    for name in sets:
+        context.viewer.mapped(name, found[name].methods)
+    return {name: found[name] for name in sets}
 
 
-def _map_set(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    name: str,
-    cameras: Sequence[str],
-    survey: Survey,
-    base: Base | None,
-    last: bool,
-) -> MappedSet:
-    log, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(drive, detections, cameras, survey.mapping, log, base, grey_reader(drive))
-    best = methods[BEST]
-    checked = compare_survey(survey, drive, best) if last else None
-    # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.
-    methods[BEST] = replace(best, corners=None)
-    took_s = time.perf_counter() - begin_s
-    _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
-    for exclusion in best.excluded:
-        where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
-        _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
-    return MappedSet(methods, checked)
+_Job = tuple[str, Sequence[str]]  # the name of a set, and its cameras
+_WORTH_PROCESSES = 4000  # detected markings whose mapping takes as long as processes take to start
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Everything that the sets of cameras of a drive are mapped from; ``last`` is the one of all cameras."""
+
+    drive: Drive
+    detections: Sequence[ImageDetections]
+    survey: Survey
+    base: Base | None
+    last: str
+
+    @property
+    def is_large(self) -> bool:
+        """Whether processes are worth their start."""
+        return sum(len(found.markings) for found in self.detections) > _WORTH_PROCESSES
+
+    def do(self, job: _Job) -> tuple[str, MappedSet, list[Line]]:
+        """Map one set of cameras; returns its name, the result and what was logged."""
+        with recorded() as lines:
+            return job[0], self._map(*job), lines
+
+    def _map(self, name: str, cameras: Sequence[str]) -> MappedSet:
+        begin_s, drive, survey = time.perf_counter(), self.drive, self.survey
+        log, base = partial(_log.debug, "%s: %s", name), self.base if name == self.last else None
+        methods = run_methods(drive, self.detections, cameras, survey.mapping, log, base, grey_reader(drive))
+        best = methods[BEST]
+        checked = compare_survey(survey, drive, best) if name == self.last else None
+        # The factors of the adjustment are large; whoever needs more of them asks while they are here.
+        methods[BEST] = replace(best, corners=None)
+        took_s = time.perf_counter() - begin_s
+        _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
+        for exclusion in best.excluded:
+            where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
+            _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
+        return MappedSet(methods, checked)
+
+
+_work: _Work | None = None
+
+
+def _start_worker(work: _Work) -> None:
+    global _work
+    logging.getLogger("v2hdm").setLevel(logging.DEBUG)
+    _work = work
+
+
+def _work_elsewhere(job: _Job) -> tuple[str, MappedSet, list[Line]]:
+    assert _work is not None
+    return _work.do(job)
