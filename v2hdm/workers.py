@@ -1,34 +1,33 @@
 """Work shared out among processes that never outlive the one that started them.
 
 Ctrl-C and errors reach this process alone, which ends the others; each of them watches this one and ends when
-it dies, which those of ``ProcessPoolExecutor`` do not do by themselves.
+it dies.
 """
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from functools import partial
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
-from typing import Any, TypeVar
+from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, TypeVar
 
 from v2hdm.errors import WorkerError
+from v2hdm.progress import Progress
 
 _TIDY_S = 30.0  # a worker without its parent may take this long to end, whatever it is in
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
-
-_failure: list[Exception] = []  # of the start of this worker process, for its first job to raise
 
 
 def share_out(
@@ -39,34 +38,128 @@ def share_out(
     arguments: tuple[object, ...],
     take: Callable[[_Result], None],
 ) -> None:
-    """Do jobs in several processes and take their results in the order of the jobs.
+    """Do short jobs in several processes and take their results in the order of the jobs.
 
-    Processes are spawned: a fork would inherit the locks of other libraries' threads. Each calls ``start``
-    with ``arguments`` first; an exception of ``work`` is raised here, caused by one with the traceback there.
-    Raises WorkerError where a process died.
+    Each process calls ``start`` with ``arguments`` first; an exception of either is raised here. Raises
+    WorkerError where a job's process died, twice.
     """
-    others, spawn = set(multiprocessing.active_children()), multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(max(1, min(processes, len(jobs))), spawn, _begin, (start, arguments))
-    ours: set[Any] = set()
+    found: dict[int, _Result] = {}
+    taken, ready = 0, _Prepared(work, start, arguments)
+    for number, result in side_by_side(ready, jobs, min(processes, len(jobs)), lambda *_: None):
+        if isinstance(result, WorkerError):
+            raise result
+        found[number] = result
+        while taken in found:
+            take(found.pop(taken))
+            taken += 1
+
+
+class _Prepared(Generic[_Job, _Result]):
+    """Work for which every process is made ready by its first job."""
+
+    def __init__(
+        self, work: Callable[[_Job], _Result], start: Callable[..., None], arguments: tuple[object, ...]
+    ) -> None:
+        self._work, self._start, self._arguments = work, start, arguments
+        self._is_ready = False
+
+    def __call__(self, job: _Job, progress: Progress) -> _Result:
+        if not self._is_ready:
+            self._start(*self._arguments)
+            self._is_ready = True
+        return self._work(job)
+
+
+def side_by_side(
+    work: Callable[[_Job, Progress], _Result],
+    jobs: Sequence[_Job],
+    processes: int,
+    progress: Callable[[_Job, str, int, int], None],
+) -> Iterator[tuple[int, _Result | WorkerError]]:
+    """Do long jobs in several processes; yields each job's number and result as it is done.
+
+    ``work`` reports its steps to the progress that it is given, and ``progress`` is called with them here. A
+    job whose process dies is begun once more, and a WorkerError is its result where that dies, too. An
+    exception of ``work`` is raised here, caused by one with the traceback there.
+
+    Processes are spawned: a fork would inherit the locks of other libraries' threads. Messages go through a
+    pipe per process: one that is killed takes no other's with it, and nobody else could reach them.
+    """
+    left, died = list(range(len(jobs)))[::-1], set[int]()
+    others = set(multiprocessing.active_children())
+    idle: list[_Worker] = []
+    doing: dict[object, tuple[_Worker, int]] = {}
     try:
-        with undisturbed_starts():
-            results = pool.map(partial(_do, work), jobs)
-            ours = set(multiprocessing.active_children()) - others
-        for result in results:
-            take(result)
-    except BrokenProcessPool:
-        pool.shutdown()
-        ends = [one.exitcode for one in ours if one.exitcode not in (0, -signal.SIGTERM)]
-        raise WorkerError(
-            f"a worker process died (exit code {ends[0] if ends else 'unknown'}), perhaps for want of "
-            "memory; set fewer workers="
-        ) from None
-    except BaseException:
-        for one in ours:
-            one.terminate()
-        raise
+        while left or doing:
+            while left and len(doing) < max(1, processes):
+                worker, number = idle.pop() if idle else _Worker(work), left.pop()
+                doing[worker.pipe] = worker, number
+                with suppress(OSError):  # it has died, as what is received says
+                    worker.pipe.send(jobs[number])
+            for pipe in wait([worker.pipe for worker, _ in doing.values()]):
+                worker, number = doing[pipe]
+                try:
+                    kind, *message = worker.pipe.recv()
+                except (EOFError, OSError):
+                    del doing[pipe]
+                    worker.process.join()
+                    if number in died:
+                        yield number, _twice_dead(worker.process.exitcode)
+                    else:
+                        died.add(number)
+                        left.append(number)
+                    continue
+                if kind == "progress":
+                    progress(jobs[number], *message)
+                    continue
+                idle.append(doing.pop(pipe)[0])
+                if kind == "failed":
+                    failure, trace = message
+                    raise failure from RuntimeError(trace)
+                yield number, message[0]
     finally:
-        pool.shutdown(cancel_futures=True)
+        ours = [one for one in multiprocessing.active_children() if one not in others]
+        for process in ours:
+            process.terminate()
+        for process in ours:
+            process.join()
+
+
+class _Worker:
+    """A process that does jobs of :func:`side_by_side`; it ends with the other end of its ``pipe``."""
+
+    def __init__(self, work: Callable[[Any, Progress], Any]) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self.pipe, theirs = spawn.Pipe()
+        self.process = spawn.Process(target=_serve, args=(work, theirs))
+        with undisturbed_starts():
+            self.process.start()
+        theirs.close()
+
+
+def _serve(work: Callable[[Any, Progress], Any], pipe: Connection) -> None:
+    live_with_parent()
+    logging.getLogger("v2hdm").addHandler(logging.NullHandler())  # warnings are the results' to state
+
+    def progress(task: str, done: int, total: int) -> None:
+        pipe.send(("progress", task, done, total))
+
+    with suppress(EOFError, OSError):
+        while True:
+            job = pipe.recv()
+            outcome: tuple[Any, ...]
+            try:
+                outcome = "done", work(job, progress)
+            except Exception as failure:
+                outcome = "failed", failure, traceback.format_exc()
+            pipe.send(outcome)
+
+
+def _twice_dead(code: int | None) -> WorkerError:
+    return WorkerError(
+        f"a worker process died twice over the same work (exit code {code}), perhaps for want of memory; set "
+        "fewer workers= (--workers)"
+    )
 
 
 @contextmanager
@@ -96,14 +189,6 @@ def live_with_parent() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
-    live_with_parent()
-    try:
-        start(*arguments)
-    except Exception as failure:
-        _failure.append(failure)
-
-
 def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -111,12 +196,3 @@ def _end_with_parent() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_TIDY_S)
     os._exit(1)
-
-
-def _do(work: Callable[[_Job], _Result], job: _Job) -> _Result:
-    if _failure:
-        raise _failure[0]
-    try:
-        return work(job)
-    except SystemExit:  # the pool would take it for a failure of the job
-        os._exit(0)

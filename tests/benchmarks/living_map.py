@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from omegaconf import OmegaConf
 
+from tests.benchmarks.made.altered import Alteration, altered
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import join_drives, read_drive
@@ -34,8 +35,7 @@ from v2hdm.records import Change, Drive, Fate, FloatArray, HdMap, ImageDetection
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings
 from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.simulate.port.build import build_port
-from v2hdm.simulate.port.config import AlteredConfig, RouteConfig, YardConfig
-from v2hdm.simulate.port.paint import Alteration
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.site.changes import Base
 
 CACHE = Path("~/.cache/v2hdm/living").expanduser()
@@ -46,14 +46,12 @@ SAME_M = 0.25
 Seen = tuple[Drive, list[ImageDetections]]
 
 
-def port(full: bool, visit: int, altered: int = 0) -> PortConfig:
+def port(full: bool, visit: int) -> PortConfig:
     """Port 2, or a short way through its yard."""
     run = OmegaConf.load(Path(__file__).parents[2] / "conf/run/port2.yaml").simulate
     config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(PortConfig), run))
     assert isinstance(config, PortConfig)
-    config = replace(
-        config, visit=visit, altered=AlteredConfig(moved=altered, removed=altered, added=altered)
-    )
+    config = replace(config, visit=visit)
     if full:
         return config
     route = RouteConfig(pieces=[[30.0, 0.0], [23.0, -90.0], [25.0, 0.0]])
@@ -209,13 +207,17 @@ def main() -> None:
     arguments = parser.parse_args()
     count = 12 if arguments.full else 4
     base = two_drives(arguments) if arguments.base is None else read_base(arguments.base)
-    config = port(full=arguments.full, visit=1 if arguments.full else 2, altered=count)
+    config = port(full=arguments.full, visit=1 if arguments.full else 2)
+    config = replace(config, name=f"{config.name}-altered")
+    with altered(count, config.seed) as alterations:  # in this process alone, which renders them
+        build_port(config)
+        rendered_drive(config, arguments.cache, 1, lambda _, __: None)
     third = seen(config, arguments.cache, arguments.workers)
     renewed = mapped(third, base)
     assert renewed.changes is not None
     told("first map after the paint was altered", renewed.hd_map, read_truth(third[0]), third[0])
     print(ids_kept(base.hd_map, renewed.hd_map, read_truth(third[0])))
-    tell_changes(renewed.changes.changes, build_port(config).alterations, base.hd_map)
+    tell_changes(renewed.changes.changes, alterations, base.hd_map)
 
 
 if __name__ == "__main__":

@@ -365,9 +365,9 @@ def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(codec, folder, tm
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
 def test_memory_does_not_grow_with_the_bag(kind, folder, tmp_path):
-    large = np.random.default_rng(1).integers(0, 255, (480, 640, 3), np.uint8)
+    large = np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8)
     peaks = []
-    for count in (10, 60):
+    for count in (10, 40):
         made = Messages(ros1=kind == "ros1")
         for k in range(count):
             made.add(1.0 + k, "/image", made.raw_image(1.0 + k, large, "bgr8", "cam"))

@@ -82,7 +82,7 @@ def test_a_fleet_outlives_its_processes_keeps_what_is_finished_and_goes_on_past_
     assert [row.status for row in rows] == ["PASS", "ERROR", "ERROR", "ERROR"], rows
     assert (rows[0].images, rows[0].kept) == (images, False)
     assert "no such drive folder" in rows[1].says
-    assert "its process died twice (exit code -9)" in rows[2].says
+    assert "died twice over the same work (exit code -9)" in rows[2].says
     assert re.search("did you mean .*mapping.max_range_m", rows[3].says)
     assert ("good", "detect", images, images) in told
     table = list(csv.DictReader(StringIO((tmp_path / "table" / "fleet.csv").read_text())))

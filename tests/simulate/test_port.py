@@ -49,7 +49,7 @@ def info_of(config, name):
 def test_exact_points_give_the_homography_of_the_extrinsic(full, name):
     exact = CalibrationConfig(survey_sigma_m=0.0, click_sigma_px=0.0)
     mount = full.cameras[name].mount
-    ipm = calibrate(info_of(full, name), mount, exact, np.random.default_rng(0)).ipm
+    ipm, _ = calibrate(info_of(full, name), mount, exact, np.random.default_rng(0))
     expected = ipm_from_extrinsic(info_of(full, name), cam_from_vehicle(mount))
     assert np.allclose(ipm / ipm[2, 2], expected / expected[2, 2], rtol=1e-5, atol=1e-7)
 

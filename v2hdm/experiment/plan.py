@@ -50,7 +50,7 @@ class ExperimentConfig:
         mapping: settings of the mapping.
         name: names the results, ``<output>/<name>/``.
         output: folder that takes the results.
-        cache: folder that keeps rendered drives, and what was detected in them.
+        cache: folder that keeps rendered drives, and what each stage has found.
         workers: processes, each of which takes one drive at a time; 0 takes one per core.
     """
 
@@ -69,7 +69,7 @@ class ExperimentConfig:
 class Job:
     """One drive of the experiment: a port under one seed, None where the drive is read.
 
-    ``options`` are the settings of the mapping by recipe, ``folder`` takes what is found.
+    ``options`` are the settings of the mapping by recipe.
     """
 
     port: str
@@ -78,12 +78,6 @@ class Job:
     detector: DetectorOptions
     options: Mapping[str, MappingOptions]
     cache: Path
-    folder: Path
-
-    @property
-    def root(self) -> Path:
-        """The experiment's folder."""
-        return self.folder.parent.parent
 
     @property
     def title(self) -> str:
@@ -103,7 +97,6 @@ def jobs(config: ExperimentConfig) -> list[Job]:
     }  # fmt: skip
     recipes = dict.fromkeys([OURS, *config.recipes])
     options = {name: replace(deepcopy(config.mapping), **changed[name]) for name in recipes}
-    folder = Path(config.output) / config.name / "drives"
     found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:
         for port, site in config.ports.items():
@@ -111,11 +104,7 @@ def jobs(config: ExperimentConfig) -> list[Job]:
                 found.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
             elif seed == config.seeds[0]:
                 found.append((port, None, site))
-    return [
-        Job(port, number, site, config.detector, options, Path(config.cache), folder / own)
-        for port, number, site in found
-        for own in [port if number is None else f"{port}-{number}"]
-    ]
+    return [Job(port, seed, site, config.detector, options, Path(config.cache)) for port, seed, site in found]
 
 
 def _check(config: ExperimentConfig) -> None:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
 import os
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, WorkerError
 from v2hdm.experiment.drive import drive_record
 from v2hdm.experiment.figures import save_figures
 from v2hdm.experiment.measures import Measured, measure
@@ -26,12 +21,10 @@ from v2hdm.experiment.summary import by_port, claims, results_table, write_table
 from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.store.files import replace_text
-from v2hdm.store.results import growing_folder, listed_files
-from v2hdm.workers import share_out
+from v2hdm.store.results import growing_folder
+from v2hdm.workers import side_by_side
 
 _OPTION, _MADE = "output=", "v2hdm experiment"
-_PATIENCE_S = 2.0
-_queue: SimpleQueue[Any] | None = None
 
 
 def run_experiment(
@@ -39,8 +32,8 @@ def run_experiment(
 ) -> tuple[Path, list[Measured]]:
     """Map every drive by every recipe and write what comes of it into ``<output>/<name>/``.
 
-    Drives that an earlier run has finished under the same settings are taken from there. ``config_yaml`` is
-    the configuration as text, kept beside the results. Returns the folder, and the figures of every drive.
+    ``config_yaml`` is the configuration as text, kept beside the results. Returns the folder, and the
+    figures of every drive.
     Raises V2hdmError where a setting or a drive is at fault, or the folder holds something that is not ours.
     """
     todo = jobs(config)
@@ -51,7 +44,7 @@ def run_experiment(
             records = _records(todo, config.workers or os.cpu_count() or 1, progress)
             measured = [measure(record) for record in records]
             drawing = partial(progress, "figures", "draw")
-            captions = save_figures(folder, todo, records, measured, drawing)
+            captions = save_figures(folder, records, measured, drawing)
             write_tables(folder, measured)
             write_words(folder, measured, captions, config)
     except OSError as failure:
@@ -61,45 +54,15 @@ def run_experiment(
 
 def _records(todo: Sequence[Job], workers: int, progress: DriveProgress) -> list[dict[str, Any]]:
     if workers <= 1 or len(todo) == 1:
-        return [drive_record(job, workers, partial(progress, job.title)) for job in todo]
-    records: list[dict[str, Any]] = []
-    with _listening(progress) as queue:
-        share_out(_work, todo, workers, _start_worker, (queue,), records.append)
-    return records
-
-
-@contextmanager
-def _listening(progress: DriveProgress) -> Iterator[SimpleQueue[Any]]:
-    """A queue whose messages become progress here while other processes work."""
-    queue: SimpleQueue[Any] = multiprocessing.get_context("spawn").SimpleQueue()
-
-    def listen() -> None:
-        while (message := queue.get()) is not None:
-            progress(*message)
-
-    # A process that was ended in the middle of a message leaves a queue that is never heard to its end.
-    listener = threading.Thread(target=listen, daemon=True)
-    listener.start()
-    try:
-        yield queue
-    finally:
-        queue.put(None)
-        listener.join(_PATIENCE_S)
-
-
-def _start_worker(queue: SimpleQueue[Any]) -> None:
-    global _queue
-    _queue = queue
-    logging.getLogger("v2hdm").setLevel(logging.ERROR)
-
-
-def _work(job: Job) -> dict[str, Any]:
-    def report(task: str, done: int, total: int) -> None:
-        if _queue is not None:
-            _queue.put((job.title, task, done, total))
-
-    with listed_files(job.root, _OPTION, _MADE):
-        return drive_record(job, 1, report)
+        return [drive_record(job, partial(progress, job.title), workers) for job in todo]
+    records: dict[int, dict[str, Any]] = {}
+    for number, found in side_by_side(
+        drive_record, todo, workers, lambda job, *step: progress(job.title, *step)
+    ):
+        if isinstance(found, WorkerError):
+            raise found
+        records[number] = found
+    return [records[number] for number in range(len(todo))]
 
 
 _SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")  # columns on the terminal

@@ -34,7 +34,7 @@ _EXTRINSICS = ("rotation (deg)", "centre (cm)")
 
 
 def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
-    """Write ``results`` and ``calibrations`` as .csv (a line per seed), .md and .tex into a folder."""
+    """Write ``results`` and ``calibrations`` as .csv (a line per seed) and .md into a folder."""
     results = [
         [one.port, one.seed, cameras, method, *(f"{take(row):.6g}" for take, _ in COLUMNS.values())]
         for one in measured
@@ -53,7 +53,6 @@ def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
         replace_csv(folder / f"{name}.csv", [["port", "seed", *keys], *rows])
         heads, lines = table(measured)
         replace_text(folder / f"{name}.md", markdown(heads, lines))
-        replace_text(folder / f"{name}.tex", _latex(heads, lines))
 
 
 def results_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
@@ -119,23 +118,6 @@ def _mean(values: Sequence[float], digits: int) -> str:
         return "-"
     mean = f"{np.mean(known):.{digits}f}"
     return f"{mean} +- {np.std(known, ddof=1):.{max(digits, 1)}f}" if len(known) > 1 else mean
-
-
-def _latex(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table for the booktabs package, with a rule between ports."""
-    kinds = "".join("l" if n < 3 else "r" for n in range(len(heads)))
-    out = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", " & ".join(map(_tex, heads)) + r" \\", r"\midrule"]
-    for number, line in enumerate(lines):
-        if number and line[0] != lines[number - 1][0]:
-            out.append(r"\midrule")
-        out.append(" & ".join(map(_tex, line)) + r" \\")
-    return "\n".join([*out, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def _tex(text: str) -> str:
-    for sign in "_%&#":
-        text = text.replace(sign, rf"\{sign}")
-    return text.replace("+-", r"$\pm$")
 
 
 _RATIOS = (

@@ -1,34 +1,25 @@
-"""A fleet from its run files to its table: drives side by side, each in a process of this machine.
-
-A process maps one drive after another and reports through a pipe of its own: one that is killed takes no
-other's messages with it, and there is no socket that anybody else could reach.
-"""
+"""A fleet from its run files to its table: drives side by side, each in a process of this machine."""
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
 import os
 import sys
 import traceback
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from rich.console import Console
 
-from v2hdm.errors import describe
+from v2hdm.errors import WorkerError, describe
 from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
 from v2hdm.pipeline.run import take_or_run
-from v2hdm.progress import patient
+from v2hdm.progress import Progress, patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.results import GrowingFolder, growing_folder
-from v2hdm.workers import live_with_parent, undisturbed_starts
+from v2hdm.workers import side_by_side
 
 ALL = "fleet"  # in place of a drive's name, for the progress of the fleet
-_SPAWN = multiprocessing.get_context("spawn")  # a fork would inherit the locks of other libraries' threads
 
 
 @dataclass(frozen=True)
@@ -101,76 +92,18 @@ class _Table:
         self._progress(ALL, "drives", len(self._rows), len(self._sources))
 
 
-class _Worker:
-    """A process that maps drives; it ends with its end of ``pipe``, and with this process."""
-
-    def __init__(self) -> None:
-        self.pipe, theirs = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_serve, args=(theirs,))
-        with undisturbed_starts():
-            self.process.start()
-        theirs.close()
-
-
 def _map_all(jobs: Sequence[Job], cores: int, table: _Table, progress: DriveProgress) -> None:
-    """Map drives side by side; one whose process dies is begun once more."""
-    side_by_side = max(1, min(cores, len(jobs)))
-    left = [replace(one, config=replace(one.config, workers=cores // side_by_side)) for one in jobs[::-1]]
-    others, died = set(multiprocessing.active_children()), set[str]()
-    idle: list[_Worker] = []
-    doing: dict[object, tuple[_Worker, Job]] = {}
-    try:
-        while left or doing:
-            while left and len(doing) < side_by_side:
-                worker = idle.pop() if idle else _Worker()
-                worker.pipe.send(left[-1])
-                doing[worker.pipe] = worker, left.pop()
-            for pipe in wait([worker.pipe for worker, _ in doing.values()]):
-                worker, job = doing[pipe]
-                try:
-                    message = worker.pipe.recv()
-                except (EOFError, OSError):
-                    del doing[pipe]
-                    worker.process.join()
-                    if job.source in died:
-                        table.add(_of_dead(job, worker.process.exitcode))
-                    else:
-                        died.add(job.source)
-                        left.append(job)
-                    continue
-                if isinstance(message[0], Row):
-                    idle.append(doing.pop(pipe)[0])
-                    table.add(*message)
-                else:
-                    progress(job.name, *message)
-    finally:
-        ours = [one for one in multiprocessing.active_children() if one not in others]
-        for process in ours:
-            process.terminate()
-        for process in ours:
-            process.join()
+    """Map drives side by side; where they are fewer than cores, each takes several."""
+    count = max(1, min(cores, len(jobs)))
+    todo = [replace(one, config=replace(one.config, workers=cores // count)) for one in jobs]
+    for number, found in side_by_side(_mapped, todo, count, lambda job, *step: progress(job.name, *step)):
+        if isinstance(found, WorkerError):
+            found = Row.of_error(jobs[number].name, jobs[number].source, str(found)), ""
+        table.add(*found)
 
 
-def _of_dead(job: Job, code: int | None) -> Row:
-    says = f"its process died twice (exit code {code}), perhaps for want of memory; set fewer --workers"
-    return Row.of_error(job.name, job.source, says)
-
-
-def _serve(pipe: Connection) -> None:
-    """Map the drives that come through the pipe; progress goes back as (stage, done, total), then a row."""
-    live_with_parent()
-    logging.getLogger("v2hdm").addHandler(logging.NullHandler())  # a run's log is in its result
-    with suppress(EOFError, OSError):
-        while True:
-            pipe.send(_mapped(pipe.recv(), pipe))
-
-
-def _mapped(job: Job, pipe: Connection) -> tuple[Row, str]:
+def _mapped(job: Job, progress: Progress) -> tuple[Row, str]:
     """Map one drive and write its results; its row, and the traceback where it met a bug of ours."""
-
-    def progress(task: str, done: int, total: int) -> None:
-        pipe.send((task, done, total))
-
     try:
         result, kept = take_or_run(job.config, job.config_yaml, progress)
     except Exception as error:  # a drive that fails is a row, and the others go on

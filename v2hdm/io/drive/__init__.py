@@ -11,7 +11,6 @@ from v2hdm.io.drive.folder import folder_drive_name, is_folder_drive, read_descr
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
-from v2hdm.io.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive
 from v2hdm.io.importers.bag.describe import describe_bag
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.records import Drive, Trajectory
@@ -30,14 +29,13 @@ def _read_bag(path: Path, options: ReadOptions) -> Drive:
 READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions], Drive]]] = {
     "folder": (is_folder_drive, read_folder_drive),
     "kitti": (is_kitti_drive, read_kitti_drive),
-    "nuscenes": (is_nuscenes_drive, read_nuscenes_drive),
     "bag": (is_bag, _read_bag),
 }
 """Formats by name: whether a path looks like one, and what makes a drive of it."""
 
 
 def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
-    """Read a drive: a folder with ``drive.yaml``, KITTI raw, nuScenes or a bag.
+    """Read a drive: a folder with ``drive.yaml``, KITTI raw or a bag.
 
     Every image gets the vehicle's pose at its time, ``map_from_vehicle`` (4, 4): position linear, rotation
     slerp, never extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are

@@ -17,7 +17,7 @@ from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre, make_transform, rotation_from_euler
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
-from v2hdm.simulate.port.paint import Alteration, alter, build_layout
+from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_route, drive_along
 from v2hdm.simulate.port.yard import MovingTruck, build_scene, moving_trucks
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
@@ -44,22 +44,13 @@ def cam_from_vehicle(mount: MountConfig) -> FloatArray:
     return make_transform(turned, -turned @ (mount.x_m, mount.y_m, mount.z_m))
 
 
-@dataclass(frozen=True)
-class ManualCalibration:
-    """The data of a manual calibration, and its result."""
-
-    surveyed_vehicle: FloatArray  # (N, 2) m, the points on the ground as they were measured
-    clicked_px: FloatArray  # (N, 2), the same points as they were clicked in the recorded image
-    ipm: FloatArray  # vehicle_from_pinhole_px (3 x 3)
-    roi_vehicle: FloatArray  # (M, 2) m, its region: the convex hull of the surveyed points
-
-
 def calibrate(
     info: CameraInfo, mount: MountConfig, config: CalibrationConfig, rng: np.random.Generator
-) -> ManualCalibration:
+) -> tuple[FloatArray, FloatArray]:
     """Calibrate a camera by hand: survey points on the ground, click them in the image, solve.
 
-    Raises ConfigError when a point lies outside the image, or the points do not determine a homography.
+    Returns ``vehicle_from_pinhole_px`` (3, 3) and its region (M, 2), the hull of the points, m. Raises
+    ConfigError when a point lies outside the image, or the points do not determine a homography.
     """
     yaw = np.deg2rad(mount.yaw_deg)
     ahead, left = np.array(config.points_ahead_m, dtype=np.float64).T
@@ -80,14 +71,14 @@ def calibrate(
         raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
     ipm = np.linalg.inv(pinhole_from_vehicle)
     unit_ipm = np.asarray(ipm / np.linalg.norm(ipm))
-    return ManualCalibration(surveyed, clicked_px, unit_ipm, convex_hull(surveyed))
+    return unit_ipm, convex_hull(surveyed)
 
 
 _IPMS = ("calibrated", "estimated")
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
-_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES, _ALTERED = range(7)
+_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES = range(6)
 
 
 @dataclass(frozen=True)
@@ -102,7 +93,6 @@ class Port:
     cameras: dict[str, Camera]
     cam_from_vehicle: dict[str, FloatArray]
     driven: DrivenPoses
-    alterations: tuple[Alteration, ...] = ()
 
     def cam_from_map(self, camera: str, frame: int) -> FloatArray:
         """Where a camera (4 x 4) truly was at an image."""
@@ -160,22 +150,21 @@ def _visit_seed(config: PortConfig, part: int) -> list[int]:
     return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
 
 
-def surveyed_cameras(config: PortConfig) -> dict[str, tuple[Camera, ManualCalibration]]:
-    """The cameras of a port as the mapper gets to know them, and the manual calibration of each.
+def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
+    """The cameras of a port as the mapper gets to know them: two IPMs, a region and a surveyed centre.
 
-    Of a camera it knows two IPMs, a region and a surveyed centre. Raises ConfigError when the points of the
-    calibration cannot be used.
+    Raises ConfigError when the points of the manual calibration cannot be used.
     """
     rng = np.random.default_rng([config.seed, _CALIBRATION])
     sigma, surveyed = np.full(3, config.calibration.centre_sigma_m), {}
     for name, camera in sorted(config.cameras.items()):
         info, mount = camera_info(name, camera), camera.mount
-        own = calibrate(info, mount, config.calibration, rng)
-        borrowed = calibrate(info, camera.borrowed_mount, config.calibration, rng)
+        own, own_roi = calibrate(info, mount, config.calibration, rng)
+        borrowed, borrowed_roi = calibrate(info, camera.borrowed_mount, config.calibration, rng)
         prior = CentrePrior(np.array([mount.x_m, mount.y_m, mount.z_m]) + rng.normal(0.0, sigma), sigma)
-        roi_vehicle = (own if config.initial_ipm == "calibrated" else borrowed).roi_vehicle
-        ipm = {"calibrated": own.ipm, "estimated": borrowed.ipm}
-        surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior), own
+        roi_vehicle = own_roi if config.initial_ipm == "calibrated" else borrowed_roi
+        ipm = {"calibrated": own, "estimated": borrowed}
+        surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior)
     return surveyed
 
 
@@ -185,16 +174,15 @@ def build_port(config: PortConfig) -> Port:
     Raises ConfigError when values are out of range or contradict each other.
     """
     _check(config)
-    streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD, _ALTERED)}
+    streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD)}
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
         problem = f"{route.length_m:g} m in all; give {_SHORTEST_ROUTE_M:g} m or more"
         raise ConfigError(f"port '{config.name}', route.pieces: {problem}")
     layout = build_layout(config.paint, route, streams[_LAYOUT])
-    layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
-    cameras = {name: camera for name, (camera, _) in surveyed_cameras(config).items()}
+    cameras = _surveyed_cameras(config)
     scene, classes = replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,
@@ -205,19 +193,16 @@ def build_port(config: PortConfig) -> Port:
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
         driven=drive_along(route, config.route, config.disturbance, anew[_POSES]),
-        alterations=tuple(alterations),
     )
 
 
 def _check(config: PortConfig) -> None:
     """Refuse what would fail far from its cause."""
-    altered, route, pieces = config.altered, config.route, config.route.pieces
+    route, pieces = config.route, config.route.pieces
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),
         (config.initial_ipm in _IPMS, "initial_ipm: choose 'calibrated' or 'estimated'"),
         (config.visit >= 0, "visit: must be 0 or more"),
-        (min(altered.moved, altered.removed, altered.added) >= 0, "altered: numbers must be 0 or more"),
-        (len(altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
         (pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
         (all(len(p) == 2 and p[0] > 0 for p in pieces), "route.pieces: each is [length_m > 0, turn_deg]"),
         (route.speed_mps > 0, "route.speed_mps: must be positive"),

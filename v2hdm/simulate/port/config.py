@@ -187,25 +187,6 @@ class PaintConfig:
 
 
 @dataclass(kw_only=True)
-class AlteredConfig:
-    """Paint that was moved, removed or added since the port was laid out.
-
-    Attributes:
-        moved: how many markings were moved.
-        removed: how many were removed.
-        added: how many were added.
-        moved_by_m: the least and the largest distance, with even steps between them.
-        turned_sigma_rad: by how much what is moved is turned as well.
-    """
-
-    moved: int = 0
-    removed: int = 0
-    added: int = 0
-    moved_by_m: list[float] = field(default_factory=lambda: [0.1, 1.0])
-    turned_sigma_rad: float = 0.03
-
-
-@dataclass(kw_only=True)
 class SurfaceConfig:
     """The ground; see :class:`v2hdm.simulate.render.scene.Ground`. Lengths of 0 for ``slab_m``: no joints.
 
@@ -311,8 +292,7 @@ class PortConfig:
 
     ``initial_ipm`` is ``calibrated`` when the drive starts from this vehicle's own manual calibration,
     ``estimated`` when it starts from the other vehicle's. ``visit`` numbers drives through one port: the same
-    paint, other noise of poses and images, other traffic; ``altered`` paint was moved, removed or added
-    since. Equal values give equal files, byte for byte.
+    paint, other noise of poses and images, other traffic. Equal values give equal files, byte for byte.
 
     Attributes:
         name: of the port and its drive.
@@ -328,7 +308,6 @@ class PortConfig:
     disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
     route: RouteConfig = field(default_factory=RouteConfig)
     paint: PaintConfig = field(default_factory=PaintConfig)
-    altered: AlteredConfig = field(default_factory=AlteredConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     yard: YardConfig = field(default_factory=YardConfig)
     exposure: ExposureConfig = field(default_factory=ExposureConfig)

@@ -28,7 +28,7 @@ from v2hdm.io.trajectory import read_image_list
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.config import AlteredConfig, PortConfig
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.route import measured_disturbances, pose_noise
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
 from v2hdm.simulate.render.scene import Box
@@ -116,13 +116,11 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Step
 def folder_of_port(config: PortConfig, cache: Path) -> Path:
     """Where a port's drive belongs in a cache: named by the port and a hash of what it is rendered from."""
     content = asdict(config)
-    # Ports that were rendered before there were visits, stencils and alterations stay the same.
+    # Ports that were rendered before there were visits and stencils stay the same.
     if not config.visit:
         del content["visit"]
     if not config.paint.stencils:
         del content["paint"]["stencils"]
-    if config.altered == AlteredConfig():
-        del content["altered"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 

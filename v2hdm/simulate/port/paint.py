@@ -1,9 +1,9 @@
-"""The markings of a port: what is painted where, what was painted anew, and the true map of both."""
+"""The markings of a port: what is painted where, and the true map of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +23,7 @@ from v2hdm.records import (
     Lane,
     Marking,
 )
-from v2hdm.simulate.port.config import AlteredConfig, PaintConfig, StencilConfig
+from v2hdm.simulate.port.config import PaintConfig, StencilConfig
 from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, placed
 
@@ -243,112 +243,3 @@ class _Painter:
 def _shares(length_m: float) -> FloatArray:
     """From 0 to 1 in steps that are at most half a metre of a length."""
     return np.linspace(0.0, 1.0, max(int(np.ceil(length_m / _VERTEX_SPACING_M)), 1) + 1)
-
-
-_BESIDE_ROUTE_M = 4.5  # only paint this near to the route is altered: a vehicle sees it from everywhere
-_CLEAR_M = 2.6  # distance of an altered marking from all other altered ones, before and after, m
-_FREE_M = 1.3  # distance of new paint's centre from other paint, m
-_TRIES = 4000
-
-
-@dataclass(frozen=True)
-class Alteration:
-    """One marking: its corners (4, 2) before, None for an added one, and after, None for a removed one."""
-
-    kind: str
-    before: FloatArray | None
-    after: FloatArray | None
-
-
-def alter(
-    layout: Layout, config: AlteredConfig, paint: PaintConfig, route: Route, rng: np.random.Generator
-) -> tuple[Layout, list[Alteration]]:
-    """Paint a port anew in places; fewer where there is no room for so many."""
-    anew = _Alterer(layout, route, rng, [])
-    for length_m in np.linspace(config.moved_by_m[0], config.moved_by_m[1], config.moved):
-        anew.move(float(length_m), config.turned_sigma_rad)
-    for _ in range(config.removed):
-        anew.remove()
-    for _ in range(config.added):
-        anew.add(_DIAMOND * (paint.diamond_length_m, paint.diamond_width_m))
-    return _painted(layout, anew.done, rng), anew.done
-
-
-@dataclass
-class _Alterer:
-    layout: Layout
-    route: Route
-    rng: np.random.Generator
-    done: list[Alteration]
-
-    def move(self, length_m: float, turned_sigma_rad: float) -> None:
-        """Shift a diamond by a distance and turn it a little."""
-        for _ in range(_TRIES):
-            before = self._any(DIAMOND)
-            if before is None:
-                continue
-            angle, turn = self.rng.uniform(0, 2 * np.pi), self.rng.normal(0.0, turned_sigma_rad)
-            centre = before.mean(axis=0)
-            shift = length_m * np.array([np.cos(angle), np.sin(angle)])
-            after = placed(before - centre, centre, turn) + shift
-            if self._is_clear(after, before):
-                self.done.append(Alteration(DIAMOND, before, after))
-                return
-
-    def remove(self) -> None:
-        """Remove a diamond or a dash."""
-        for _ in range(_TRIES):
-            before = self._any(DIAMOND, LANE_DASH)
-            if before is not None:
-                kind = next(one.kind for one in self.layout.markings if one.corners_map is before)
-                self.done.append(Alteration(kind, before, None))
-                return
-
-    def add(self, half: FloatArray) -> None:
-        """Add a diamond beside the route where there is room."""
-        route, rng = self.route, self.rng
-        for _ in range(_TRIES):
-            station = rng.uniform(8.0, route.length_m - 8.0)
-            offset_m = rng.uniform(-_BESIDE_ROUTE_M, _BESIDE_ROUTE_M)
-            after = placed(half, *route.pose_at(station, offset_m))
-            if self._is_apart(after) and self._is_clear(after, None):
-                self.done.append(Alteration(DIAMOND, None, after))
-                return
-
-    def _any(self, *kinds: str) -> FloatArray | None:
-        """Corners of a marking drawn at random; None where it is off the route or near an altered one."""
-        own = [one.corners_map for one in self.layout.markings if one.kind in kinds]
-        corners = own[int(self.rng.integers(len(own)))]
-        beside = float(self.route.distance_to(corners.mean(axis=0)[None])[0]) <= _BESIDE_ROUTE_M
-        return corners if beside and self._is_apart(corners) else None
-
-    def _is_apart(self, corners: FloatArray) -> bool:
-        centre = corners.mean(axis=0)
-        others = [one for each in self.done for one in (each.before, each.after) if one is not None]
-        return all(np.linalg.norm(centre - other.mean(axis=0)) > _CLEAR_M for other in others)
-
-    def _is_clear(self, corners: FloatArray, itself: FloatArray | None) -> bool:
-        """Whether new paint keeps clear of all other."""
-        centre = corners.mean(axis=0)
-        others = [one.polygon_map for one in self.layout.paints if one.polygon_map is not itself]
-        lines = [lane.points_map for lane in self.layout.lanes]
-        nearest = min(float(np.linalg.norm(points - centre, axis=1).min()) for points in [*others, *lines])
-        return nearest > _FREE_M - (0.0 if itself is None else 0.3)
-
-
-def _painted(layout: Layout, done: list[Alteration], rng: np.random.Generator) -> Layout:
-    now = {id(one.before): one.after for one in done if one.before is not None}
-    paints, markings = [], []
-    for paint in layout.paints:
-        if (polygon := now.get(id(paint.polygon_map), paint.polygon_map)) is not None:
-            paints.append(replace(paint, polygon_map=polygon))
-    for marking in layout.markings:
-        if (corners := now.get(id(marking.corners_map), marking.corners_map)) is not None:
-            markings.append(replace(marking, corners_map=corners))
-    like = next((paint for paint in layout.paints if paint.kind == DIAMOND), None)
-    for one in done:
-        if one.before is None and one.after is not None and like is not None:
-            seed = int(rng.integers(1 << 30))
-            paints.append(replace(like, polygon_map=one.after, wear=0.05, dirt=0.05, seed=seed))
-            markings.append(Marking(DIAMOND, one.after, 0))
-    return Layout(paints, markings, layout.lanes, layout.occupied_map)
