@@ -39,15 +39,15 @@ def elsewhere(monkeypatch):
     """The sets that processes have mapped, in their order; what reaches or leaves one is pickled."""
     jobs = []
 
-    def share(work, given, processes, start, arguments, take):
+    def share(work, given, processes, progress):
         assert processes == 2
-        start(*pickle.loads(pickle.dumps(arguments)))
-        for job in given:
+        for number, job in enumerate(given):
             jobs.append(job[0])
-            take(pickle.loads(pickle.dumps(work(pickle.loads(pickle.dumps(job))))))
+            there, job = pickle.loads(pickle.dumps((work, job)))
+            yield number, pickle.loads(pickle.dumps(there(job, progress)))
 
     monkeypatch.setattr(camera_sets._Work, "_map", mapped)
-    monkeypatch.setattr(camera_sets, "share_out", share)
+    monkeypatch.setattr(camera_sets, "side_by_side", share)
     return jobs
 
 

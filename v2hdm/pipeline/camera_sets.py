@@ -7,17 +7,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import parent_process
 
+from v2hdm.errors import WorkerError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.survey import Survey, compare_survey
+from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
 from v2hdm.site.changes import Base
 from v2hdm.store.cache import Line, log_again, recorded
-from v2hdm.workers import share_out
+from v2hdm.workers import side_by_side
 
 _log = logging.getLogger(__name__)
 
@@ -67,20 +70,23 @@ def map_camera_sets(
 
     def take(made: tuple[str, MappedSet, list[Line]]) -> None:
         name, mapped, lines = made
-        if elsewhere:
-            log_again(lines)
         found[name] = cache.put(STAGE, keys[name], MappedSet, mapped, lines)
         context.progress("map", len(found), len(sets))
 
     work = _Work(drive, detections, survey, base, last)
-    todo = [name for name in sets if name not in found]
-    elsewhere = len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and work.is_large
-    if elsewhere:  # the largest set first
-        jobs = [(name, sets[name]) for name in sorted(todo, key=lambda name: -len(sets[name]))]
-        share_out(_work_elsewhere, jobs, context.processes, _start_worker, (work,), take)
+    # The largest first, so that processes end together.
+    todo = [
+        (name, sets[name]) for name in sorted(sets, key=lambda name: -len(sets[name])) if name not in found
+    ]
+    if len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and work.is_large:
+        for _, made in side_by_side(work, todo, context.processes, lambda *_: None):
+            if isinstance(made, WorkerError):
+                raise made
+            log_again(made[2])
+            take(made)
     else:
-        for name in todo:
-            take(work.do((name, sets[name])))
+        for job in todo:
+            take(work(job))
     for name in sets:
         context.viewer.mapped(name, found[name].methods)
     return {name: found[name] for name in sets}
@@ -105,8 +111,10 @@ class _Work:
         """Whether processes are worth their start."""
         return sum(len(found.markings) for found in self.detections) > _WORTH_PROCESSES
 
-    def do(self, job: _Job) -> tuple[str, MappedSet, list[Line]]:
+    def __call__(self, job: _Job, _: Progress = silent) -> tuple[str, MappedSet, list[Line]]:
         """Map one set of cameras; returns its name, the result and what was logged."""
+        if parent_process() is not None:
+            logging.getLogger("v2hdm").setLevel(logging.DEBUG)
         with recorded() as lines:
             return job[0], self._map(*job), lines
 
@@ -124,17 +132,3 @@ class _Work:
             where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
             _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
         return MappedSet(methods, checked)
-
-
-_work: _Work | None = None
-
-
-def _start_worker(work: _Work) -> None:
-    global _work
-    logging.getLogger("v2hdm").setLevel(logging.DEBUG)
-    _work = work
-
-
-def _work_elsewhere(job: _Job) -> tuple[str, MappedSet, list[Line]]:
-    assert _work is not None
-    return _work.do(job)
