@@ -8,6 +8,7 @@ import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag import reading
 from v2hdm.io.importers.bag.describe import list_topics
 from v2hdm.io.importers.bag.messages import file_of
-from v2hdm.io.importers.bag.streams import ImageStream, import_streams
+from v2hdm.io.importers.bag.streams import ImageStream, TfStream, import_streams
 
 
 @pytest.fixture(scope="module")
@@ -483,6 +484,34 @@ def test_no_decompressor_of_a_bag_is_without_a_limit(monkeypatch):
     packed = zstd.compress(bytes(30_000_000))
     with pytest.raises(DriveError, match="unpacks to more than a recording would"):
         reader2.zstd.decompress(packed)
+
+
+def test_a_lens_that_changes_within_a_recording_is_refused(folder, tmp_path):
+    made = messages_of(folder)
+    infos = [n for n, (_, topic, _) in enumerate(made.rows) if topic == "/sensing/front/camera_info"]
+    stamp_s, topic, last = made.rows[infos[-1]]
+    zoomed = replace(last, k=last.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1])
+    made.rows[infos[-1]] = stamp_s, topic, zoomed
+    with pytest.raises(DriveError, match=rf"message {len(infos)} states another lens than the first"):
+        read(tmp_path / "drive", described(folder, write_ros2(tmp_path / "bag", made)))
+
+
+def test_a_frame_whose_name_has_a_tab_is_refused(folder, tmp_path):
+    made = messages_of(folder, mounted={**mountings(), "a\tb": mountings()["front"]})
+    bag = write_ros2(tmp_path / "bag", made)
+    with pytest.raises(DriveError, match="a frame is named") as refused:
+        import_streams(bag, [TfStream(False, "here")], tmp_path / "cache")
+    assert "\t" not in str(refused.value)
+
+
+def test_stamps_of_messages_that_are_texts_end_in_one_line(folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("UPDATE messages SET timestamp = 'noon'")
+    database.close()
+    with pytest.raises(DriveError, match="not readable as a bag"):
+        read(tmp_path / "drive", described(folder, bag))
 
 
 def _video(path, frames=20, codec="mpeg4", **options):
