@@ -135,8 +135,8 @@ KERNEL = """
 from pathlib import Path
 
 import pytest
-from v2hdm.adjust.engines.numba import build
-build.PLACES = (Path({place!r}),)
+from v2hdm import compiled
+compiled.PLACES = (Path({place!r}),)
 import numpy as np
 from v2hdm.adjust.engines.numba.engine import _gather
 out = np.zeros((1, 1))

@@ -4,8 +4,11 @@ import errno
 import io
 import json
 import os
+import queue
 import re
 import shutil
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, e
 from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.frames import Frame
 from v2hdm.detection.road import RoadDetector, draw_detections
 from v2hdm.detection.stopwatch import TOTAL, Stopwatch, lap
 from v2hdm.io.calibration.reading import Provenance
@@ -190,6 +194,81 @@ def test_what_an_unplugged_camera_saw_is_kept(bench, tmp_path, monkeypatch, caps
     assert bench.run(0, "--output", output) == 2
     assert "camera 0: gives no image after 3 frames" in capsys.readouterr().err
     assert len(lines(output.read_text())) == 3
+
+
+def test_a_slow_detector_gets_the_newest_frame_and_the_number_of_those_dropped():
+    given, read = queue.Queue(), queue.Queue()
+
+    def camera():
+        for index in iter(given.get, None):
+            yield Frame("camera 0", f"{index}", index, time.time(), np.zeros((2, 2, 3), np.uint8))
+            read.put(index)
+
+    newest, found, total = frames.NewestFrames(camera()), [], 0
+    for burst in (1, 5, 2, 10):
+        for _ in range(burst):  # while the detector is busy
+            given.put(total)
+            total += 1
+            read.get(timeout=10)
+        found.append(next(newest))
+    assert [frame.index for frame in found] == [0, 5, 7, 17]
+    assert [frame.dropped for frame in found] == [0, 4, 1, 9]
+    given.put(None)
+    with pytest.raises(StopIteration):
+        next(newest)
+
+
+def test_images_of_a_camera_grow_no_older_when_the_detector_is_slow(bench, tmp_path, monkeypatch, capsys):
+    image = picture(make_camera(), DIAMONDS)
+
+    class Fast(FakeCapture):
+        def read(self):
+            time.sleep(0.002)
+            return True, image
+
+    monkeypatch.setattr(frames.cv2, "VideoCapture", Fast)
+    output = tmp_path / "found.jsonl"
+    assert bench.run(0, "--live", "--output", output, "--limit", 12) == 0
+    found = lines(output.read_text())
+    assert len(found) == 12
+    assert [one["frame"] for one in found] == (np.cumsum([one["dropped"] + 1 for one in found]) - 1).tolist()
+    said = capsys.readouterr().err
+    assert f"{sum(one['dropped'] for one in found)} images dropped" in said
+    assert sum(one["dropped"] for one in found) > 12
+    age_ms, total_ms = (float(re.search(rf"^{row} +([0-9.]+)", said, re.M)[1]) for row in ("age", "all"))
+    assert age_ms < total_ms + 50
+
+
+def test_of_a_folder_that_grows_the_newest_whole_image_is_taken(bench, tmp_path, caplog):
+    image = (bench.folder / "0.png").read_bytes()
+
+    def write(name, content=image, old_s=0.0):
+        (tmp_path / name).write_bytes(content)
+        stamp_s = time.time() - old_s
+        os.utime(tmp_path / name, (stamp_s, stamp_s))
+
+    write("9.png", old_s=20)
+    write("1.png", old_s=10)
+    arriving = frames.arriving_frames(tmp_path)
+    first = next(arriving)
+    assert (first.name, first.dropped) == ("9", 0)
+    for k, name in enumerate(("b", "a", "c")):
+        write(f"{name}.png", old_s=9 - k)
+    taken = next(arriving)
+    assert (taken.name, taken.index) == ("c", 1)
+    assert taken.stamp_s == pytest.approx(time.time() - 7, abs=5)
+    write("d.png", image[:200])
+    threading.Timer(0.1, write, ["d.png"]).start()
+    assert next(arriving).name == "d"
+    write("e.png", image[:200], old_s=60)
+    threading.Timer(0.1, write, ["f.png"]).start()
+    assert next(arriving).name == "f"
+    assert "e.png" in caplog.text
+
+
+def test_only_what_brings_new_images_is_live(bench, capsys):
+    assert bench.run(bench.folder / "0.png", "--live") == 2
+    assert "--live" in capsys.readouterr().err
 
 
 def not_finite(model, path):

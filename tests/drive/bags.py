@@ -184,11 +184,11 @@ def mountings() -> dict[str, FloatArray]:
     return {"front": looking_forward(2.0), "rear": looking_forward(3.0)}
 
 
-def write_ros1(path: Path, made: Messages, compressed: bool = False) -> Path:
+def write_ros1(path: Path, made: Messages, compression: str | None = None) -> Path:
     path = path.with_suffix(".bag")
     writer = Writer1(path)
-    if compressed:
-        writer.set_compression(Writer1.CompressionFormat.LZ4)
+    if compression:
+        writer.set_compression(Writer1.CompressionFormat[compression.upper()])
     with writer:
         _write(writer, made, ROS1.serialize_ros1, ROS1)
     return path

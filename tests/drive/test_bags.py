@@ -1,5 +1,6 @@
 """One drive in every container is the same drive; damaged containers end in one line."""
 
+import bz2
 import json
 import logging
 import re
@@ -7,17 +8,21 @@ import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
 import yaml
 from backports import zstd
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from rosbags.rosbag1 import reader as reader1
+from rosbags.rosbag2 import CompressionMode, StoragePlugin, storage_mcap
+from rosbags.rosbag2 import reader as reader2
 
 from tests.drive.bags import (
     VIDEO,
@@ -38,9 +43,10 @@ from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
 from v2hdm.io.drive.sources import _import_video
+from v2hdm.io.importers.bag import reading
 from v2hdm.io.importers.bag.describe import list_topics
 from v2hdm.io.importers.bag.messages import file_of
-from v2hdm.io.importers.bag.streams import ImageStream, import_streams
+from v2hdm.io.importers.bag.streams import ImageStream, TfStream, import_streams
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +67,7 @@ def _ros2(storage, compression):
 SQLITE3, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
 CONTAINERS: dict[str, Callable[[Path, Path], Path]] = {
     "ros1": lambda path, folder: write_ros1(path, messages_of(folder, ros1=True)),
-    "ros1 lz4": lambda path, folder: write_ros1(path, messages_of(folder, ros1=True), compressed=True),
+    "ros1 lz4": lambda path, folder: write_ros1(path, messages_of(folder, ros1=True), "lz4"),
     "sqlite3": _ros2(SQLITE3, CompressionMode.NONE),
     "sqlite3 zstd file": _ros2(SQLITE3, CompressionMode.FILE),
     "sqlite3 zstd message": _ros2(SQLITE3, CompressionMode.MESSAGE),
@@ -443,9 +449,74 @@ def test_zeros_that_would_unpack_to_all_of_the_memory_are_refused(mode, folder, 
         read(tmp_path / "drive", described(folder, bag))
 
 
-def _video(path, frames=20):
+PACKED: dict[str, Callable[[Path, Messages], Path]] = {
+    "ros1 lz4": lambda path, made: write_ros1(path, made, "lz4"),
+    "ros1 bz2": lambda path, made: write_ros1(path, made, "bz2"),
+    "mcap zstd chunks": lambda path, made: write_ros2(path, made, MCAP, CompressionMode.STORAGE),
+}
+
+
+@pytest.mark.parametrize("kind", PACKED)
+def test_chunks_of_zeros_are_refused_and_no_memory_is_asked_for(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "_SPARE_BYTES", 1_000_000)
+    made = Messages(kind.startswith("ros1"))
+    zeros = np.zeros((2000, 4000, 3), dtype=np.uint8)
+    made.add(1.0, "/image", made.raw_image(1.0, zeros, "rgb8", "front"))
+    bag = PACKED[kind](tmp_path / "bag", made)
+    (file,) = [bag] if bag.is_file() else bag.glob("*.mcap")
+    assert file.stat().st_size < 200_000
+    with pytest.raises(DriveError, match="unpacks to more than a recording would") as refused:
+        import_streams(bag, [ImageStream("/image", "header", "here")], tmp_path / "cache")
+    assert "\n" not in str(refused.value)
+
+
+def test_no_decompressor_of_a_bag_is_without_a_limit(monkeypatch):
+    """What rosbags may learn to unpack one day, too."""
+    monkeypatch.setattr(reading, "_SPARE_BYTES", 1_000_000)
+    reading._limit_unpacking()
+    pack = {"lz4": lz4.frame.compress, "zstd": zstd.compress, "bz2": bz2.compress}
+    for unpackers in (storage_mcap.DECOMPRESSORS, reader1.decompressors):
+        for name, unpack in unpackers.items():
+            if name not in ("", "none"):
+                assert len(unpack(pack[name](bytes(1_000_000)), 1_000_000)) == 1_000_000
+                with pytest.raises(DriveError, match="unpacks to more than a recording would"):
+                    unpack(pack[name](bytes(30_000_000)), 30_000_000)
+    packed = zstd.compress(bytes(30_000_000))
+    with pytest.raises(DriveError, match="unpacks to more than a recording would"):
+        reader2.zstd.decompress(packed)
+
+
+def test_a_lens_that_changes_within_a_recording_is_refused(folder, tmp_path):
+    made = messages_of(folder)
+    infos = [n for n, (_, topic, _) in enumerate(made.rows) if topic == "/sensing/front/camera_info"]
+    stamp_s, topic, last = made.rows[infos[-1]]
+    zoomed = replace(last, k=last.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1])
+    made.rows[infos[-1]] = stamp_s, topic, zoomed
+    with pytest.raises(DriveError, match=rf"message {len(infos)} states another lens than the first"):
+        read(tmp_path / "drive", described(folder, write_ros2(tmp_path / "bag", made)))
+
+
+def test_a_frame_whose_name_has_a_tab_is_refused(folder, tmp_path):
+    made = messages_of(folder, mounted={**mountings(), "a\tb": mountings()["front"]})
+    bag = write_ros2(tmp_path / "bag", made)
+    with pytest.raises(DriveError, match="a frame is named") as refused:
+        import_streams(bag, [TfStream(False, "here")], tmp_path / "cache")
+    assert "\t" not in str(refused.value)
+
+
+def test_stamps_of_messages_that_are_texts_end_in_one_line(folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("UPDATE messages SET timestamp = 'noon'")
+    database.close()
+    with pytest.raises(DriveError, match="not readable as a bag"):
+        read(tmp_path / "drive", described(folder, bag))
+
+
+def _video(path, frames=20, codec="mpeg4", **options):
     with av.open(str(path), "w") as container:
-        track = container.add_stream("mpeg4", rate=10)
+        track = container.add_stream(codec, rate=10, options=options)
         track.width, track.height = 320, 240
         rng = np.random.default_rng(1)
         for _ in range(frames):
@@ -453,6 +524,37 @@ def _video(path, frames=20):
             container.mux(track.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
         container.mux(track.encode(None))
     return path.read_bytes()
+
+
+def test_a_flipped_bit_in_a_video_whose_pictures_carry_hashes_is_reported(tmp_path, caplog):
+    """The decoder of H.265 conceals it without a word."""
+    path, params = tmp_path / "a.mkv", {"x265-params": "hash=1:log-level=none:keyint=10"}
+    flipped = bytearray(_video(path, codec="libx265", **params))
+    _import_video(path, tmp_path / "whole", "here")
+    assert "complains" not in caplog.text
+    flipped[len(flipped) // 2] ^= 16
+    path.write_bytes(flipped)
+    _import_video(path, tmp_path / "flipped", "here")
+    assert re.search(r"a\.mkv: frame \d+: the decoder complains", caplog.text)
+
+
+def test_damage_that_the_decoder_of_a_topics_video_conceals_is_reported_once(tmp_path, caplog):
+    path, made = tmp_path / "a.mkv", Messages()
+    _video(path, codec="libx264", bf="0")
+    with av.open(str(path)) as container:
+        start = av.BitStreamFilterContext("h264_mp4toannexb", container.streams.video[0])
+        packets = [bytes(one) for packet in container.demux(video=0) for one in start.filter(packet)]
+    for number, packet in enumerate(filter(None, packets)):
+        damaged = bytearray(packet)
+        if number > 5:
+            damaged[len(packet) // 2 :] = bytes(len(packet) - len(packet) // 2)
+        stamp, data = made.header(1.0 + number, "cam").stamp, np.frombuffer(damaged, np.uint8)
+        fields = {"timestamp": stamp, "frame_id": "cam", "data": data, "format": "h264"}
+        made.add(1.0 + number, "/video", made.make(VIDEO, **fields))
+    stream = ImageStream("/video", "header", "here")
+    import_streams(write_ros2(tmp_path / "bag", made), [stream], tmp_path / "cache")
+    assert re.search(r"/video: packet 7: the decoder complains", caplog.text)
+    assert caplog.text.count("complains") == 1
 
 
 def test_a_video_that_is_cut_off_turned_or_a_playlist_is_reported(tmp_path, caplog):

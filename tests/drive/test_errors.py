@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from tests.drive.example import make_drive
-from v2hdm.errors import DriveError
-from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.errors import DriveError, MapFileError
+from v2hdm.io.drive import ReadOptions, read_drive, truth
 from v2hdm.io.drive.truth import read_truth
+from v2hdm.report.page import facts
 
 Damage = Callable[[Path], None]
 
@@ -194,3 +195,15 @@ def test_a_region_of_which_the_image_shows_a_part_is_taken_whatever_the_sign_of_
     ipm = {name: (sign * np.array(m)).tolist() for name, m in content["cameras"]["front"]["ipm"].items()}
     front(ipm=ipm, roi_vehicle=[[-1.0, -9.0], [30.0, -9.0], [30.0, 9.0], [-1.0, 9.0]])(tmp_path)
     assert read_drive(tmp_path).images
+
+
+@pytest.mark.parametrize(
+    ("read", "error"),
+    [(lambda path: list(truth._rows(path, ["a", "b"])), DriveError), (facts._table, MapFileError)],
+    ids=["truth", "result"],
+)
+def test_a_cell_that_is_longer_than_csv_takes_is_one_line(read, error, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n1," + "x" * 140_000 + "\n")
+    with pytest.raises(error, match=r"a\.csv: .*larger than field limit"):
+        read(path)

@@ -10,6 +10,8 @@ import errno
 import json
 import os
 import sys
+import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -49,24 +51,30 @@ def run(arguments: Sequence[str]) -> None:
     parser.add_argument("--model", help="ONNX file of the detector (default: the one that is shipped)")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network (default: 1)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="look at the newest image of a camera, or of a folder that grows, and drop those before it",
+    )
     parser.add_argument("--output", type=Path, help="file for the JSON lines (default: stdout)")
     parser.add_argument("--draw", type=Path, metavar="DIR", help="folder of the images with detections drawn")
     _detect(parser.parse_args(arguments))
 
 
 def _detect(parsed: argparse.Namespace) -> None:
-    """Detect; a live camera is watched until Ctrl-C, which any other source raises on without a file."""
+    """Detect; what is live is watched until Ctrl-C, which any other source raises on without a file."""
     import cv2
 
     from v2hdm.detection.options import DetectorOptions
     from v2hdm.detection.road import as_record, draw_detections
-    from v2hdm.detection.stopwatch import Stopwatch
+    from v2hdm.detection.stopwatch import KEPT, Stopwatch
     from v2hdm.detection.weights import unknown_network
     from v2hdm.pipeline.detect_images import detect_images
     from v2hdm.store.results import growing_folder
 
     cv2.setNumThreads(1)
-    stopwatch, live = Stopwatch(), parsed.source.isdecimal()
+    stopwatch, live = Stopwatch(), parsed.live or parsed.source.isdecimal()
+    dropped, age_s = 0, deque[float](maxlen=KEPT)
     frames = detect_images(
         parsed.source,
         camera=parsed.camera,
@@ -75,6 +83,7 @@ def _detect(parsed: argparse.Namespace) -> None:
         linear=parsed.linear,
         detector=DetectorOptions(model=parsed.model, threads=parsed.threads),
         limit=parsed.limit,
+        live=parsed.live,
         stopwatch=stopwatch,
     )
     failure = None
@@ -83,7 +92,13 @@ def _detect(parsed: argparse.Namespace) -> None:
     with folder as drawings, _lines(parsed.output) as stream:
         try:
             for frame, camera, road in frames:
-                print(json.dumps(as_record(frame, camera, road)), file=stream, flush=live)
+                record = as_record(frame, camera, road)
+                if parsed.live:
+                    record["dropped"] = frame.dropped
+                print(json.dumps(record), file=stream, flush=live)
+                if parsed.live:
+                    dropped += frame.dropped
+                    age_s.append(time.time() - (frame.stamp_s or 0.0))
                 if drawings is not None:
                     markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
                     drawn = draw_detections(frame.pixels, markings, lanes)
@@ -96,7 +111,9 @@ def _detect(parsed: argparse.Namespace) -> None:
             if not (live and stopwatch.images):
                 raise
             failure = error  # hours of a camera that was unplugged are kept
-    _report(stopwatch)
+    _report(stopwatch, age_s)
+    if parsed.live and stopwatch.images:
+        print(f"{dropped} images dropped, since newer ones had come", file=sys.stderr)
     unknown = unknown_network(parsed.model) if parsed.model is not None else None
     if unknown is not None:
         print(unknown, file=sys.stderr)
@@ -136,7 +153,7 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
         raise DriveError(line) from error
 
 
-def _report(stopwatch: Stopwatch) -> None:
+def _report(stopwatch: Stopwatch, age_s: Sequence[float]) -> None:
     import numpy as np
 
     from v2hdm.detection.stopwatch import TOTAL
@@ -150,6 +167,8 @@ def _report(stopwatch: Stopwatch) -> None:
     times_s = {stage: stopwatch.times_s(stage) for stage in dict.fromkeys([*first, *stopwatch.stages])}
     times_s["other"] = stopwatch.times_s(TOTAL) - sum(times_s.values())
     times_s[TOTAL] = stopwatch.times_s(TOTAL)
+    if age_s:  # from when a live image came to when its detections were written
+        times_s["age"] = np.array(age_s)
     for stage, seconds in times_s.items():
         p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
         print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)

@@ -1,13 +1,14 @@
-"""Images one after another: from files, a video or a live camera."""
+"""Images one after another: from files, a video, a live camera or a folder that grows."""
 
 from __future__ import annotations
 
 import logging
 import os
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,9 @@ _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Suffixes of images in a folder."""
+
+_POLL_S = 0.005  # a folder that grows is looked at this often
+_WRITTEN_S = 1.0  # an image is written within this time
 
 # Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
@@ -48,7 +52,8 @@ class Frame:
     """One image (H, W, 3) uint8 BGR to look at.
 
     ``source`` is its file, or the video or camera it comes from, ``index`` its number there. ``stamp_s`` is
-    the time within a video, Unix time for a live camera, None for a file. ``name`` is unique.
+    the time within a video, Unix time for a live camera, None for a file. ``name`` is unique. ``dropped``
+    counts the live images before it that nobody has looked at, since newer ones came.
     """
 
     source: str
@@ -56,6 +61,7 @@ class Frame:
     index: int
     stamp_s: float | None
     pixels: np.ndarray
+    dropped: int = 0
 
 
 def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
@@ -120,6 +126,79 @@ def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[
             name = f"camera{number}_{count - 1:06d}"
             yield Frame(f"camera {number}", name, count - 1, time.time(), pixels)
         raise DriveError(f"camera {number}: gives no image after {count} frames; check its cable")
+
+
+class NewestFrames(Iterator[Frame]):
+    """The newest frame of a camera whenever one is asked for: a thread reads and drops those before it."""
+
+    def __init__(self, frames: Iterator[Frame]) -> None:
+        self._newest: Frame | None = None
+        self._end: BaseException | None = None
+        self._changed = threading.Condition()
+        threading.Thread(target=self._read, args=(frames,), name="v2hdm-camera", daemon=True).start()
+
+    def _read(self, frames: Iterator[Frame]) -> None:
+        end: BaseException = StopIteration()
+        try:
+            for frame in frames:
+                with self._changed:
+                    before = self._newest
+                    dropped = 0 if before is None else before.dropped + 1
+                    self._newest = replace(frame, dropped=dropped)
+                    self._changed.notify()
+        except BaseException as error:  # for the one who asks for frames
+            end = error
+        with self._changed:
+            self._end = end
+            self._changed.notify()
+
+    def __next__(self) -> Frame:
+        """Wait for a frame that was not given yet; raises what the camera did, after its last one."""
+        with self._changed:
+            while self._newest is None and self._end is None:
+                self._changed.wait(1.0)  # Windows takes Ctrl-C only between waits
+            frame, self._newest = self._newest, None
+            if frame is not None:
+                return frame
+        assert self._end is not None
+        raise self._end
+
+
+def arriving_frames(folder: Path) -> Iterator[Frame]:
+    """The newest image of a folder that somebody writes to, each time that one is asked for; never ends.
+
+    Its time is when it was written. Images that were there before the newest one at the start do not count
+    as dropped. One that cannot be read a second after it was written is left out with a warning.
+
+    Raises:
+        DriveError: the folder cannot be read.
+    """
+    known, index = {path.name for path in list_images(folder)[:-1]}, 0
+    while True:
+        came = {path: _written_s(path) for path in list_images(folder) if path.name not in known}
+        if not came:
+            time.sleep(_POLL_S)
+            continue
+        newest = max(came, key=lambda path: (came[path], path.name))
+        try:
+            pixels = read_bgr(newest)
+        except DriveError as error:
+            if time.time() - came[newest] > _WRITTEN_S:
+                _log.warning("%s", error)
+                known.add(newest.name)
+            time.sleep(_POLL_S)
+            continue
+        known.update(path.name for path in came)
+        yield Frame(str(newest), newest.stem, index, came[newest], pixels, len(came) - 1)
+        index += 1
+
+
+def _written_s(path: Path) -> float:
+    """When a file was written, Unix time; 0 if it is gone."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 @contextmanager

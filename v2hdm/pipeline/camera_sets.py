@@ -7,15 +7,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import parent_process
 
+from v2hdm.errors import WorkerError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.survey import Survey, compare_survey
+from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
 from v2hdm.site.changes import Base
+from v2hdm.store.cache import Line, log_again, recorded
+from v2hdm.workers import side_by_side
 
 _log = logging.getLogger(__name__)
 
@@ -54,39 +59,76 @@ def map_camera_sets(
     against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
     no map can be made, AdjustError where the adjustment fails.
     """
-    sets, cache = camera_sets(drive), context.cache
+    cache, sets = context.cache, camera_sets(drive)
     begun = cache.key(drive_key, list(detections), survey.mapping)
-    context.progress("map", 0, len(sets))
-    found: dict[str, MappedSet] = {}
-    for name, cameras in sets.items():
-        last = name == list(sets)[-1]
-        now = base if last else None
-        work = partial(_map_set, drive, detections, name, cameras, survey, now, last)
-        key = cache.key(begun, name, cameras, (base, survey.check) if last else None)
-        found[name] = mapped = cache.get_or_make(STAGE, key, MappedSet, work)
-        context.viewer.mapped(name, mapped.methods)
+    *single, last = sets
+    keys = {name: cache.key(begun, name, sets[name], None) for name in single}
+    keys[last] = cache.key(begun, last, sets[last], (base, survey.check))
+    known = {name: cache.get(STAGE, key, MappedSet) for name, key in keys.items()}
+    found = {name: mapped for name, mapped in known.items() if mapped is not None}
+    context.progress("map", len(found), len(sets))
+
+    def take(made: tuple[str, MappedSet, list[Line]]) -> None:
+        name, mapped, lines = made
+        found[name] = cache.put(STAGE, keys[name], MappedSet, mapped, lines)
         context.progress("map", len(found), len(sets))
-    return found
+
+    work = _Work(drive, detections, survey, base, last)
+    # The largest first, so that processes end together.
+    todo = [
+        (name, sets[name]) for name in sorted(sets, key=lambda name: -len(sets[name])) if name not in found
+    ]
+    if len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and work.is_large:
+        for _, made in side_by_side(work, todo, context.processes, lambda *_: None):
+            if isinstance(made, WorkerError):
+                raise made
+            log_again(made[2])
+            take(made)
+    else:
+        for job in todo:
+            take(work(job))
+    for name in sets:
+        context.viewer.mapped(name, found[name].methods)
+    return {name: found[name] for name in sets}
 
 
-def _map_set(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    name: str,
-    cameras: Sequence[str],
-    survey: Survey,
-    base: Base | None,
-    last: bool,
-) -> MappedSet:
-    log, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
-    methods = run_methods(drive, detections, cameras, survey.mapping, log, base, grey_reader(drive))
-    best = methods[BEST]
-    checked = compare_survey(survey, drive, best) if last else None
-    # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.
-    methods[BEST] = replace(best, corners=None)
-    took_s = time.perf_counter() - begin_s
-    _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
-    for exclusion in best.excluded:
-        where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
-        _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
-    return MappedSet(methods, checked)
+_Job = tuple[str, Sequence[str]]  # the name of a set, and its cameras
+_WORTH_PROCESSES = 4000  # detected markings whose mapping takes as long as processes take to start
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Everything that the sets of cameras of a drive are mapped from; ``last`` is the one of all cameras."""
+
+    drive: Drive
+    detections: Sequence[ImageDetections]
+    survey: Survey
+    base: Base | None
+    last: str
+
+    @property
+    def is_large(self) -> bool:
+        """Whether processes are worth their start."""
+        return sum(len(found.markings) for found in self.detections) > _WORTH_PROCESSES
+
+    def __call__(self, job: _Job, _: Progress = silent) -> tuple[str, MappedSet, list[Line]]:
+        """Map one set of cameras; returns its name, the result and what was logged."""
+        if parent_process() is not None:
+            logging.getLogger("v2hdm").setLevel(logging.DEBUG)
+        with recorded() as lines:
+            return job[0], self._map(*job), lines
+
+    def _map(self, name: str, cameras: Sequence[str]) -> MappedSet:
+        begin_s, drive, survey = time.perf_counter(), self.drive, self.survey
+        log, base = partial(_log.debug, "%s: %s", name), self.base if name == self.last else None
+        methods = run_methods(drive, self.detections, cameras, survey.mapping, log, base, grey_reader(drive))
+        best = methods[BEST]
+        checked = compare_survey(survey, drive, best) if name == self.last else None
+        # The factors of the adjustment are large; whoever needs more of them asks while they are here.
+        methods[BEST] = replace(best, corners=None)
+        took_s = time.perf_counter() - begin_s
+        _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
+        for exclusion in best.excluded:
+            where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
+            _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
+        return MappedSet(methods, checked)

@@ -17,6 +17,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import (
     IMAGE_SUFFIXES,
     Frame,
+    NewestFrames,
+    arriving_frames,
     camera_frames,
     image_frames,
     list_images,
@@ -65,6 +67,7 @@ def detect_images(
     linear: bool = False,
     detector: Detector | DetectorOptions | None = None,
     limit: int | None = None,
+    live: bool = False,
     stopwatch: Stopwatch | None = None,
 ) -> Iterator[Detected]:
     """Find markings and lanes in images one after another; the base install is enough.
@@ -77,6 +80,8 @@ def detect_images(
         linear: grey values are proportional to light, not sRGB.
         detector: the detector, or its settings.
         limit: stop after so many images.
+        live: of a camera, or a folder that somebody writes images to, take the newest image each time; those
+            that came before it are dropped and counted (``frame.dropped``).
         stopwatch: takes the time of each stage.
 
     Returns:
@@ -103,7 +108,7 @@ def detect_images(
         detector = Detector.load(options=options)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
     rough = _Rough(detector, lens, path, mounting, linear=linear)
-    frames = islice(_frames(str(source), road, rough), limit)
+    frames = islice((_live_frames if live else _frames)(str(source), road, rough), limit)
     return _found(frames, rough, stopwatch or Stopwatch())
 
 
@@ -227,9 +232,7 @@ def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
                 f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
                 "or start from another folder for the camera"
             )
-        info = rough.lens or (road and road.camera.info)
-        frames = camera_frames(int(source), (info.width, info.height) if info else None)
-        return ((frame, road) for frame in frames)
+        return ((frame, road) for frame in _of_camera(int(source), road, rough))
     if not path.exists():
         raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
     paths = list_images(path) if path.is_dir() else [path]
@@ -245,6 +248,23 @@ def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
         rough.folder = paths
     is_video = not path.is_dir() and path.suffix.lower() not in IMAGE_SUFFIXES
     return ((frame, road) for frame in (video_frames(path) if is_video else image_frames(paths)))
+
+
+def _of_camera(number: int, road: RoadDetector | None, rough: _Rough) -> Iterator[Frame]:
+    info = rough.lens or (road and road.camera.info)
+    return camera_frames(number, (info.width, info.height) if info else None)
+
+
+def _live_frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
+    """The newest frame each time, of a camera or a folder."""
+    path = Path(source)
+    if source.isdecimal() and not path.exists():
+        frames: Iterator[Frame] = NewestFrames(_of_camera(int(source), road, rough))
+    elif path.is_dir():
+        frames = arriving_frames(path)
+    else:
+        raise ConfigError(f"--live: {path} is no camera's index and no folder; only these bring new images")
+    return ((frame, road) for frame in frames)
 
 
 def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Frames:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
+from v2hdm.adjust.ahead import compiled_meanwhile
 from v2hdm.detection.batch import detect_images
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -117,7 +118,8 @@ def map_drive(
     unjudged = Result(about, read.drives, read.contents, described, seconds, options.device)
     try:
         with closing(context.viewer):
-            detections = _detect(checked.drive, read.contents, settings, context)
+            with compiled_meanwhile(options.device):
+                detections = _detect(checked.drive, read.contents, settings, context)
             with context.timed("map"):
                 key = read.contents.key(checked.drive)
                 sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)

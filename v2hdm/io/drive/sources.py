@@ -21,7 +21,7 @@ from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
-from v2hdm.io.safe.pixels import VIDEO_OPTIONS, png
+from v2hdm.io.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
@@ -197,6 +197,7 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
                 av.open(str(path), options=VIDEO_OPTIONS) as container,
             ):
                 promised_s = (container.duration or 0) / av.time_base
+                container.streams.video[0].codec_context.options = DECODER_OPTIONS
                 for frame in container.decode(video=0):
                     where = f"{path}: frame {len(stamps) + 1}"
                     if frame.rotation:

@@ -139,10 +139,13 @@ def _read_lane_visible(path: Path, hd_map: HdMap) -> tuple[BoolArray, ...]:
 def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
     """The rows of a CSV file below its header, each with its place for messages."""
     reader = csv.reader(io.StringIO(read_text(path, DriveError)))
-    if next(reader, None) != list(columns):
-        raise DriveError(f"{path}: line 1: expected the header '{','.join(columns)}'; add it")
-    for row in reader:
-        where = f"{path}: line {reader.line_num}"
-        if len(row) != len(columns):
-            raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; mend that line")
-        yield where, row
+    try:
+        if next(reader, None) != list(columns):
+            raise DriveError(f"{path}: line 1: expected the header '{','.join(columns)}'; add it")
+        for row in reader:
+            where = f"{path}: line {reader.line_num}"
+            if len(row) != len(columns):
+                raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; mend that line")
+            yield where, row
+    except csv.Error as failure:
+        raise DriveError(f"{path}: line {reader.line_num}: {failure}; mend that line") from None

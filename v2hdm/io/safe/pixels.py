@@ -53,6 +53,8 @@ VIDEO_OPTIONS = {
     "format_whitelist": "mov,matroska,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,ivf,obu,asf,flv,ogg,mjpeg,mxf",
 }
 """FFmpeg's, without which a file of another format, such as a playlist, makes it open other files."""
+DECODER_OPTIONS = {"err_detect": "crccheck"}
+"""FFmpeg's, without which hashes of pictures that a video of H.265 carries are not looked at."""
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 

@@ -160,7 +160,10 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
 def _table(path: Path) -> tuple[tuple[str, ...], ...]:
     if not path.is_file():
         return ()
-    return tuple(tuple(row) for row in csv.reader(io.StringIO(read_text(path, MapFileError))) if row)
+    try:
+        return tuple(tuple(row) for row in csv.reader(io.StringIO(read_text(path, MapFileError))) if row)
+    except csv.Error as failure:
+        raise MapFileError(f"{path}: {failure}; map the drive again") from None
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
+from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.scene import Dapple, Ground, GroundMarks, Paint, Shadow
-from v2hdm.simulate.render.textures import Float32, Tile, fade, noise_tile, photo_tile, sample, smoothstep
-from v2hdm.simulate.render.view import Outline, View, coverage, following_row, in_view, outlines, windows
+from v2hdm.simulate.render.textures import (
+    Float32,
+    Tile,
+    fade,
+    noise_tile,
+    photo_tile,
+    sample,
+    scale_of,
+    smoothstep,
+)  # fmt: skip
+from v2hdm.simulate.render.view import (
+    Outline,
+    View,
+    bands_of,
+    edges_of,
+    following_row,
+    in_view,
+    outlines,
+    windows,
+)  # fmt: skip
 
 _FARTHEST_M = 400.0
 _SHADOWS_TO_M = 90.0
@@ -31,6 +50,11 @@ class GroundField:
     depth_m: Float32
     footprint_m: Float32
     below: NDArray[np.bool_]
+
+    @property
+    def planes(self) -> tuple[Float32, Float32, Float32]:
+        """``x_m``, ``y_m`` and ``footprint_m``."""
+        return self.x_m, self.y_m, self.footprint_m
 
     def rows(self, window: tuple[slice, slice]) -> tuple[slice, slice]:
         """A window of the image as a window of these arrays."""
@@ -83,14 +107,10 @@ def tone(ground: Ground, field: GroundField) -> Float32:
     """Relative reflectance (H, W) of the bare, dry ground, about 1."""
     shift = _shift(ground.seed)
     fine = fine_tile(ground.texture)
-    out = sample(fine, field.x_m, field.y_m, shift)
-    out *= fade(fine, field.footprint_m) * np.float32(ground.contrast)
-    medium = sample(MEDIUM_TILE, field.x_m, field.y_m, shift)
-    medium *= fade(MEDIUM_TILE, field.footprint_m) * np.float32(0.6 * ground.stains)
-    out += medium
-    out += _sample_smooth(COARSE_TILE, field, shift) * np.float32(0.8 * ground.stains)
-    out += np.float32(1.0)
-    np.clip(out, 0.25, 2.5, out=out)
+    scales = np.array([scale_of(fine, shift), scale_of(MEDIUM_TILE, shift)], dtype=np.float32)
+    amplitudes = np.array([ground.contrast, 0.6 * ground.stains, 0.8 * ground.stains], dtype=np.float32)
+    coarse, out = _sample_smooth(COARSE_TILE, field, shift), np.empty_like(field.x_m)
+    kernels.ground_tone((fine.padded, MEDIUM_TILE.padded), scales, amplitudes, coarse, field.planes, out)
     if ground.slab_m is not None:
         _slabs(ground, ground.slab_m, field, out)
     if ground.marks is not None:
@@ -137,10 +157,10 @@ def _marks(marks: GroundMarks, field: GroundField, out: Float32) -> None:
     out *= factor.astype(np.float32) * np.float32(1.0 / 128.0)
 
 
-def wetness(ground: Ground, field: GroundField) -> Float32 | None:
-    """How wet (H, W) the ground is, 0 dry to 1 standing water, or None when it is dry everywhere."""
+def wetness(ground: Ground, field: GroundField) -> Float32:
+    """How wet (H, W) the ground is, 0 dry to 1 standing water; of no size when it is dry everywhere."""
     if ground.wet_fraction <= 0:
-        return None
+        return np.empty((0, 0), dtype=np.float32)
     level = float(np.quantile(WET_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
     values = _sample_smooth(WET_TILE, field, _shift(ground.seed + 1))
     return smoothstep(values, level - 0.1, level + 0.3)
@@ -177,25 +197,20 @@ def _on_ground_px(view: View, polygon_map: FloatArray) -> FloatArray:
 
 
 def _cast(shadow: Shadow, shape: Outline, view: View, field: GroundField, out: Float32) -> None:
-    polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
-    for window in windows(view, shape, field.first_row):
-        part = field.rows(window)
-        soft = np.float32(1.0) / (np.float32(shadow.softness_m) + field.footprint_m[part])
-        dark = _ground_coverage(polygon, field.x_m[part], field.y_m[part], soft)
-        out[part] = np.minimum(out[part], np.float32(1.0) - dark * np.float32(1.0 - shadow.transmission))
+    lines, first = _inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64)), field.first_row
+    softness_m, darkness = np.float32(shadow.softness_m), np.float32(1.0 - shadow.transmission)
+    kernels.cast_shadow(*bands_of(view, shape, first), first, lines, softness_m, darkness, field.planes, out)
 
 
-def _ground_coverage(polygon: NDArray[np.float64], x: Float32, y: Float32, sharpness: Float32) -> Float32:
-    """Coverage of ground points by a convex polygon whose border is 1 / sharpness metres wide."""
+def _inward_lines(polygon: NDArray[np.float64]) -> Float32:
+    """Lines (N, 3) of a convex polygon's sides: x n - d is the distance of a point inwards, n first."""
     following = following_row(polygon)
     edge = following - polygon
     area2 = float((polygon[:, 0] * following[:, 1] - following[:, 0] * polygon[:, 1]).sum())
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) * np.sign(area2)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    least = np.full_like(x, np.inf)
-    for n, p in zip(normal, polygon, strict=True):
-        np.minimum(least, x * np.float32(n[0]) + y * np.float32(n[1]) - np.float32(n @ p), out=least)
-    return np.asarray(np.clip(least * sharpness + np.float32(0.5), 0, 1))
+    along = [n @ p for n, p in zip(normal, polygon, strict=True)]
+    return np.column_stack([normal, along]).astype(np.float32)
 
 
 def _dapple(dapple: Dapple, view: View, field: GroundField, out: Float32) -> None:
@@ -215,7 +230,8 @@ def _dapple(dapple: Dapple, view: View, field: GroundField, out: Float32) -> Non
         lit = lit * amplitude + (np.float32(1.0) - amplitude) * np.float32(1.0 - dapple.shaded)
         dark = (np.float32(1.0) - lit) * np.float32(1.0 - dapple.transmission)
         if region is not None:
-            dark *= _ground_coverage(region, x, y, np.full_like(x, 2.0))
+            least = np.min([x * a + y * b - d for a, b, d in _inward_lines(region)], axis=0)
+            dark *= np.clip(least * np.float32(2.0) + np.float32(0.5), 0, 1)
         out[part] *= np.float32(1.0) - dark
 
 
@@ -243,47 +259,29 @@ class PaintLayer:
             row[: len(polygon), :2] = polygon
             row[len(polygon) :, :2] = polygon[-1]
 
-    def draw(self, view: View, field: GroundField, albedo: list[Float32], labels: Labels) -> None:
-        """Paint onto the ground field's three planes of ``albedo`` (H', W) and into ``labels`` (H, W)."""
+    def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
+        """Paint onto the ground field's ``albedo`` (H', W, 3) and into ``labels`` (H, W)."""
         homogeneous = view.homogeneous_px(self._vertices)
         seen = in_view(view, homogeneous, _FARTHEST_PAINT_M)
         paints = [self._paints[index] for index in seen]
         polygons = [homogeneous[k, : len(one.polygon_map)] for k, one in zip(seen, paints, strict=True)]
+        rays, first = (view.rays.u_pinhole_px, view.rays.v_pinhole_px), field.first_row
+        tiles = [_WEAR_TILE, MEDIUM_TILE, fine_tile("asphalt")]
+        padded = tuple(tile.padded for tile in tiles)
         for paint, shape in zip(paints, outlines(view, polygons), strict=True):
             if shape is None:
                 continue
-            label = self._label[paint.kind]
-            for window in windows(view, shape, field.first_row):
-                part = field.rows(window)
-                covered = coverage(view, shape, window)
-                if not covered.any():
-                    continue
-                labels[window][covered > 0.5] = label
-                opacity, tone = _opacity(paint, covered, field, part)
-                for plane, reflectance in zip(albedo, paint.albedo_bgr, strict=True):
-                    below = plane[part]
-                    below += opacity * (tone * np.float32(reflectance) - below)
+            shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
+            kernels.draw_paint(
+                *bands_of(view, shape, first), first, edges_of(shape), rays, field.planes, padded,
+                np.array([scale_of(tile, shift) for tile in tiles], dtype=np.float32), _look(paint),
+                self._label[paint.kind], albedo, labels,
+            )  # fmt: skip
 
 
-def _opacity(
-    paint: Paint, covered: Float32, field: GroundField, part: tuple[slice, slice]
-) -> tuple[Float32, Float32]:
-    """How much (h, w) of every pixel shows paint, and that paint's relative tone (h, w)."""
-    x, y, footprint = field.x_m[part], field.y_m[part], field.footprint_m[part]
-    shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
-    flaking = _faded(_WEAR_TILE, x, y, footprint, shift)
-    flaking += np.float32(0.7) * _faded(MEDIUM_TILE, x, y, footprint, shift)
+def _look(paint: Paint) -> Float32:
+    """The level of noise below which paint has worn off, its dirt and its reflectance."""
     # The standard normal quantile by Tukey's lambda approximation (0.14), good to 0.01 within +-2.5.
     p = min(max(paint.wear, 1e-3), 1 - 1e-3)
-    threshold = np.float32(float((p**0.14 - (1 - p) ** 0.14) * 4.91) * 1.22)
-    softness = np.float32(0.35) + footprint * np.float32(12.0)
-    kept = np.clip((flaking - threshold) / softness + np.float32(0.5), 0, 1)
-    grain = fine_tile("asphalt")
-    tone = np.float32(1.0) + np.float32(0.06) * _faded(grain, x, y, footprint, shift)
-    dirt = np.float32(paint.dirt) * np.clip(np.float32(0.8) - np.float32(0.4) * flaking, 0, 1.6)
-    opacity = covered * kept * (np.float32(1.0) - np.float32(0.6) * dirt)
-    return opacity, tone * (np.float32(1.0) - np.float32(0.4) * dirt)
-
-
-def _faded(tile: Tile, x: Float32, y: Float32, footprint: Float32, shift: tuple[float, float]) -> Float32:
-    return np.asarray(sample(tile, x, y, shift) * fade(tile, footprint))
+    threshold = float((p**0.14 - (1 - p) ** 0.14) * 4.91) * 1.22
+    return np.array([threshold, paint.dirt, *paint.albedo_bgr], dtype=np.float32)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render import ground as on_ground
+from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.ground import GroundField, PaintLayer
 from v2hdm.simulate.render.scene import Box, Light, Scene, Shadow, box_shadow
 from v2hdm.simulate.render.surroundings import draw_background, draw_boxes
@@ -115,35 +116,19 @@ class Renderer:
     ) -> Float32:
         scene = self.scene
         bare = on_ground.tone(scene.ground, ground)
-        albedo = [bare * np.float32(c) for c in scene.ground.albedo_bgr]
+        albedo = _float32(cv2.merge([bare * np.float32(c) for c in scene.ground.albedo_bgr]))
         self._paint.draw(view, ground, albedo, labels)
         sun = on_ground.sun_visibility(shadows, scene.dapples, view, ground)
         wet = on_ground.wetness(scene.ground, ground)
-        return _lit(albedo, sun, wet, ground, view, scene.light)
+        centre = view.centre_map.astype(np.float32)
+        kernels.light_ground(albedo, sun, wet, (ground.x_m, ground.y_m), centre, _lights(scene.light))
+        return albedo
 
 
-def _lit(
-    albedo: list[Float32], sun: Float32, wet: Float32 | None, ground: GroundField, view: View, light: Light
-) -> Float32:
-    """Ground radiance (H', W, 3): Lambert's law under sun and sky; water darkens and mirrors the sky."""
+def _lights(light: Light) -> Float32:
+    """Irradiances (3, 3) of the ground by the sun and the sky, and the radiance of the horizon."""
     height = max(light.sun_direction_map[2], 0.0)
-    mirror = None if wet is None else wet * _fresnel(ground, view)
-    for plane, s, d, horizon in zip(albedo, light.sun_bgr, light.sky_bgr, light.horizon_bgr, strict=True):
-        plane *= sun * np.float32(s * height) + np.float32(d)
-        if wet is not None and mirror is not None:
-            plane *= np.float32(1.0) - np.float32(0.45) * wet
-            plane += mirror * np.float32(horizon)
-    return np.asarray(cv2.merge(albedo), dtype=np.float32)
-
-
-def _fresnel(ground: GroundField, view: View) -> Float32:
-    """Part (H', W) of the sky's light that a rough film of water mirrors (after Schlick 1994)."""
-    centre = view.centre_map.astype(np.float32)
-    range_squared = (ground.x_m - centre[0]) ** 2 + (ground.y_m - centre[1]) ** 2
-    sine = centre[2] / np.sqrt(range_squared + centre[2] ** 2)
-    grazing = np.float32(1.0) - np.maximum(sine, np.float32(0.12))
-    squared = grazing * grazing
-    return np.asarray(np.float32(0.02) + np.float32(0.45) * squared * squared * grazing)
+    return np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr], dtype=np.float32)
 
 
 _CODE_STEPS = 16384
@@ -191,10 +176,13 @@ def expose(image: Float32, optics: Optics, rng: np.random.Generator) -> NDArray[
     image = _float32(cv2.multiply(cv2.transform(image, balance), _vignette(height, width, optics.vignetting)))
     if optics.grey:
         image = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[..., None], 3, axis=2)
-    image += _noise(image, optics, rng)
-    image *= np.float32(_CODE_STEPS - 1)
-    np.clip(image, 0, _CODE_STEPS - 1, out=image)
-    return np.asarray(np.take(_srgb_codes(), image.astype(np.uint16)))
+    out = np.empty(image.shape, dtype=np.uint8)
+    row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
+    field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
+    noise = field[row : row + height, column : column + width]
+    per_electron, dark = np.float32(1.0 / optics.full_well_electrons), np.float32(optics.read_noise**2)
+    kernels.record(image, noise, per_electron, dark, _srgb_codes(), out)
+    return out
 
 
 def _float32(array: NDArray[Any]) -> Float32:
@@ -206,18 +194,12 @@ def _motion_blur(radiance: Float32, view: View, motion: Motion) -> Float32:
     """Mean of three images displaced along the image flow over the exposure, symmetric about its middle."""
     if motion.exposure_s <= 0:
         return radiance.copy()
-    height, width = radiance.shape[:2]
     flow = _flow(view, motion) * np.float32(motion.exposure_s / 3.0)
     if float(np.abs(flow).max()) < 0.02:
         return radiance.copy()
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    out = radiance.copy()
-    for sign in (-1.0, 1.0):
-        out += cv2.remap(
-            radiance, u + np.float32(sign) * flow[..., 0], v + np.float32(sign) * flow[..., 1],
-            cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
-    return np.asarray(out * np.float32(1.0 / 3.0))
+    out = np.empty_like(radiance)
+    kernels.blur_along(radiance, flow, out)
+    return out
 
 
 def _flow(view: View, motion: Motion) -> Float32:
@@ -243,18 +225,9 @@ def _flow(view: View, motion: Motion) -> Float32:
     return np.asarray(full[:height, :width])
 
 
-def _noise(image: Float32, optics: Optics, rng: np.random.Generator) -> Float32:
-    """Shot and read noise of an image: a window of a fixed field of normal numbers, placed at random."""
-    height, width = image.shape[:2]
-    row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
-    field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
-    variance = np.maximum(image, 0) * np.float32(1.0 / optics.full_well_electrons)
-    variance += np.float32(optics.read_noise**2)
-    return np.asarray(cv2.multiply(cv2.sqrt(variance), field[row : row + height, column : column + width]))
-
-
 @lru_cache(maxsize=4)
 def _normal_field(height: int, width: int) -> Float32:
+    """Normal numbers, of which a window placed at random is the noise of an image."""
     return np.random.default_rng(20).standard_normal((height, width, 3), dtype=np.float32)
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
+from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.scene import Backdrop, Box, Light, box_footprint
-from v2hdm.simulate.render.textures import Float32, noise_tile, sample
-from v2hdm.simulate.render.view import Outline, View, Window, coverage, in_view, outlines, windows
+from v2hdm.simulate.render.textures import Float32, noise_tile, sample, scale_of
+from v2hdm.simulate.render.view import Outline, View, bands_of, edges_of, in_view, outlines
 
 _CORRUGATION_M = 0.28
 _DIRT_TILE = noise_tile(17, 6.0, 1.2)
@@ -87,18 +88,30 @@ def _draw_face(
         sun * s + (sky if face.normal[2] >= 0 else 0.35) * d
         for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True)
     ]
-    for window in windows(view, shape):
-        covered = coverage(view, shape, window, grown_px=0.5)
-        if not covered.any():
+    edges, rays = edges_of(shape, grown_px=0.5), (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
+    face_from_pinhole, per_focal = _plane_of(face, view), np.float32(1.0 / view.rays.info.intrinsic[0, 0])
+    offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
+    scale, waves = np.array(scale_of(_DIRT_TILE, offset), dtype=np.float32), np.empty((0, 0), np.float32)
+    found, count = bands_of(view, shape)
+    for window in found[:count]:
+        seen = np.empty((4, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
+        if not kernels.look_at_face(window, edges, rays, face_from_pinhole, per_focal, seen):
             continue
-        at = _face_coordinates(face, view, window)
-        tone, albedo = _tone(box, face, *at), _albedo(box, face, *at)
-        hidden[window] |= covered > 0.5
-        target = radiance[window]
-        for channel in range(3):
-            below = target[..., channel]
-            colour = np.asarray(albedo[channel] * lit[channel], dtype=np.float32)
-            below += covered * (tone * colour - below)
+        if box.corrugated and face.upright:
+            waves = np.sin(seen[1] * np.float32(2 * np.pi / _CORRUGATION_M))
+        colour = _colour(box, face, lit, *seen[1:])
+        kernels.draw_face(
+            window, seen, _DIRT_TILE.padded, scale, waves, face.upright, colour, radiance, hidden
+        )
+
+
+def _colour(
+    box: Box, face: _Face, lit: Sequence[float], along_m: Float32, up_m: Float32, footprint_m: Float32
+) -> Float32:
+    """The light (3, h, w) that a face of no other tone sends from a window, or (3, 1, 1) where it is one."""
+    albedo = _albedo(box, face, along_m, up_m, footprint_m)
+    parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
+    return np.stack(parts).reshape(3, *(parts[0].shape or (1, 1)))
 
 
 def _albedo(
@@ -119,32 +132,14 @@ def _albedo(
     return np.moveaxis(shown.astype(np.float32) * np.float32(1 / 255), 2, 0)
 
 
-def _tone(box: Box, face: _Face, along_m: Float32, up_m: Float32, footprint: Float32) -> Float32:
-    """Relative brightness (h, w): corrugation, door seams by its shade, streaks of dirt."""
-    offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
-    tone = np.float32(1.0) + np.float32(0.1) * sample(_DIRT_TILE, along_m, up_m * np.float32(0.35), offset)
-    if box.corrugated and face.upright:
-        wave = np.clip(np.sin(along_m * np.float32(2 * np.pi / _CORRUGATION_M)) * np.float32(2.5), -1, 1)
-        tone += np.float32(0.16) * wave / (np.float32(1.0) + (footprint * 20) ** 2)
-    if face.upright:
-        tone *= np.float32(0.8) + np.float32(0.2) * np.clip(up_m * np.float32(1.2), 0, 1)
-    return np.asarray(np.clip(tone * np.float32(1.0), 0.2, 1.8))
-
-
-def _face_coordinates(face: _Face, view: View, window: Window) -> tuple[Float32, Float32, Float32]:
-    """Metres along the face's first and last edge for each pixel of a window, and the size of a pixel."""
+def _plane_of(face: _Face, view: View) -> Float32:
+    """Metres along a face's first and last edge, and the inverse depth, from pinhole pixels (3, 3)."""
     origin, first, last = face.corners_map[0], face.corners_map[1], face.corners_map[3]
     sides = (first - origin, last - origin)
     axes = np.column_stack([side / max(float(np.linalg.norm(side)), 1e-9) for side in sides])
     rotation, translation = view.cam_from_map[:3, :3], view.cam_from_map[:3, 3]
     cam_from_face = np.column_stack([rotation @ axes, rotation @ origin + translation])
-    pinhole_from_face = view.rays.info.intrinsic @ cam_from_face
-    face_from_pinhole = np.linalg.inv(pinhole_from_face).astype(np.float32)
-    u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
-    a, b, w = (m[0] * u + m[1] * v + m[2] for m in face_from_pinhole)
-    depth = np.float32(1.0) / np.where(np.abs(w) < 1e-6, np.float32(1e-6), w)
-    footprint = np.abs(depth) * np.float32(1.0 / view.rays.info.intrinsic[0, 0])
-    return np.clip(a * depth, -50, 50), np.clip(b * depth, -50, 50), footprint
+    return np.linalg.inv(view.rays.info.intrinsic @ cam_from_face).astype(np.float32)
 
 
 _CLOUD_TILE = noise_tile(18, 3.0, 1.5)

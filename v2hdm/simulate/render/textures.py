@@ -92,6 +92,12 @@ def _wrapped(metres: Float32, side_m: float, offset_m: float) -> Float32:
     return turns
 
 
+def scale_of(tile: Tile, shift_m: tuple[float, float], finest_px: float = 4.0) -> list[float]:
+    """A tile's turns a metre, turns at 0 across and along, and its finest waves a metre, for kernels."""
+    per_wave = 1.0 / (finest_px * tile.side_m / tile.values.shape[0])
+    return [1.0 / tile.side_m, shift_m[0] / tile.side_m, shift_m[1] / tile.side_m, per_wave]
+
+
 def fade(tile: Tile, footprint_m: Float32, finest_px: float = 4.0) -> Float32:
     """Amplitude (H, W) left to a tile whose finest wavelength is ``finest_px`` tile pixels."""
     finest_m = finest_px * tile.side_m / tile.values.shape[0]

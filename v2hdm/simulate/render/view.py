@@ -19,6 +19,7 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray, IntArray
+from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.textures import Float32
 
 _GRID_STEP_PX = 8
@@ -165,49 +166,30 @@ def _visible_parts(
     return parts
 
 
-def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
-    """Image windows that cover an outline closely: bands of rows, each as wide as the outline is there."""
+def bands_of(view: View, shape: Outline, first_row: int = 0) -> tuple[IntArray, int]:
+    """Image windows that cover an outline closely, and their number: bands of rows as wide as it is there.
+
+    Windows are rows (first row, end, first column, end) of the array; what follows the last means nothing.
+    """
     height, width = view.rays.u_pinhole_px.shape
-    boundary = shape.boundary_px
-    following = following_row(boundary)
-    rise = following[:, 1] - boundary[:, 1]
-    rise[rise == 0] = 1e-9
-    top = max(int(np.floor(boundary[:, 1].min())) - 2, first_row)
-    bottom = min(int(np.ceil(boundary[:, 1].max())) + 3, height)
-    left, right = boundary[:, 0].min(), boundary[:, 0].max()
-    band = _BAND_ROWS if (bottom - top) * (right - left) > _BAND_AREA_PX else max(bottom - top, 1)
-    for row in range(top, bottom, band):
-        end = min(row + band, bottom)
-        at = np.clip((np.array([[row - 2.0], [end + 2.0]]) - boundary[:, 1]) / rise, 0.0, 1.0)[..., None]
-        points = (boundary + at * (following - boundary)).reshape(-1, 2)
-        points = points[(points[:, 1] >= row - 2.01) & (points[:, 1] <= end + 2.01)]
-        if len(points) == 0:
-            continue
-        first = max(int(np.floor(points[:, 0].min())) - 2, 0)
-        last = min(int(np.ceil(points[:, 0].max())) + 3, width)
-        if first < last:
-            yield slice(row, end), slice(first, last)
+    found = np.empty((height // _BAND_ROWS + 2, 4), dtype=np.int64)
+    limits = (_BAND_ROWS, _BAND_AREA_PX)
+    return found, kernels.bands(shape.boundary_px, first_row, height, width, limits, found)
 
 
-def coverage(view: View, shape: Outline, window: Window, grown_px: float = 0.0) -> Float32:
-    """Fraction (h, w) of every pixel of a window that the outline covers.
+def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
+    """The windows of :func:`bands_of` as slices."""
+    found, count = bands_of(view, shape, first_row)
+    for top, bottom, left, right in found[:count].tolist():
+        yield slice(top, bottom), slice(left, right)
+
+
+def edges_of(shape: Outline, grown_px: float = 0.0) -> Float32:
+    """Lines (N, 3) for kernels, whose value at a pixel is the share of it that the edge leaves, from 0 to 1.
 
     An edge covers ``clip(1/2 + d)`` of a pixel at signed distance d. Opposite edges of a quadrilateral add up
     (so a strip narrower than a pixel keeps its area), neighbouring ones multiply; with other numbers of
     edges what each cuts off is added. ``grown_px`` pushes every edge outwards, which closes the seam between
     faces that share one.
     """
-    u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
-    parts: list[Float32] = []
-    for edge in shape.edges:
-        distance = u * np.float32(edge[0])
-        distance += v * np.float32(edge[1])
-        distance += np.float32(edge[2] + 0.5 + grown_px)
-        parts.append(np.clip(distance, 0, 1, out=distance))
-    if len(parts) == 4:
-        across = np.maximum(parts[0] + parts[2] - np.float32(1.0), 0)
-        return np.asarray(across * np.maximum(parts[1] + parts[3] - np.float32(1.0), 0))
-    total = parts[0] - np.float32(len(parts) - 1)
-    for part in parts[1:]:
-        total += part
-    return np.asarray(np.maximum(total, 0))
+    return np.add(shape.edges, [0.0, 0.0, 0.5 + grown_px], dtype=np.float64).astype(np.float32)

@@ -16,7 +16,6 @@ from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
 from v2hdm.adjust.engine import Engine, Evaluated, Linearised
 from v2hdm.adjust.engines.numba import evaluate, frames, linearise, motion, observe
-from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.adjust.engines.numba.evaluate import Evaluation
 from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
 from v2hdm.adjust.engines.numba.pool import share
@@ -24,6 +23,7 @@ from v2hdm.adjust.engines.numba.tables import cam_from_map, prior_blocks_of, spr
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
 from v2hdm.adjust.tiles import find_pattern
+from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 

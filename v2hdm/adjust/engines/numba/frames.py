@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from v2hdm.adjust.engines.numba.build import inlined, kernel
 from v2hdm.adjust.engines.numba.inline import floored, solve_unit_rows, weigh
 from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
 from v2hdm.adjust.engines.numba.linearise import couple, differentiate
+from v2hdm.compiled import inlined, kernel
 from v2hdm.records import FloatArray, IntArray
 
 

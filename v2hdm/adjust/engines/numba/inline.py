@@ -10,8 +10,8 @@ import math
 
 from v2hdm.adjust.corner_factor import CORNER_FLOOR, PIVOT_FLOOR
 from v2hdm.adjust.engine import WEIGHT_FLOOR
-from v2hdm.adjust.engines.numba.build import inlined
 from v2hdm.adjust.engines.numba.layout import Base, Layout
+from v2hdm.compiled import inlined
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.engines.numba.build import inlined, kernel
 from v2hdm.adjust.engines.numba.inline import (
     add_corner_priors,
     add_force,
@@ -23,6 +22,7 @@ from v2hdm.adjust.engines.numba.inline import (
     whiten,
 )
 from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
+from v2hdm.compiled import inlined, kernel
 from v2hdm.records import FloatArray
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.compiled import inlined, kernel
 from v2hdm.geometry.rigid import EXP_SERIES, LEFT_JACOBIAN_SERIES
 from v2hdm.records import FloatArray
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.adjust.engines.numba.inline import floored, see, weigh, whiten
 from v2hdm.adjust.engines.numba.layout import Base, Layout
 from v2hdm.adjust.engines.numba.linearise import couple, differentiate
 from v2hdm.adjust.model import MIN_DEPRESSION_SINE
+from v2hdm.compiled import kernel
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray, IntArray
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust.engines.numba.build import kernel
+from v2hdm.compiled import kernel
 from v2hdm.records import FloatArray, IntArray
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -14,6 +15,8 @@ from v2hdm.io.importers.tables import Attitudes, Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import FloatArray
+
+_log = logging.getLogger(__name__)
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGE_KINDS = (RAW, COMPRESSED)
@@ -91,6 +94,7 @@ class VideoDecoder:
         self._context: Any = self._av.CodecContext.create(_CODECS.get(form, form), "r")
         self._begun = False
         self._context.thread_count = 1  # frames of several threads come late
+        self._complained = False
 
     def frames(self, data: bytes | None, number: int) -> Iterator[tuple[int, np.ndarray]]:
         """The frames that the packet ``number`` completes, with their packets' numbers; None ends the video.
@@ -101,8 +105,19 @@ class VideoDecoder:
         if data is not None:
             packet = self._av.Packet(data)
             packet.pts = number
+        said = self._av.logging
+        said.set_level(said.ERROR)
         try:
-            for frame in self._context.decode(packet):
+            with said.Capture(local=False) as complaints:
+                frames = self._context.decode(packet)
+            damaged = self._begun and (complaints or any(frame.is_corrupt for frame in frames))
+            if damaged and not self._complained:
+                self._complained = True
+                _log.warning(
+                    "%s: packet %d: the decoder complains (%s); is it damaged?",
+                    self._where, number + 1, complaints[-1][2].strip() if complaints else "corrupt",
+                )  # fmt: skip
+            for frame in frames:
                 self._begun = True
                 yield int(frame.pts), frame.to_ndarray(format="bgr24")
         except self._av.error.FFmpegError as failure:
@@ -112,6 +127,8 @@ class VideoDecoder:
                 f"{self._where}: packet {number + 1} cannot be decoded ({' '.join(str(failure).split())}); "
                 "leave it out, or record images"
             ) from None
+        finally:
+            said.set_level(None)
 
 
 ODOMETRY = "nav_msgs/msg/Odometry"

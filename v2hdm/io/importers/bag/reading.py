@@ -113,8 +113,9 @@ class Bag:
             missing -= 1
             connection, received_ns, data = item
             with _one_line(self.path, f"topic {connection.topic}, type {connection.msgtype}: "):
+                message = connection.topic, connection.msgtype, received_ns / 1e9
                 fields = self._fields(connection, data)
-            yield Message(connection.topic, connection.msgtype, received_ns / 1e9, fields)
+            yield Message(*message, fields)
         if missing > 0:
             raise DriveError(
                 f"{self.path}: {missing} messages of {', '.join(sorted(topics))} that it lists are not "

@@ -111,7 +111,7 @@ class ImageStream(Stream):
 
 
 class InfoStream(Stream):
-    """Intrinsics of the first message of a topic."""
+    """Intrinsics of a topic, the same in each of its messages."""
 
     def __init__(self, topic: str, where: str) -> None:
         super().__init__(topic, ["camera_info"], where, (topic, [INFO_KIND], where))
@@ -119,10 +119,16 @@ class InfoStream(Stream):
     def write(self, folder: Path) -> Writer:
         """Write the first message as ``camera_info``."""
         if (first := (yield)) is not None:
-            info = info_of(first.fields, self.label, f"{self.where}: topic {self.label}")
-            write_camera_info(info, folder / INFO_FILE)
-            while (yield) is not None:
-                pass
+            where = f"{self.where}: topic {self.label}"
+            write_camera_info(info_of(first.fields, self.label, where), folder / INFO_FILE)
+            number, lens = 1, _lens(first.fields)
+            while (later := (yield)) is not None:
+                number += 1
+                if _lens(later.fields) != lens:
+                    raise DriveError(
+                        f"{where}: message {number} states another lens than the first; map the parts of the "
+                        "recording one by one, or give the right camera_info as a file"
+                    )
 
 
 class PoseStream(Stream):
@@ -229,6 +235,12 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
         for writer in writers:
             next(writer, None)  # sends None
     return folders
+
+
+def _lens(fields: Any) -> list[float]:
+    """Size, camera matrix and distortion, by the names of ROS 2 or ROS 1."""
+    matrix, distortion = (fields.k, fields.d) if hasattr(fields, "k") else (fields.K, fields.D)
+    return [fields.width, fields.height, *matrix, *distortion]
 
 
 def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:

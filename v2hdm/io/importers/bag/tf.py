@@ -110,4 +110,6 @@ def transform_rows(fields: Any) -> list[tuple[Edge, tuple[float, ...]]]:
 
 def frame_name(name: str) -> str:
     """A frame's name without the slash that old recorders put before it."""
+    if not name.isprintable():
+        raise DriveError(f"a frame is named {name!r}: names have letters that show; rename it in the bag")
     return name.lstrip("/")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache, wraps
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -24,12 +26,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # Kernels allocate nothing, and so need not count references to arrays: done at each use of one, that took
 # four times as long as all else. Of the liberties with rounding all that keep NaN and infinity what they are,
 # which the line search relies on.
-_OPTIONS: dict[str, Any] = {
-    "_nrt": False,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
-}
+_EXACT: dict[str, Any] = {"_nrt": False, "nogil": True, "error_model": "numpy"}
+_OPTIONS = _EXACT | {"fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"}}
 
 # What reading or writing a kernel that is kept fails with; a kernel itself fails with nothing.
 _UNREADABLE = (OSError, EOFError, AttributeError, ImportError, pickle.UnpicklingError, ValueError)
@@ -41,17 +39,32 @@ def inlined(function: _Function) -> _Function:
     return part
 
 
+def exactly_inlined(function: _Function) -> _Function:
+    """A part of exact kernels."""
+    part: _Function = numba.njit(forceinline=True, **_EXACT)(function)
+    return part
+
+
 def kernel(function: _Function) -> _Function:
     """A kernel: compiled at its first call, or read from where an earlier process has left it.
 
     Where nothing can be kept, or what was kept cannot be read, every process compiles anew.
     """
-    folder, settings = _folder(), cast(Any, numba.config)
+    return _kept(function, _OPTIONS)
+
+
+def exact_kernel(function: _Function) -> _Function:
+    """A kernel that rounds each operation as numpy does."""
+    return _kept(function, _EXACT)
+
+
+def _kept(function: _Function, options: dict[str, Any]) -> _Function:
+    folder, settings = folder_of(sys.modules[function.__module__]), cast(Any, numba.config)
     usual, settings.CACHE_DIR = settings.CACHE_DIR, str(folder or "")
     try:
-        compiled: Callable[..., Any] = numba.njit(cache=folder is not None, **_OPTIONS)(function)
+        compiled: Callable[..., Any] = numba.njit(cache=folder is not None, **options)(function)
     except (OSError, RuntimeError):  # numba has no use for the folder
-        compiled = numba.njit(**_OPTIONS)(function)
+        compiled = numba.njit(**options)(function)
     finally:
         settings.CACHE_DIR = usual
 
@@ -61,21 +74,27 @@ def kernel(function: _Function) -> _Function:
         try:
             return compiled(*arguments)
         except _UNREADABLE:
-            compiled = numba.njit(**_OPTIONS)(function)
+            compiled = numba.njit(**options)(function)
             return compiled(*arguments)
 
+    cast(Any, call).is_kernel = True
     return call  # type: ignore[return-value]
 
 
+def folder_of(module: ModuleType) -> Path | None:
+    """Where the kernels of a module are kept, None where they cannot be."""
+    return _folder(Path(str(module.__file__)).parent)
+
+
 @cache
-def _folder() -> Path | None:
+def _folder(sources: Path) -> Path | None:
     """The first of :data:`PLACES` that can be written to, or None.
 
-    The folder is named by the sources: numba itself sees neither a change in a part of a kernel nor one that
-    leaves a file's size and time as they were, as another wheel's may be.
+    The folder is named by the ``sources`` beside the kernel: numba itself sees neither a change in a part of
+    a kernel nor one that leaves a file's size and time as they were, as another wheel's may be.
     """
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in (Path(__file__), *sorted(sources.glob("*.py"))):
         digest.update(source.read_bytes())
     for place in PLACES:
         folder = place / f"kernels-{digest.hexdigest()[:12]}"

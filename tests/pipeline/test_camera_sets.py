@@ -1,0 +1,75 @@
+"""Sets of cameras mapped here or by processes side by side: the same results, log and cache."""
+
+import logging
+import pickle
+from collections import Counter
+from dataclasses import dataclass, field
+
+import pytest
+
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline import camera_sets
+from v2hdm.pipeline.camera_sets import MappedSet, map_camera_sets
+from v2hdm.pipeline.context import Context
+from v2hdm.pipeline.survey import Survey
+from v2hdm.records import HdMap
+from v2hdm.store.cache import StageCache
+
+
+@dataclass
+class Images:
+    """What stands for a drive's detections: so many markings in one image."""
+
+    markings: list[int]
+
+
+@dataclass
+class Cameras:
+    cameras: dict[str, int] = field(default_factory=lambda: {"front": 1, "left": 2, "rear": 3})
+
+
+def mapped(work, name, cameras):
+    logging.getLogger("v2hdm.mapping").info("mapped with %s", name)
+    return MappedSet({"Opt": MethodResult("Opt", tuple(cameras), HdMap((), (), None))})
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """The sets that processes have mapped, in their order; what reaches or leaves one is pickled."""
+    jobs = []
+
+    def share(work, given, processes, progress):
+        assert processes == 2
+        for number, job in enumerate(given):
+            jobs.append(job[0])
+            there, job = pickle.loads(pickle.dumps((work, job)))
+            yield number, pickle.loads(pickle.dumps(there(job, progress)))
+
+    monkeypatch.setattr(camera_sets._Work, "_map", mapped)
+    monkeypatch.setattr(camera_sets, "side_by_side", share)
+    return jobs
+
+
+def mapped_sets(cache, workers, detections):
+    survey = Survey(MappingOptions(), ())
+    context = Context(StageCache(cache), workers=workers)
+    return map_camera_sets(Cameras(), "drive", [detections], survey, None, context)
+
+
+@pytest.mark.parametrize(("workers", "count"), [(1, 5000), (2, 3), (2, 5000)])
+def test_large_drives_are_mapped_by_processes_the_largest_set_first(
+    workers, count, elsewhere, tmp_path, caplog
+):
+    caplog.set_level(logging.INFO, "v2hdm")
+    found = mapped_sets(tmp_path, workers, Images([0] * count))
+    assert list(found) == ["front", "left", "rear", "all"]
+    assert found["all"].methods["Opt"].cameras == ("front", "left", "rear")
+    assert elsewhere == (["all", "front", "left", "rear"] if workers * count == 10_000 else [])
+    # What stands for processes logs here, too.
+    assert Counter(caplog.messages) == {f"mapped with {name}": 2 if elsewhere else 1 for name in found}
+    caplog.clear()
+    elsewhere.clear()
+    assert mapped_sets(tmp_path, 3 - workers, Images([0] * count)) == found
+    assert not elsewhere
+    assert Counter(caplog.messages) == {f"mapped with {name}": 1 for name in found}

@@ -1,0 +1,330 @@
+"""Loops over pixels, compiled: each does in one pass, where something is drawn, what took numpy many.
+
+They round as numpy and ``cv2.remap`` do. Windows are (first row, end, first column, end) of arrays (H, W).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from v2hdm.compiled import exact_kernel, exactly_inlined
+from v2hdm.records import FloatArray, IntArray
+
+_Plane = NDArray[np.float32]
+_f = np.float32
+_TILE_PX = 512.0
+_ONE, _HALF, _ZERO = _f(1.0), _f(0.5), _f(0.0)
+
+
+def _rounded_once(_: Any, a: Any, b: Any, c: Any) -> Any:
+    def build(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return types.float32(types.float32, types.float32, types.float32), build
+
+
+_fma: Any = intrinsic(_rounded_once)  # a b + c rounded once, as in cv2.remap
+
+
+@exactly_inlined
+def _clip(value: Any, low: Any, high: Any) -> Any:
+    return min(max(value, low), high)
+
+
+@exactly_inlined
+def _wrap(metres: Any, per_metre: Any, turn: Any) -> Any:
+    turns = metres * per_metre
+    turns += turn
+    turns -= _f(np.floor(turns))
+    return turns * _f(_TILE_PX)
+
+
+@exactly_inlined
+def _sample(tile: _Plane, x_m: Any, y_m: Any, per_metre: Any, turn_x: Any, turn_y: Any) -> Any:
+    """A padded tile's value at a ground point, as :func:`v2hdm.simulate.render.textures.sample` has it."""
+    x, y = _wrap(x_m, per_metre, turn_x), _wrap(y_m, per_metre, turn_y)
+    column, row = int(x), int(y)
+    share_x, share_y = x - _f(column), y - _f(row)
+    above = _fma(share_x, tile[row, column + 1] - tile[row, column], tile[row, column])
+    below = _fma(share_x, tile[row + 1, column + 1] - tile[row + 1, column], tile[row + 1, column])
+    return _fma(share_y, below - above, above)
+
+
+@exactly_inlined
+def _fade(footprint_m: Any, per_wave: Any) -> Any:
+    waves = footprint_m * per_wave
+    return _ONE / (_ONE + waves * waves)
+
+
+@exactly_inlined
+def _coverage(edges: NDArray[np.float32], u: Any, v: Any) -> Any:
+    """How much of a pixel an outline covers; see :func:`v2hdm.simulate.render.view.coverage`."""
+    count = len(edges)
+    if count == 4:
+        first = _clip(u * edges[0, 0] + v * edges[0, 1] + edges[0, 2], _ZERO, _ONE)
+        third = _clip(u * edges[2, 0] + v * edges[2, 1] + edges[2, 2], _ZERO, _ONE)
+        across = max(first + third - _ONE, _ZERO)
+        if across == _ZERO:
+            return _ZERO
+        second = _clip(u * edges[1, 0] + v * edges[1, 1] + edges[1, 2], _ZERO, _ONE)
+        fourth = _clip(u * edges[3, 0] + v * edges[3, 1] + edges[3, 2], _ZERO, _ONE)
+        return across * max(second + fourth - _ONE, _ZERO)
+    total = _clip(u * edges[0, 0] + v * edges[0, 1] + edges[0, 2], _ZERO, _ONE) - _f(count - 1)
+    for k in range(1, count):
+        total += _clip(u * edges[k, 0] + v * edges[k, 1] + edges[k, 2], _ZERO, _ONE)
+    return max(total, _ZERO)
+
+
+@exact_kernel
+def bands(boundary: FloatArray, first_row: int, height: int, width: int, limits: Any, out: IntArray) -> int:
+    """Write the windows of an outline's ``boundary`` (M, 2) px into ``out``; returns their number.
+
+    ``limits`` are the rows of a band, and the area from which on there are several.
+    """
+    count = len(boundary)
+    top, bottom, left, right = boundary[0, 1], boundary[0, 1], boundary[0, 0], boundary[0, 0]
+    for k in range(1, count):
+        top, bottom = min(top, boundary[k, 1]), max(bottom, boundary[k, 1])
+        left, right = min(left, boundary[k, 0]), max(right, boundary[k, 0])
+    begin, end = max(int(np.floor(top)) - 2, first_row), min(int(np.ceil(bottom)) + 3, height)
+    step = limits[0] if (end - begin) * (right - left) > limits[1] else max(end - begin, 1)
+    found = 0
+    for row in range(begin, end, step):
+        last = min(row + step, end)
+        least, most = np.inf, -np.inf
+        for k in range(count):
+            following = k + 1 if k + 1 < count else 0
+            rise = boundary[following, 1] - boundary[k, 1]
+            if rise == 0:
+                rise = 1e-9
+            for level in (row - 2.0, last + 2.0):
+                at = min(max((level - boundary[k, 1]) / rise, 0.0), 1.0)
+                y = boundary[k, 1] + at * (boundary[following, 1] - boundary[k, 1])
+                if row - 2.01 <= y <= last + 2.01:
+                    x = boundary[k, 0] + at * (boundary[following, 0] - boundary[k, 0])
+                    least, most = min(least, x), max(most, x)
+        if least > most:
+            continue
+        first_column, end_column = max(int(np.floor(least)) - 2, 0), min(int(np.ceil(most)) + 3, width)
+        if first_column < end_column:
+            out[found, 0], out[found, 1] = row, last
+            out[found, 2], out[found, 3] = first_column, end_column
+            found += 1
+    return found
+
+
+@exact_kernel
+def draw_paint(
+    windows: IntArray, count: int, first_row: int, edges: _Plane, rays: Any, ground: Any, tiles: Any,
+    scales: _Plane, look: _Plane, label: int, albedo: _Plane, labels: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Paint a polygon onto ``albedo`` (H', W, 3) from ``first_row`` on, and into ``labels`` (H, W).
+
+    ``scales`` (3, 4) are of the tiles of wear, stains and grain: turns a metre, turns at 0, waves a metre;
+    ``look`` are threshold, dirt and the paint's reflectance.
+    """
+    u, v = rays
+    x_m, y_m, footprint_m = ground
+    wear, stains, grain = tiles
+    for n in range(count):
+        for row in range(windows[n, 0], windows[n, 1]):
+            at = row - first_row
+            for column in range(windows[n, 2], windows[n, 3]):
+                covered = _coverage(edges, u[row, column], v[row, column])
+                if covered == _ZERO:
+                    continue
+                if covered > _HALF:
+                    labels[row, column] = label
+                x, y, footprint = x_m[at, column], y_m[at, column], footprint_m[at, column]
+                own = _sample(wear, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
+                flaking = own * _fade(footprint, scales[0, 3])
+                own = _sample(stains, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
+                flaking += _f(0.7) * (own * _fade(footprint, scales[1, 3]))
+                kept = (flaking - look[0]) / (_f(0.35) + footprint * _f(12.0)) + _HALF
+                own = _sample(grain, x, y, scales[2, 0], scales[2, 1], scales[2, 2])
+                tone = _ONE + _f(0.06) * (own * _fade(footprint, scales[2, 3]))
+                dirt = look[1] * _clip(_f(0.8) - _f(0.4) * flaking, _ZERO, _f(1.6))
+                opacity = covered * _clip(kept, _ZERO, _ONE) * (_ONE - _f(0.6) * dirt)
+                tone *= _ONE - _f(0.4) * dirt
+                for c in range(3):
+                    below = albedo[at, column, c]
+                    albedo[at, column, c] = below + opacity * (tone * look[2 + c] - below)
+
+
+@exact_kernel
+def look_at_face(
+    window: Any, edges: _Plane, rays: Any, face_from_pinhole: _Plane, per_focal: Any, out: _Plane
+) -> bool:
+    """Write coverage, metres along both sides, and a pixel's size (4, h, w); whether anything is covered."""
+    u, v = rays
+    covers = False
+    m = face_from_pinhole
+    for row in range(window[0], window[1]):
+        for column in range(window[2], window[3]):
+            i, j = row - window[0], column - window[2]
+            own_u, own_v = u[row, column], v[row, column]
+            covered = _coverage(edges, own_u, own_v)
+            out[0, i, j] = covered
+            covers |= covered > _ZERO
+            inverse = m[2, 0] * own_u + m[2, 1] * own_v + m[2, 2]
+            depth = _ONE / (_f(1e-6) if abs(inverse) < _f(1e-6) else inverse)
+            out[1, i, j] = _clip((m[0, 0] * own_u + m[0, 1] * own_v + m[0, 2]) * depth, _f(-50.0), _f(50.0))
+            out[2, i, j] = _clip((m[1, 0] * own_u + m[1, 1] * own_v + m[1, 2]) * depth, _f(-50.0), _f(50.0))
+            out[3, i, j] = abs(depth) * per_focal
+    return covers
+
+
+@exact_kernel
+def draw_face(
+    window: Any, face: _Plane, tile: _Plane, scale: _Plane, wave: _Plane, upright: bool, colour: _Plane,
+    radiance: _Plane, hidden: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Draw what :func:`look_at_face` saw over ``radiance`` (H, W, 3) and into ``hidden`` (H, W).
+
+    ``wave`` (h, w), or of no size, is the sine of the corrugation; ``colour`` is (3, h, w) or (3, 1, 1).
+    """
+    corrugated, pictured = wave.shape[0] > 0, colour.shape[1] * colour.shape[2] > 1
+    for i in range(window[1] - window[0]):
+        for j in range(window[3] - window[2]):
+            covered = face[0, i, j]
+            if covered == _ZERO:
+                continue
+            row, column = i + window[0], j + window[2]
+            if covered > _HALF:
+                hidden[row, column] = True
+            along, up, footprint = face[1, i, j], face[2, i, j], face[3, i, j]
+            tone = _ONE + _f(0.1) * _sample(tile, along, up * _f(0.35), scale[0], scale[1], scale[2])
+            if corrugated:
+                ripple = _clip(wave[i, j] * _f(2.5), _f(-1.0), _ONE)
+                fine = footprint * _f(20.0)
+                tone += _f(0.16) * ripple / (_ONE + fine * fine)
+            if upright:
+                tone *= _f(0.8) + _f(0.2) * _clip(up * _f(1.2), _ZERO, _ONE)
+            tone = _clip(tone, _f(0.2), _f(1.8))
+            for c in range(3):
+                shown = colour[c, i, j] if pictured else colour[c, 0, 0]
+                below = radiance[row, column, c]
+                radiance[row, column, c] = below + covered * (tone * shown - below)
+
+
+@exactly_inlined
+def _within(lines: _Plane, x: Any, y: Any, sharpness: Any) -> Any:
+    least = _f(np.inf)
+    for k in range(len(lines)):
+        least = min(least, x * lines[k, 0] + y * lines[k, 1] - lines[k, 2])
+    return _clip(least * sharpness + _HALF, _ZERO, _ONE)
+
+
+@exact_kernel
+def cast_shadow(
+    windows: IntArray, count: int, first_row: int, lines: _Plane, softness_m: Any, darkness: Any, ground: Any,
+    out: _Plane,
+) -> None:  # fmt: skip
+    """Lower the sun's visibility ``out`` (H', W) to that in a polygon with inward ``lines`` (N, 3)."""
+    x_m, y_m, footprint_m = ground
+    for n in range(count):
+        for row in range(windows[n, 0] - first_row, windows[n, 1] - first_row):
+            for column in range(windows[n, 2], windows[n, 3]):
+                sharpness = _ONE / (softness_m + footprint_m[row, column])
+                dark = _within(lines, x_m[row, column], y_m[row, column], sharpness)
+                out[row, column] = min(out[row, column], _ONE - dark * darkness)
+
+
+@exact_kernel
+def ground_tone(
+    tiles: Any, scales: _Plane, amplitudes: _Plane, coarse: _Plane, ground: Any, out: _Plane
+) -> None:
+    """Write the relative reflectance (H', W) by grain, stains and ``coarse`` stains (H', W)."""
+    fine, medium = tiles
+    x_m, y_m, footprint_m = ground
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            x, y, footprint = x_m[row, column], y_m[row, column], footprint_m[row, column]
+            own = _sample(fine, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
+            tone = own * (_fade(footprint, scales[0, 3]) * amplitudes[0])
+            own = _sample(medium, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
+            tone += own * (_fade(footprint, scales[1, 3]) * amplitudes[1])
+            tone += coarse[row, column] * amplitudes[2]
+            out[row, column] = _clip(tone + _ONE, _f(0.25), _f(2.5))
+
+
+@exact_kernel
+def light_ground(
+    albedo: _Plane, sun: _Plane, wet: _Plane, ground: Any, centre: _Plane, light: _Plane
+) -> None:
+    """Turn ``albedo`` (H', W, 3) into radiance; ``light`` (3, 3) is of the sun, the sky and the horizon.
+
+    Lambert's law; water, where ``wet`` is not of no size, darkens and mirrors the sky by its angle (after
+    Schlick 1994).
+    """
+    x_m, y_m = ground
+    squared_height = centre[2] * centre[2]
+    for row in range(albedo.shape[0]):
+        for column in range(albedo.shape[1]):
+            film = mirror = _ZERO
+            if wet.shape[0] > 0:
+                film = wet[row, column]
+                x, y = x_m[row, column] - centre[0], y_m[row, column] - centre[1]
+                sine = centre[2] / _f(np.sqrt(x * x + y * y + squared_height))
+                grazing = _ONE - max(sine, _f(0.12))
+                squared = grazing * grazing
+                mirror = film * (_f(0.02) + _f(0.45) * squared * squared * grazing)
+            for c in range(3):
+                lit = albedo[row, column, c] * (sun[row, column] * light[0, c] + light[1, c])
+                if wet.shape[0] > 0:
+                    lit = lit * (_ONE - _f(0.45) * film) + mirror * light[2, c]
+                albedo[row, column, c] = lit
+
+
+@exactly_inlined
+def _at_border(place: int, size: int) -> int:
+    return min(max(place, 0), size - 1)
+
+
+@exact_kernel
+def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
+    """Write the mean (H, W, 3) of an image and of it moved by the flow (H, W, 2) px either way."""
+    height, width = image.shape[0], image.shape[1]
+    for row in range(height):
+        for column in range(width):
+            for c in range(3):
+                out[row, column, c] = image[row, column, c]
+            for sign in (_f(-1.0), _ONE):
+                x = _f(column) + sign * flow[row, column, 0]
+                y = _f(row) + sign * flow[row, column, 1]
+                floor_x, floor_y = _f(np.floor(x)), _f(np.floor(y))
+                share_x, share_y = x - floor_x, y - floor_y
+                left, right = _at_border(int(floor_x), width), _at_border(int(floor_x) + 1, width)
+                top, bottom = _at_border(int(floor_y), height), _at_border(int(floor_y) + 1, height)
+                for c in range(3):
+                    above = _fma(share_x, image[top, right, c] - image[top, left, c], image[top, left, c])
+                    first = image[bottom, left, c]
+                    below = _fma(share_x, image[bottom, right, c] - first, first)
+                    out[row, column, c] += _fma(share_y, below - above, above)
+            for c in range(3):
+                out[row, column, c] *= _f(1.0 / 3.0)
+
+
+@exact_kernel
+def record(
+    image: _Plane,
+    noise: _Plane,
+    per_electron: Any,
+    dark: Any,
+    codes: NDArray[np.uint8],
+    out: NDArray[np.uint8],
+) -> None:
+    """Write the codes (H, W, 3) of an exposed image with shot noise and noise in the dark."""
+    steps = _f(len(codes) - 1)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            for c in range(3):
+                level = image[row, column, c]
+                sigma = _f(np.sqrt(max(level, _ZERO) * per_electron + dark))
+                level = (level + sigma * noise[row, column, c]) * steps
+                out[row, column, c] = codes[int(_clip(level, _ZERO, steps))]
