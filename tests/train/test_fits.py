@@ -19,11 +19,13 @@ from tests.train.small import tiny, train
 from train import fit_judge, fit_lane_score, ship, shipment
 from train.checkpoint import load_checkpoint
 from train.confident_spots import lit
-from train.examples import TrueMarking, example, polygon_overlap
+from train.examples import TrueMarking, example, polygon_overlap, whole_ones
 from train.exported import read_exported
 from train.fit_judge import Gathered, is_true
 from train.fit_lane_score import proposed, seen
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from train.scenes.paint import Brush, rectangle, rhombus
+from train.scenes.symbols import hollow_diamond
 from train.shipment import Order
 from v2hdm.detection import weights
 from v2hdm.detection.classifier import AMONG, SHAPES
@@ -150,6 +152,20 @@ def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_no
     assert is_true(shown, LANE_DASH, hidden)[0] is True
     assert is_true(shown, LANE_DASH, hidden - [0, 70])[0] is None
     assert is_true(shown, LANE_DASH, hidden + np.array([200.0, 0.0])) == (False, None)
+
+
+def test_a_hollow_diamond_is_one_marking_as_worn_as_the_worst_of_its_strokes():
+    rng = np.random.default_rng(0)
+    brush = Brush((0.7, 0.7, 0.7), 0.3, 0.1)
+    dash = brush.paint(rng, LANE_DASH, rectangle(np.array([5.0, 2.0]), 3.0, 0.15))
+    filled = brush.paint(rng, DIAMOND, rhombus(np.array([9.0, 0.0]), 2.0, 1.4))
+    outlines = [hollow_diamond(brush, rng, rhombus(np.array([x, 0.0]), 2.0, 1.4), 0.2) for x in (5.0, 7.0)]
+    whole = whole_ones([dash, *outlines[0], *outlines[1], filled])
+    assert whole[0] is dash
+    assert whole[3] is filled
+    for one, strokes in zip(whole[1:3], outlines, strict=True):
+        np.testing.assert_array_equal(one.polygon_map, strokes[0].polygon_map)
+        assert one.wear == max(stroke.wear for stroke in strokes[1:]) < 1
 
 
 CONFIG = JudgeConfig(epochs=6, width=4)
