@@ -12,7 +12,7 @@ import onnxruntime
 import pytest
 import torch
 
-from export.judge_file import write_judge
+from export.judge_file import read_judge, write_judge
 from export.onnx_file import export_checkpoint
 from models.judge import Judge
 from tests.train.small import tiny, train
@@ -28,7 +28,7 @@ from train.scenes.paint import Brush, rectangle, rhombus
 from train.scenes.symbols import hollow_diamond
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.classifier import AMONG, SHAPES
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
@@ -230,6 +230,18 @@ def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
         np.testing.assert_allclose(np.exp(log_sigma), expected[1], rtol=1e-3)
 
 
+def test_a_judge_is_read_from_its_file_to_learn_on_unless_its_inputs_are_others(tmp_path):
+    known, path = quadrilaterals(5, 200), tmp_path / "judge.onnx"
+    judge = train_judge(known, CONFIG)
+    write_judge(judge, (3, 20, 20), {}, path)
+    again = read_judge(path, 3, 4, 2, CONFIG.width)
+    assert read_judge(path, 3, 5, 2, CONFIG.width) is None
+    for new, old in zip(judged(again.eval(), known), judged(judge, known), strict=True):
+        np.testing.assert_allclose(new, old, atol=1e-5)
+    learnt = judged(train_judge(quadrilaterals(6, 600), CONFIG, again), known)[0]
+    assert ((learnt > 0) == known.true).mean() >= ((judged(judge, known)[0] > 0) == known.true).mean() > 0.8
+
+
 def test_a_judge_of_broken_weights_is_not_written(tmp_path):
     judge = train_judge(quadrilaterals(4, 100), CONFIG)
     with torch.no_grad():
@@ -275,11 +287,11 @@ def quick(monkeypatch):
         gathered.append(part.numbers)
 
     judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
-    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in SHAPES}
+    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in COMPANIES}
     lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
     monkeypatch.setattr(shipment, "share_out", in_this_process)
     monkeypatch.setattr(fit_judge, "gather", gather)
-    monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell: (tell(0.5), (judge, among))[1])
+    monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell, start: (tell(0.5), (judge, among))[1])
     monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))
     monkeypatch.setattr(fit_lane_score, "fit_to", lambda images: lines)
     return gathered
