@@ -1,4 +1,4 @@
-"""The judge as an ONNX file, checked against torch."""
+"""The judge as an ONNX file, checked against torch, and read again to learn on."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime
 import torch
+from onnx import numpy_helper
 
 from export.onnx_file import graph_of, write_labelled
 from models.judge import Judge
@@ -45,6 +47,17 @@ def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str
             if not difference <= _TOLERANCE:
                 raise DetectorError(f"{path} was not written: its {name} would differ by {difference:.2g}")
     write_labelled(model, label, path)
+
+
+def read_judge(path: Path, channels: int, features: int, shapes: int, width: int) -> Judge | None:
+    """The judge in a file of :func:`write_judge`, to learn on; None where it is of other inputs."""
+    judge = Judge(channels, features, shapes, width, 0.0)
+    values = {part.name: numpy_helper.to_array(part) for part in onnx.load(path).graph.initializer}
+    state = judge.state_dict()
+    if any(name not in values or values[name].shape != tuple(part.shape) for name, part in state.items()):
+        return None
+    judge.load_state_dict({name: torch.from_numpy(values[name].copy()) for name in state})
+    return judge
 
 
 def _any_rows(judge: Judge, views_shape: tuple[int, int, int], rows: int) -> dict[str, torch.Tensor]:

@@ -26,6 +26,11 @@ Pair = tuple[Tensor, Targets]
 """Images (H, W, 3) uint8 and the answers for them."""
 
 
+def hardships_of(config: DataConfig) -> Hardships:
+    """The hardships that renders are drawn with."""
+    return Hardships(**{each.name: getattr(config, each.name) for each in fields(Hardships)})
+
+
 class RenderStream(IterableDataset[Pair]):
     """Pairs of image and answers, the same for the same seed, workers and part.
 
@@ -46,8 +51,7 @@ class RenderStream(IterableDataset[Pair]):
         labels: LabelledImages | None = None,
     ) -> None:
         self.config = config
-        names = (field.name for field in fields(Hardships))
-        self.hardships = Hardships(**{name: getattr(config, name) for name in names})
+        self.hardships = hardships_of(config)
         self.seed = seed
         self.first_render = first_render
         self.part = part

@@ -6,8 +6,8 @@ lanes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,18 +15,19 @@ import numpy as np
 from train.config import DataConfig
 from train.labels import Place, paint_labels
 from train.labels_image import ANY, LabelledImage
-from train.scenes.scenes import image_line, image_points, random_scene
-from train.scenes.views import TrainingView, random_view
+from train.scenes.hardships import NONE, Hardships
+from train.scenes.scenes import drawn_scene, image_line, image_points
+from train.scenes.views import TrainingView
 from v2hdm.catalogue import CORNERED_CLASSES, LANE_CLASSES, NOT_PAINT, OUTLINED_CLASSES, PAINT_CLASSES
 from v2hdm.detection.camera import camera_from_calibration, rough_calibration
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.planar import clip_convex, clip_half, signed_area
+from v2hdm.geometry.planar import clip_convex, clip_half, inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, FloatArray
-from v2hdm.simulate.render.renderer import Rendered, Renderer
-from v2hdm.simulate.render.scene import Scene
+from v2hdm.simulate.render.renderer import Rendered
+from v2hdm.simulate.render.scene import Paint, Scene
 
 SEED = 771_000_003
 """No training or validation seed, whatever their index: those start from single-digit seeds."""
@@ -92,13 +93,10 @@ class Example:
     silent: tuple[str, ...] = ()
 
 
-def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
-    """Example ``index`` of the fixed set, or of that of another ``seed``."""
-    rng = np.random.default_rng([seed, index])
-    scene, lanes = random_scene(rng, difficulty)
-    view = random_view(rng, WIDTH, HEIGHT)
-    rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
-    return example_of(scene, lanes, view, rendered, _camera(view))
+def example(index: int, difficulty: float = 1.0, seed: int = SEED, hardships: Hardships = NONE) -> Example:
+    """Example ``index`` of the fixed set, or of that of another ``seed`` or with ``hardships``."""
+    drawn = drawn_scene(np.random.default_rng([seed, index]), WIDTH, HEIGHT, difficulty, hardships)
+    return example_of(drawn.scene, drawn.lanes_map, drawn.view, drawn.rendered, _camera(drawn.view))
 
 
 def photograph(image: LabelledImage, config: DataConfig, rng: np.random.Generator) -> Example:
@@ -165,7 +163,7 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
     """The scene's paint by piece; pieces that belong together (arrows, chevrons) are judged as one."""
     centre = camera_centre(view.cam_from_map)
     out = []
-    for paint in scene.paints:
+    for paint in whole_ones(scene.paints):
         if paint.kind not in CORNERED_CLASSES + OUTLINED_CLASSES:
             continue
         polygon = np.asarray(paint.polygon_map, dtype=np.float64)
@@ -182,6 +180,24 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
         fair = whole and tall and range_m <= MAX_RANGE_M and paint.wear <= 0.4
         out.append(TrueMarking(paint.kind, polygon_px, range_m, fair and paint.kind in CORNERED_CLASSES))
     return out
+
+
+def whole_ones(paints: Sequence[Paint]) -> list[Paint]:
+    """These paints, of hollow markings their outlines alone, as worn as the most worn of their strokes."""
+    out: list[Paint] = []
+    hollow = None
+    for paint in paints:
+        if hollow and paint.kind == hollow.kind and inside_convex(hollow.polygon_map, _middle(paint)):
+            worst = paint.wear if out[-1] is hollow else max(paint.wear, out[-1].wear)
+            out[-1] = replace(hollow, wear=worst)
+            continue
+        out.append(paint)
+        hollow = paint if paint.wear == 1.0 else None
+    return out
+
+
+def _middle(paint: Paint) -> FloatArray:
+    return np.asarray(paint.polygon_map.mean(axis=0))
 
 
 def _before_camera(polygon_map: FloatArray, view: TrainingView) -> FloatArray:
@@ -219,6 +235,8 @@ def _share(mask: np.ndarray, low: np.ndarray, rendered: Rendered, labels: Iterab
 
 def polygon_overlap(first: FloatArray, second: FloatArray) -> float:
     """Intersection over union of the hulls of two polygons."""
+    if (first.max(axis=0) < second.min(axis=0)).any() or (second.max(axis=0) < first.min(axis=0)).any():
+        return 0.0
     a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
     common, first_area, second_area = (abs(float(signed_area(p))) for p in (clip_convex(a, b), a, b))
     return common / max(first_area + second_area - common, 1e-6)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -63,19 +63,26 @@ class JudgeConfig:
     seed: int = 0
 
 
-def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
-    """A judge that has learnt from all of ``known``, ready to be asked."""
+def train_judge(known: Quadrilaterals, config: JudgeConfig, start: Judge | None = None) -> Judge:
+    """A judge that has learnt from all of ``known``, ready to be asked.
+
+    One to ``start`` from knows most of it already: a quarter of the time at a third of the rate is enough.
+    """
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     channels, features, shapes = known.views.shape[1], known.evidence.shape[1], known.shape.shape[1]
     judge = Judge(channels, features, shapes, config.width, config.dropout).train()
-    judge.mean.copy_(torch.from_numpy(known.evidence.mean(axis=0)))
-    judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
+    if start is not None:
+        judge.load_state_dict(start.state_dict())
+        config = replace(config, epochs=-(-config.epochs // 4), learning_rate=config.learning_rate / 3)
+    else:
+        judge.mean.copy_(torch.from_numpy(known.evidence.mean(axis=0)))
+        judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
     parts = [torch.from_numpy(part) for part in (known.views, known.evidence, known.shape)]
     true = torch.from_numpy(known.true.astype(np.float32))
     side_error, side_variance = torch.from_numpy(known.side_error), torch.from_numpy(known.side_variance)
     claims = _Claims.of(known)
-    batches = -(-len(true) // _BATCH)
+    batches = -(-len(true) // (_BATCH if start is None else 2 * _BATCH))
     optimiser = torch.optim.AdamW(judge.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, config.learning_rate, total_steps=config.epochs * batches

@@ -186,8 +186,17 @@ def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
         tell(_GATHERED + (_JUDGED - _GATHERED) * share, "judge: learning")
 
     learnt(0.0)
-    judge, confidence = fit_judge.fit_all(Gathered.load([part.path for part in parts]), learnt)
+    judge, confidence = fit_judge.fit_all(
+        Gathered.load([part.path for part in parts]), learnt, _judge_before(order, network)
+    )
     fit_judge.write_both(judge, confidence, order.judge_images, folder)
+
+
+def _judge_before(order: Order, network: Path) -> Path | None:
+    """The judge of the same network that is to be replaced, to learn on from it, if there is one."""
+    judge, before = (order.folder / name for name in (weights.JUDGE_FILE.name, weights.NETWORK_FILE.name))
+    known = judge.is_file() and before.is_file() and before.read_bytes() == network.read_bytes()
+    return judge if known else None
 
 
 def _labels(order: Order, tell: Share) -> LabelledImages | None:

@@ -11,7 +11,7 @@ from tests.detection.pictures import bar, brightness_model, diamond, make_camera
 from train.fit_judge import fit
 from v2hdm.catalogue import load_catalogue
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.classifier import AMONG, COMPANY, SHAPES, classify_among, company
+from v2hdm.detection.classifier import AMONG, COMPANIES, COMPANY, SHAPES, classify_among, company
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
@@ -212,8 +212,8 @@ def test_judge_and_weights_are_those_of_the_evidence_that_is_gathered():
     assert (label["features"], label["channels"]) == ([*FEATURES], [*CHANNELS])
     assert label["shapes"] == [*SHAPES]
     fitted = json.loads(CONFIDENCE_FILE.read_text())
-    assert set(fitted) == set(SHAPES)
-    assert all(set(fitted[shape]["weights"]) == set(AMONG) for shape in SHAPES)
+    assert set(fitted) == set(COMPANIES)
+    assert all(set(fitted[name]["weights"]) == set(AMONG) for name in COMPANIES)
 
 
 def test_an_end_worn_to_shreds_is_trusted_less_than_a_clean_one(tmp_path):

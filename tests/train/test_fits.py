@@ -12,21 +12,23 @@ import onnxruntime
 import pytest
 import torch
 
-from export.judge_file import write_judge
+from export.judge_file import read_judge, write_judge
 from export.onnx_file import export_checkpoint
 from models.judge import Judge
 from tests.train.small import tiny, train
 from train import fit_judge, fit_lane_score, ship, shipment
 from train.checkpoint import load_checkpoint
 from train.confident_spots import lit
-from train.examples import TrueMarking, example, polygon_overlap
+from train.examples import TrueMarking, example, polygon_overlap, whole_ones
 from train.exported import read_exported
 from train.fit_judge import Gathered, is_true
 from train.fit_lane_score import proposed, seen
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from train.scenes.paint import Brush, rectangle, rhombus
+from train.scenes.symbols import hollow_diamond
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.classifier import AMONG, SHAPES
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
@@ -152,6 +154,20 @@ def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_no
     assert is_true(shown, LANE_DASH, hidden + np.array([200.0, 0.0])) == (False, None)
 
 
+def test_a_hollow_diamond_is_one_marking_as_worn_as_the_worst_of_its_strokes():
+    rng = np.random.default_rng(0)
+    brush = Brush((0.7, 0.7, 0.7), 0.3, 0.1)
+    dash = brush.paint(rng, LANE_DASH, rectangle(np.array([5.0, 2.0]), 3.0, 0.15))
+    filled = brush.paint(rng, DIAMOND, rhombus(np.array([9.0, 0.0]), 2.0, 1.4))
+    outlines = [hollow_diamond(brush, rng, rhombus(np.array([x, 0.0]), 2.0, 1.4), 0.2) for x in (5.0, 7.0)]
+    whole = whole_ones([dash, *outlines[0], *outlines[1], filled])
+    assert whole[0] is dash
+    assert whole[3] is filled
+    for one, strokes in zip(whole[1:3], outlines, strict=True):
+        np.testing.assert_array_equal(one.polygon_map, strokes[0].polygon_map)
+        assert one.wear == max(stroke.wear for stroke in strokes[1:]) < 1
+
+
 CONFIG = JudgeConfig(epochs=6, width=4)
 
 
@@ -198,7 +214,7 @@ def test_where_the_paint_network_is_confident_the_image_has_a_say_of_its_own():
     assert told[0.3] > told[0.0] + 0.5
 
 
-def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
+def test_the_file_answers_as_the_network_does_for_any_number_of_rows_and_can_be_read_again(tmp_path):
     known = quadrilaterals(3, 200)
     judge = train_judge(known, CONFIG)
     path = tmp_path / "judge.onnx"
@@ -212,6 +228,23 @@ def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
         expected = judged(judge, part)
         np.testing.assert_allclose(odds, expected[0], atol=1e-4)
         np.testing.assert_allclose(np.exp(log_sigma), expected[1], rtol=1e-3)
+    again = read_judge(path, 3, 4, 2, CONFIG.width)
+    assert again is not None
+    for new, old in zip(judged(again.eval(), known), judged(judge, known), strict=True):
+        np.testing.assert_allclose(new, old, atol=1e-5)
+    assert read_judge(path, 3, 5, 2, CONFIG.width) is None
+
+
+def test_a_judge_that_learns_on_begins_as_it_was_and_leaves_the_first_alone():
+    known, more = quadrilaterals(5, 300), quadrilaterals(6, 600)
+    first = train_judge(known, CONFIG)
+    before = judged(first, more)[0]
+    on = train_judge(more, CONFIG, first)
+    after = judged(on, more)[0]
+    np.testing.assert_array_equal(judged(first, more)[0], before)
+    torch.testing.assert_close(on.mean, first.mean)
+    assert fit_judge.log_loss(after, more.true) < fit_judge.log_loss(before, more.true)
+    assert np.corrcoef(before, after)[0, 1] > 0.5
 
 
 def test_a_judge_of_broken_weights_is_not_written(tmp_path):
@@ -259,11 +292,11 @@ def quick(monkeypatch):
         gathered.append(part.numbers)
 
     judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
-    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in SHAPES}
+    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in COMPANIES}
     lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
     monkeypatch.setattr(shipment, "share_out", in_this_process)
     monkeypatch.setattr(fit_judge, "gather", gather)
-    monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell: (tell(0.5), (judge, among))[1])
+    monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell, start: (tell(0.5), (judge, among))[1])
     monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))
     monkeypatch.setattr(fit_lane_score, "fit_to", lambda images: lines)
     return gathered

@@ -40,7 +40,7 @@ from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import SEEN_ACROSS, FloatArray
-from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
@@ -95,6 +95,32 @@ def training_sample(
         hardships: What is added to the scene and done to its image.
     """
     rng = np.random.default_rng([seed, index])
+    drawn = drawn_scene(rng, width, height, difficulty, hardships)
+    rendered = drawn.rendered
+    seen = (image_line(drawn.view, lane) for lane in drawn.lanes_map)
+    lanes_px = tuple(lane for lane in seen if len(lane) > 1)
+    labels = _TO_ONE_ASIDE[rendered.labels] if drawn.aside else rendered.labels
+    return TrainingSample(rendered.image, labels, rendered.hidden, lanes_px)
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """A random scene, the lines (N, 2) of its lanes, a view of it and what that shows.
+
+    The camera of an ``aside`` view looks to the side of the vehicle.
+    """
+
+    scene: Scene
+    lanes_map: list[FloatArray]
+    view: TrainingView
+    aside: bool
+    rendered: Rendered
+
+
+def drawn_scene(
+    rng: np.random.Generator, width: int, height: int, difficulty: float, hardships: Hardships
+) -> DrawnScene:
+    """A scene and a view of it by chance, rendered; arguments are those of :func:`training_sample`."""
     scene, lanes = random_scene(rng, difficulty, hardships)
     usual = random_view(rng, width, height)
     places = [paint.polygon_map.mean(axis=0) for paint in scene.paints if paint.kind in CORNERED_CLASSES]
@@ -109,10 +135,7 @@ def training_sample(
     rendered = Renderer(scene).render(
         view.info, view.cam_from_map, rng, optics, view.motion, before_lens=before
     )
-    seen = (image_line(view, lane) for lane in lanes)
-    lanes_px = tuple(lane for lane in seen if len(lane) > 1)
-    labels = rendered.labels if view is ahead else _TO_ONE_ASIDE[rendered.labels]
-    return TrainingSample(rendered.image, labels, rendered.hidden, lanes_px)
+    return DrawnScene(scene, lanes, view, view is not ahead, rendered)
 
 
 def image_points(view: TrainingView, points_map: FloatArray) -> FloatArray:

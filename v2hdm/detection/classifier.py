@@ -32,7 +32,7 @@ from v2hdm.detection.patch import ImageQuads, Patches
 from v2hdm.detection.propose import Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.quadrilateral import Quad
-from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
+from v2hdm.records import DIAMOND, LANE_DASH, STOP_LINE, BoolArray, FloatArray, MarkingDetection
 
 JUDGE_INPUTS = ("views", "evidence", "shape")
 JUDGE_OUTPUTS = ("odds", "log_side_sigma")
@@ -50,6 +50,9 @@ AMONG = ("alone", *COMPANY)
 
 SHAPES = (DIAMOND, LANE_DASH, "bar")
 """Diamonds, lane dashes, and whatever else has four corners."""
+
+COMPANIES = (STOP_LINE, *SHAPES)
+"""Whose company is weighed apart: the bars of a crosswalk are many and alike, a stop line keeps none."""
 
 _LOG_SIZE_SIGMA = 0.2
 _DIRECTION_SIGMA = 0.15
@@ -187,7 +190,8 @@ def classify_alone(
 
 def classify_among(odds: FloatArray, ground: FloatArray, kinds: Sequence[str]) -> FloatArray:
     """Probability (R,) of all readings of an image, whose log odds alone are (R,), corners (R, 4, 2), m."""
-    weights, bias = zip(*(_confidence(CONFIDENCE_FILE)[shape_of(kind)] for kind in kinds), strict=True)
+    fitted = _confidence(CONFIDENCE_FILE)
+    weights, bias = zip(*(fitted[shape_of(kind, COMPANIES)] for kind in kinds), strict=True)
     features = features_among(odds, ground, kinds)
     return as_probability((features * np.array(weights)).sum(axis=1) + np.array(bias))
 
@@ -197,9 +201,9 @@ def features_among(odds: FloatArray, ground: FloatArray, kinds: Sequence[str]) -
     return np.column_stack([odds, company(ground, kinds, as_probability(odds))])
 
 
-def shape_of(kind: str) -> str:
-    """The one of :data:`SHAPES` that a class with four corners has."""
-    return kind if kind in SHAPES else SHAPES[-1]
+def shape_of(kind: str, shapes: Sequence[str] = SHAPES) -> str:
+    """The one of ``shapes`` that a class with four corners has."""
+    return kind if kind in shapes else shapes[-1]
 
 
 def one_hot(kinds: Sequence[str]) -> np.ndarray:
@@ -214,7 +218,7 @@ def _session(path: Path) -> Any:
 
 @cache
 def _confidence(path: Path) -> dict[str, tuple[FloatArray, float]]:
-    """Weights (F,) and bias of each shape's logistic function among others."""
+    """Weights (F,) and bias of the logistic function of each of :data:`COMPANIES`."""
     fitted = json.loads(path.read_text(encoding="utf-8"))
     return {
         shape: (np.array([part["weights"][name] for name in AMONG]), float(part["bias"]))
@@ -233,6 +237,7 @@ def company(ground: FloatArray, kinds: Sequence[str], probability: FloatArray) -
     apart = centre[None] - centre[:, None]
     distance = np.hypot(apart[..., 0], apart[..., 1])
     weight = np.where((kind[:, None] == kind) & (distance > _APART_M), probability, 0.0)
+    weight[kind == STOP_LINE] = 0.0
     log_size = np.log(size)
     misfit = ((log_size[:, None] - log_size) ** 2).sum(axis=2) / _LOG_SIZE_SIGMA**2
     # Of axes that have no sense of direction.

@@ -298,17 +298,9 @@ class _State:
         """The state at a start; light and contrast are not known yet (nan)."""
         count = len(blur_px)
         outline = quad.corners, outline_sigma_px, *_closure(quad.corners, frames)
+        known = Quad(quad.corners.copy()), blur_px, expected_blur_px, *outline
         contrast, light = np.full(count, _CONTRAST), np.full((count, KNOTS), np.nan)
-        return cls(
-            Quad(quad.corners.copy()),
-            blur_px,
-            expected_blur_px,
-            *outline,
-            contrast,
-            contrast.copy(),
-            light,
-            np.zeros(count),
-        )
+        return cls(*known, contrast, contrast.copy(), light, np.zeros(count))
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
         """Gauss-Newton until each marking's step is small; the system is that of its last step.
