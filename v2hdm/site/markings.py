@@ -55,12 +55,6 @@ class Support:
         """The class of each candidate."""
         return tuple(self.sightings.kinds[kind] for kind in self.kind)
 
-    def of_kinds(self, names: Sequence[str]) -> Support:
-        """The same of classes (G,); one that no sighting is of has the shape of that which images say."""
-        known = {name: number for number, name in enumerate(self.sightings.kinds)}
-        kind = [known.get(name, own) for name, own in zip(names, self.kind.tolist(), strict=True)]
-        return replace(self, kind=np.array(kind, dtype=np.int64))
-
     def counts(self, corners_map: FloatArray) -> Counts:
         """How often candidates of corners (G, 4, 2) were seen."""
         count = len(self.kind)
@@ -142,16 +136,20 @@ def classify(solved: Candidates, seen: Support, parallax: Parallax, options: Acc
     """
     counts = seen.counts(np.where(solved.known[..., None], solved.corners_map, np.nan))
     first = posterior(solved, seen.kind, counts)
-    stated = Stated.of(options.corrections, first.candidates.corners_map, seen.names())
-    kinds = [
-        stated.kept[group].new_kind or kind if group in stated.kept else kind
-        for group, kind in enumerate(seen.names())
-    ]
-    solved, seen = stated.placed(solved, first.candidates), seen.of_kinds(kinds)
+    names = list(seen.names())
+    stated, number = Stated.of(options.corrections, first.candidates.corners_map, names), seen.kind.copy()
+    for group, correction in stated.kept.items():
+        names[group] = correction.new_kind or names[group]
+        # The shape of a class is learned from its candidates: without another one there is none.
+        number[group] = dict(zip(seen.names(), seen.kind.tolist(), strict=True)).get(
+            names[group], number[group]
+        )
+    solved = stated.placed(solved, first.candidates)
     # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
     counts = seen.counts(first.candidates.corners_map)
-    found = posterior(solved, seen.kind, counts)
+    found = posterior(solved, number, counts)
     found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
+    found.log_odds[list(stated.kept)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))
     part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
     verdict: list[str | None] = [
@@ -161,16 +159,16 @@ def classify(solved: Candidates, seen: Support, parallax: Parallax, options: Acc
     sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
     # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
-    for group in np.flatnonzero(uncertain):
+    for group in np.flatnonzero(uncertain).tolist():
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)
     verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
+    for kept in stated.kept:
+        verdict[kept] = None
     verdict = [stated.rejected.get(group, reason) for group, reason in enumerate(verdict)]
-    for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
+    for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])).tolist():
         verdict[group] = COVERED
-    for own in stated.kept:
-        verdict[own] = None
-    return Classified(tuple(kinds), found.candidates, counts, found.misfit, verdict)
+    return Classified(tuple(names), found.candidates, counts, found.misfit, verdict)
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:

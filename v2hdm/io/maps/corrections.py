@@ -5,7 +5,7 @@ They name places, not candidates: markings get other numbers when a drive is map
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,11 +101,12 @@ def correction_of(entry: object, where: str) -> Correction:
 
 def write_corrections(corrections: Sequence[Correction], result: str, path: Path) -> None:
     """Write corrections of a ``result``, whole."""
-    content = {"result": result, "corrections": [_entry(one) for one in corrections]}
+    content = {"result": result, "corrections": [entry_of(one) for one in corrections]}
     replace_text(path, _HEAD + dump_yaml(content))
 
 
-def _entry(one: Correction) -> Mapping[str, Any]:
+def entry_of(one: Correction) -> dict[str, Any]:
+    """An entry as it is written."""
     entry: dict[str, Any] = {"says": one.says, "class": one.kind}
     named = {"marking": one.marking, "new_class": one.new_kind, "reason": one.reason}
     entry |= {key: value for key, value in named.items() if value}

@@ -284,6 +284,7 @@
       side.append(element("p", { class: "hint" }, what), shots);
     } else side.append(element("p", { class: "hint" }, "No picture of it in this report."));
     byId("details").replaceChildren(element("div", { class: "card", "data-key": about.key }, text, side));
+    dispatchEvent(new CustomEvent("v2hdm-selected", { detail: { shape, text } }));
   }
 
   function corners(about) {
@@ -329,5 +330,5 @@
     }
   });
   byId("map").dataset.ready = String(Math.round(performance.now()));
-  window.v2hdmMap = { map, things }; // for tests, and for those who want more of it
+  window.v2hdmMap = { map, things, element, kinds: data.kinds }; // for tests, and for those who want more of it
 })();
