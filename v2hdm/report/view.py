@@ -11,6 +11,7 @@ import json
 import secrets
 import threading
 from collections.abc import Sequence
+from contextvars import Context
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -65,7 +66,8 @@ class Session:
             now = {name: one for name, one in self.corrections.items() if name != key}
             if entry is not None:
                 now[key] = correction_of(entry, key)
-            write_corrections(list(now.values()), str(self.folder), self.path)
+            # The file was read when the command began, and is written all the same: it is gone on with.
+            Context().run(write_corrections, list(now.values()), str(self.folder), self.path)
             self.corrections = now
 
 

@@ -16,7 +16,7 @@ from tests.report.page.folder import PLACES, make_result
 from tests.report.page.test_browser import ON_SCREEN
 from tests.report.page.test_browser import browser as browser
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps.corrections import read_corrections
+from v2hdm.io.maps.corrections import Correction, read_corrections, write_corrections
 from v2hdm.report.page.document import write_page
 from v2hdm.report.view import file_beside, server_of
 from v2hdm.store.files import file_digest
@@ -131,14 +131,21 @@ def test_a_file_that_is_not_ours_is_not_replaced(tmp_path):
         server_of(tmp_path / "result", drive, file_beside(tmp_path / "result"))
 
 
-def test_a_signal_ends_it_in_one_line(tmp_path):
+def test_a_signal_ends_it_in_one_line_and_what_was_said_before_is_gone_on_with(tmp_path):
     make_result(tmp_path)
+    path = file_beside(tmp_path / "result")
+    write_corrections([Correction(says="accepted", kind="diamond", outline_map=[[1.0, 2.0]])], "r", path)
     command = [sys.executable, "-m", "v2hdm", "view", str(tmp_path / "result")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline().startswith("open http://127.0.0.1:")
+        address = process.stdout.readline().split()[1].rstrip(";")
+        entry = {"says": "rejected", "class": "diamond", "outline_map": [[3.0, 4.0]]}
+        sent = json.dumps({"key": "x0", "correction": entry})
+        assert ask(address, "POST", f"{urlsplit(address).path}correct", sent) == (200, "kept")
         os.kill(process.pid, signal.SIGINT)
         said, failed = process.communicate(timeout=30)
-    assert (process.returncode, said, failed) == (0, "ended\n", "")
+    line = f"2 corrections in {path}: map.corrections={path} in the next run\n"
+    assert (process.returncode, said, failed) == (0, line, "")
+    assert [one.says for one in read_corrections(path)] == ["accepted", "rejected"]
 
 
 def test_pictures_of_a_report_stay_when_it_is_made_again_without_its_drive(tmp_path):
