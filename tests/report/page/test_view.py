@@ -63,7 +63,7 @@ def test_a_person_rejects_reclassifies_and_drags_and_the_result_stays(browser, s
         handle.hover()
         page.mouse.down()
         box = handle.bounding_box()
-        page.mouse.move(box["x"] + 7 + 12, box["y"] + 7, steps=4)
+        page.mouse.move(box["x"] + 13 + 12, box["y"] + 13, steps=4)
         page.mouse.up()
         page.locator(".said", has_text="1 corner").wait_for()
         assert "3 corrections in result.corrections.yaml" in page.locator(".editing").inner_text()

@@ -16,7 +16,6 @@
     status.classList.toggle("problem", problem !== "");
     for (const shape of things) {
       const own = said[shape.about.key];
-      const element = shape.getElement?.();
       if (own) shape.setStyle({ weight: 3, dashArray: own.says === "rejected" ? "3 4" : null, fillOpacity: own.says === "rejected" ? 0.08 : 0.7 });
     }
   }
@@ -63,7 +62,7 @@
     if (!about.c || own.says === "rejected") return;
     about.c.forEach(([x, y], n) => {
       const [east, north] = own.moved?.[n + 1] ?? [x, y];
-      const handle = L.marker([north, east], { draggable: true, autoPan: true, title: `corner ${n + 1}: drag it`, icon: L.divIcon({ className: "handle", iconSize: [14, 14] }) });
+      const handle = L.marker([north, east], { draggable: true, autoPan: true, title: `corner ${n + 1}: drag it`, icon: L.divIcon({ className: "handle", iconSize: [26, 26] }) });
       handle.on("drag", () => {
         const corners = about.c.map((corner) => [corner[1], corner[0]]);
         handles.eachLayer((one) => { corners[one.corner] = one.getLatLng(); });
