@@ -68,3 +68,14 @@ def short_drive(rendered: Callable[[PortConfig], Path]) -> Path:
 def small_drive(rendered: Callable[[PortConfig], Path]) -> Path:
     """The drive through :func:`small_port`."""
     return rendered(small_port())
+
+
+@pytest.fixture(scope="session")
+def small_mapped(small_drive: Path) -> tuple[Path, Path]:
+    """The result of a run over :func:`small_port`'s drive, to be read only, and the cache of that run."""
+    from v2hdm.pipeline.run import run
+
+    cache = small_drive.parent / "cache"
+    with (small_drive.parent / "mapped").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return run(run_config(small_drive, small_drive.parent / "out", cache=str(cache))).folder, cache

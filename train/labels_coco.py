@@ -63,7 +63,9 @@ def read_coco(
             )
         if entry["image_id"] not in shapes:
             raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
-        kind = _kind(names[entry["category_id"]], kinds, known, where)
+        # What COCO calls a crowd is of no score there: nobody knows what of it is one of the category.
+        unsure = bool(entry.get("iscrowd"))
+        kind = (UNKNOWN,) if unsure else _kind(names[entry["category_id"]], kinds, known, where)
         if kind != (NOT_PAINT,):
             rings = _rings(entry["segmentation"], where, scales[entry["image_id"]])
             shapes[entry["image_id"]].append(Shape(kind, rings))

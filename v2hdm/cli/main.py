@@ -96,6 +96,8 @@ _SAYS = {
     "calibrate compare": "Say whether a camera has moved between two results.",
     "localize": "Find the vehicle's poses from the markings of a map.",
     "report": "Make the report.html of a result again.",
+    "view": "Look at a result in the browser, and correct its markings for the next run.",
+    "labels": "Label a result's markings in every image of its drive, to train from.",
     "mosaic": "Show the ground of a result from above, before and after the optimisation.",
     "export": "Convert a map or a calibration to other formats.",
     "experiment": "Compare all methods on both ports, as the paper does.",

@@ -157,3 +157,16 @@ def _geodetic_from_ecef(points: FloatArray) -> FloatArray:
     on_ellipsoid = out_m - _SEMI_MAJOR_M * np.cos(parametric), z - minor_m * np.sin(parametric)
     height_m = on_ellipsoid[0] * np.cos(lat) + on_ellipsoid[1] * np.sin(lat)
     return np.column_stack([np.degrees(lat), np.degrees(np.arctan2(y, x)), height_m])
+
+
+def utm_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> tuple[str, FloatArray]:
+    """The UTM zone of an origin as an EPSG code, and eastings and northings (N, 2) of points (N, 3) in it.
+
+    Raises MapFileError where pyproj is not installed.
+    """
+    pyproj = need("pyproj", "map", "coordinates of a UTM zone", MapFileError)
+    zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
+    north, etrs = origin.latitude_deg >= 0, origin.datum.upper().startswith("ETRS")
+    code = f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
+    to_grid = pyproj.Transformer.from_crs(pyproj.CRS(code).geodetic_crs, code, always_xy=True)
+    return code, np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))

@@ -34,6 +34,7 @@ from v2hdm.mapping.stated import without_corner
 from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.changes import Base, update_map
+from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.looks import Observer
@@ -316,12 +317,13 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
     seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
     symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
+    hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
         hd_map=hd_map if section is None else with_heights(hd_map, drive.road, section.height_m),
         calibrations=optimised.calibrations,
-        excluded=(*optimised.excluded, *no_symbols),
+        excluded=(*optimised.excluded, *no_symbols, *rejected),
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
         growth=(*growth, optimised.markings) if growth else (),

@@ -10,6 +10,7 @@ from typing import Any
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.io.drive import ReadOptions, drive_name
+from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.io.maps.formats import check_formats
 from v2hdm.io.safe.texts import shown, take_camera_name, take_name
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
@@ -47,9 +48,14 @@ class DriveConfig(ReadOptions):
 
 @dataclass(kw_only=True)
 class MapConfig:
-    """The map that comes out: ``base`` is the map.geojson that the drive brings up to date, None for none."""
+    """The map that comes out.
+
+    ``base`` is the map.geojson that the drive brings up to date, ``corrections`` the file of what a person
+    says of an earlier map of the same drive (``v2hdm view``), None for none.
+    """
 
     base: str | None = None
+    corrections: str | None = None
 
 
 @dataclass(kw_only=True)
@@ -163,6 +169,8 @@ def admit(config: RunConfig) -> str:
     detector = Detector.load(options=replace(config.detector, device="cpu"))
     check_options(config.mapping, detector.catalogue.cornered)
     table_of(config.mapping.survey)
+    if config.map.corrections is not None:
+        read_corrections(Path(config.map.corrections))
     check_formats(config.export, "export")
     if config.mosaic and len(config.drive.paths) > 1:
         raise ConfigError("mosaic=true shows the ground of one drive; map the drives one by one for it")

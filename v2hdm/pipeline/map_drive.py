@@ -17,6 +17,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
+from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
@@ -34,7 +35,7 @@ from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_result
-from v2hdm.verdict.results.survey import check_known_sizes
+from v2hdm.verdict.results.survey import check_corrections, check_known_sizes
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +58,7 @@ def map_drive(
     detector: Detector | DetectorOptions | None = None,
     reading: ReadOptions | None = None,
     base: Path | str | None = None,
+    corrections: Path | str | None = None,
     accuracy_goal_cm: float = ACCURACY_GOAL_CM,
     name: str | None = None,
     cache: Path | str | None = None,
@@ -72,6 +74,7 @@ def map_drive(
         detector: the detector, or its settings.
         reading: how folders are read.
         base: the map.geojson of an earlier result, which the drive brings up to date.
+        corrections: the file of what a person says of an earlier map of the drive (``v2hdm view``).
         accuracy_goal_cm: the 95 % radius, cm, within which map and calibrations have to be known for a PASS.
         name: of the result; None takes that of the drive.
         cache: folder that keeps what each stage has found for the next call; None keeps nothing.
@@ -85,7 +88,7 @@ def map_drive(
 
     Raises:
         DriveError: the drive cannot be read.
-        MapFileError: ``base`` cannot be used.
+        MapFileError: ``base`` or ``corrections`` cannot be used.
         DetectorError: the detector cannot be used.
         ConfigError: ``accuracy_goal_cm`` or another setting is out of range.
         MappingError: there is nothing to map, although no check of the drive has failed.
@@ -101,6 +104,9 @@ def map_drive(
     kept = StageCache(None if cache is None else Path(cache))
     context = context or Context(kept, progress, workers=workers)
     options, reading = options or MappingOptions(), reading or ReadOptions()
+    if corrections is not None:
+        stated = read_corrections(Path(corrections))
+        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
     settings = detector.options if isinstance(detector, Detector) else detector
     settings = settings or DetectorOptions.for_mapping()
     sources = [drive] if isinstance(drive, Source) else list(drive)
@@ -171,6 +177,7 @@ def _judge(
     with context.timed("judge"):
         found = check_result(checked.drive, methods, checked.ground)
         unfit = check_known_sizes(survey.mapping.known_sizes, best)
+        unfit += check_corrections(survey.mapping.acceptance.corrections, best)
         reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.control else "poses")
         surveyed = check_survey(survey, best, compared)
         verdict = Verdict.of([*checked.findings, *found, *unfit, *surveyed, *reached])

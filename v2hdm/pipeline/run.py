@@ -255,6 +255,7 @@ def map_and_save(
                 detector=config.detector,
                 reading=config.drive,
                 base=config.map.base,
+                corrections=config.map.corrections,
                 accuracy_goal_cm=config.accuracy_goal_cm,
                 context=context,
             )

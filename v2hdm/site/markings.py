@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from v2hdm.association.ground import Views, easy_views, images_with_symbol
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
-from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import Candidates, Counts, Exclusion
+from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
@@ -32,9 +32,6 @@ _CLUTTER_BY = (
     "its sightings contradict each other",
 )
 """Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
-
-_MAX_OVERLAP = 0.2
-"""Share of the smaller marking's area that may lie on another marking: paint does not overlap."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +136,20 @@ def classify(solved: Candidates, seen: Support, parallax: Parallax, options: Acc
     """
     counts = seen.counts(np.where(solved.known[..., None], solved.corners_map, np.nan))
     first = posterior(solved, seen.kind, counts)
+    names = list(seen.names())
+    stated, number = Stated.of(options.corrections, first.candidates.corners_map, names), seen.kind.copy()
+    for group, correction in stated.kept.items():
+        names[group] = correction.new_kind or names[group]
+        # The shape of a class is learned from its candidates: without another one there is none.
+        number[group] = dict(zip(seen.names(), seen.kind.tolist(), strict=True)).get(
+            names[group], number[group]
+        )
+    solved = stated.placed(solved, first.candidates)
     # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
     counts = seen.counts(first.candidates.corners_map)
-    found = posterior(solved, seen.kind, counts)
+    found = posterior(solved, number, counts)
+    found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
+    found.log_odds[list(stated.kept)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))
     part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
     verdict: list[str | None] = [
@@ -151,13 +159,16 @@ def classify(solved: Candidates, seen: Support, parallax: Parallax, options: Acc
     sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
     # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
-    for group in np.flatnonzero(uncertain):
+    for group in np.flatnonzero(uncertain).tolist():
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)
     verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
-    for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
+    for kept in stated.kept:
+        verdict[kept] = None
+    verdict = [stated.rejected.get(group, reason) for group, reason in enumerate(verdict)]
+    for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])).tolist():
         verdict[group] = COVERED
-    return Classified(seen.names(), found.candidates, counts, found.misfit, verdict)
+    return Classified(tuple(names), found.candidates, counts, found.misfit, verdict)
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:
@@ -170,15 +181,9 @@ def _covered(found: Posterior, standing: IntArray) -> IntArray:
     pairs = standing[cKDTree(centres).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
     covered: set[int] = set()
     for a, b in sorted(pairs.tolist(), key=lambda pair: -max(odds[pair[0]], odds[pair[1]])):
-        if a not in covered and b not in covered and _overlap(corners[a], corners[b]) > _MAX_OVERLAP:
+        if a not in covered and b not in covered and overlap(corners[a], corners[b]) > MAX_OVERLAP:
             covered.add(b if odds[a] >= odds[b] else a)
     return np.array(sorted(covered), dtype=np.int64)
-
-
-def _overlap(a: FloatArray, b: FloatArray) -> float:
-    """Common area of two convex quadrilaterals as a share of the smaller one's."""
-    common = abs(float(signed_area(clip_convex(a, b))))
-    return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)
 
 
 JointCovariance = Callable[[IntArray], FloatArray]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from v2hdm.io.maps.corrections import Correction
 
 
 @dataclass(kw_only=True)
@@ -11,11 +13,13 @@ class AcceptanceOptions:
 
     ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not, and
     of lying on the ground, given how it moves in the images; and a worst corner less certain than the best
-    one of the map by at most ``max_sigma_m``.
+    one of the map by at most ``max_sigma_m``. ``corrections`` are what a person says of candidates, which
+    ``map.corrections`` reads from a file.
     """
 
     min_probability: float = 0.9
     max_sigma_m: float = 0.06
+    corrections: list[Correction] = field(default_factory=list)
 
 
 @dataclass(kw_only=True)

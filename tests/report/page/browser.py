@@ -32,7 +32,7 @@ def browser_path() -> str:
 
 @contextmanager
 def opened(
-    browser: Any, path: Path, width: int = 1280, height: int = 800, scheme: str = "light"
+    browser: Any, path: Path | str, width: int = 1280, height: int = 800, scheme: str = "light"
 ) -> Iterator[Watched]:
     """The page at ``path``, drawn."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
@@ -42,6 +42,6 @@ def opened(
     )
     watched.page.on("pageerror", lambda error: watched.said.append(str(error)))
     watched.page.on("request", lambda request: watched.requests.append(request.url))
-    watched.page.goto(path.as_uri())
+    watched.page.goto(path if isinstance(path, str) else path.as_uri())
     yield watched
     context.close()

@@ -170,3 +170,29 @@ def test_colours_by_accuracy_have_a_scale_in_centimetres(browser, report):
         page.select_option("#colour", "absolute")
         assert page.locator("#legend .ends").inner_text().startswith("2.4 cm")
         is_quiet(watched)
+
+
+def test_the_table_is_sorted_searched_and_leads_to_the_map(browser, report):
+    with opened(browser, report) as watched:
+        page = watched.page
+
+        def rows():
+            return page.locator("#list tbody th").all_inner_texts()
+
+        assert rows() == ["2", "1", "3", "4", "6"]  # the most suspicious one first
+        page.locator("#list thead button").first.click()
+        assert rows() == ["1", "2", "3", "4", "6"]
+        page.locator("#list thead button").first.click()
+        assert rows() == ["6", "4", "3", "2", "1"]
+        page.fill("#search", "diamond")
+        assert rows() == ["4", "3", "2", "1"]
+        assert page.locator("#listed").inner_text() == "4 of 5"
+        page.locator("#list tbody button").first.click()
+        assert page.locator("#details h3").inner_text() == "Marking 4, diamond"
+        with page.expect_download() as download:
+            page.click("#save")
+        lines = download.value.path().read_text().splitlines()
+        assert lines[0].startswith('"marking","class","sightings"')
+        assert len(lines) == 5
+        assert page.locator("#files a").first.get_attribute("href") == "calibration_front.yaml"
+        assert watched.said == []

@@ -178,6 +178,31 @@ def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map
     assert [one["off"] for one in page.map_data["checks"]] == [[0.0123, -0.004], [None, None]]
 
 
+def test_coordinates_under_the_pointer_are_those_of_the_origin_to_a_millimetre(result):
+    from dataclasses import replace
+
+    from v2hdm.geometry.geodetic import geodetic_from_enu
+    from v2hdm.records import GeodeticOrigin
+    from v2hdm.report.page.layers import layers
+
+    origin, facts = GeodeticOrigin(53.5, 9.9, 12.0), read_facts(result, None)
+    far = Marking(DIAMOND, DIAMOND_M + np.array([4000.0, -3000.0]), 3)
+    hd_map = replace(facts.hd_map, origin=origin, markings=(*facts.hd_map.markings, far))
+    earth, grid = layers(replace(facts, hd_map=hd_map), None)["systems"]
+
+    def at(system, x, y):
+        x, y = x / system["scale"], y / system["scale"]
+        return np.array(system["of"]) @ [x**a * y**b for a in range(4) for b in range(4 - a)]
+
+    place = np.array([[3100.0, -1900.0, 0.0]])
+    true = geodetic_from_enu(origin, place)[0, :2]
+    assert at(earth, *place[0, :2]) == pytest.approx(true, abs=1e-8)  # a millimetre
+    pyproj = pytest.importorskip("pyproj")
+    assert grid["name"] == "EPSG:32632"
+    stated = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*true)
+    assert at(grid, *place[0, :2]) == pytest.approx(stated, abs=1e-3)
+
+
 def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypatch):
     from v2hdm.report.page import layers as ground
 

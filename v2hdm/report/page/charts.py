@@ -113,8 +113,11 @@ def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
 
 def _histogram_chart(residuals: GroundResiduals) -> str:
     """Residuals in px, and in standard deviations beside what they would be if the noise model were right."""
-    with _chart("histogram", 7.2, 2.5) as (figure, out):
-        left, right = figure.subplots(1, 2)
+    with (
+        _chart("histogram", 3.5, 2.5) as (figure, first),
+        _chart("histogram in sigmas", 3.5, 2.5) as (other, second),
+    ):
+        left, right = figure.subplots(), other.subplots()
         size_px = residuals.size_px[residuals.is_point]
         edges_px = np.linspace(0, max(float(np.percentile(size_px, 99)) if len(size_px) else 1.0, 0.1), 41)
         edges_sigma = np.linspace(0, 5, 41)
@@ -132,7 +135,7 @@ def _histogram_chart(residuals: GroundResiduals) -> str:
             axes.set_xlim(left=0)
             axes.grid(axis="y")
             axes.legend(loc="upper right", fontsize=8.5)
-    return out[0]
+    return first[0] + second[0]
 
 
 def _steps(axes: Axes, values: FloatArray, edges: FloatArray, label: str, number: int) -> None:
@@ -143,19 +146,17 @@ def _steps(axes: Axes, values: FloatArray, edges: FloatArray, label: str, number
 
 def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]) -> str:
     """The mean residual over each camera's image, by ``sizes`` (width, height) in px."""
-    names = list(residuals.cameras)
-    width_px, height_px = sizes[names[0]]
-    columns = min(2, len(names))
-    rows = -(-len(names) // columns)
-    panel_in = 7.2 / columns
-    with _chart("field", 7.2, rows * (0.84 * panel_in * height_px / width_px + 0.75)) as (figure, out):
-        panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
-        for axes in panels[len(names) :]:
-            axes.set_axis_off()
-        fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
-        longest = max([float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)] or [0.1])
-        for number, (axes, name) in enumerate(zip(panels, names, strict=False)):
-            width_px, height_px = sizes[name]
+    names = residuals.cameras
+    fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
+    longest = max([float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)] or [0.1])
+    panel_in, charts = 7.2 if len(names) == 1 else 3.5, ""
+    for number, name in enumerate(names):
+        width_px, height_px = sizes[name]
+        with _chart(f"field {name}", panel_in, 0.84 * panel_in * height_px / width_px + 0.75) as (
+            figure,
+            out,
+        ):
+            axes = figure.subplots()
             # The longest arrow spans one and a half cells.
             span, colour = 1.5 * width_px / CELLS[1], OKABE_ITO[_ORDER[number % len(_ORDER)]]
             draw_arrows(axes, *fields[number], longest, span, color=colour, width=0.005, headwidth=3.6)
@@ -163,7 +164,8 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
             axes.set(aspect="equal", title=name)
             for side in ("top", "right"):
                 axes.spines[side].set_visible(True)
-    return out[0]
+        charts += out[0]
+    return charts
 
 
 def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
@@ -183,8 +185,11 @@ def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tu
 
 def _range_chart(residuals: GroundResiduals) -> str:
     """Residuals against the distance from the camera: in the image and on the ground."""
-    with _chart("range", 7.2, 2.5) as (figure, out):
-        left, right = figure.subplots(1, 2)
+    with (
+        _chart("range", 3.5, 2.5) as (figure, first),
+        _chart("range on the ground", 3.5, 2.5) as (other, second),
+    ):
+        left, right = figure.subplots(), other.subplots()
         farthest = float(np.ceil(residuals.range_m.max(initial=1.0)))
         edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
         ground_cm = 100 * np.linalg.norm(residuals.ground_m, axis=1)
@@ -194,13 +199,13 @@ def _range_chart(residuals: GroundResiduals) -> str:
             for axes, values in ((left, residuals.size_px), (right, ground_cm)):
                 axes.plot(*_rms_by(residuals.range_m[own], values[own], edges), label=name, **look)
         left.set_ylabel("RMS distance (px)")
-        right.set_ylabel("RMS distance on the ground (cm)")
+        right.set_ylabel("RMS on the ground (cm)")
         for axes in (left, right):
             axes.set_xlabel("distance from the camera (m)")
             axes.set_ylim(bottom=0)
             axes.grid(axis="y")
             axes.legend(loc="best", fontsize=8.5)
-    return out[0]
+    return first[0] + second[0]
 
 
 def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jinja2
 import numpy as np
 
+from v2hdm.errors import MapFileError
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.layers import ground_page, layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.tables import in_words
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import read_text, replace_text
 
 
 def document(facts: Facts) -> SimpleNamespace:
@@ -88,17 +92,29 @@ def _ellipses(facts: Facts) -> str:
 
 
 FILE = "report.html"  # name of the page in a result folder
-_ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templates", "map.js": "templates"}
+_ASSETS = {
+    "leaflet.js": "vendor",
+    "leaflet.css": "vendor",
+    "page.css": "templates",
+    "map.js": "templates",
+    "edit.js": "templates",
+}
 """Scripts and styles that stand in the page as they are, by the folder that holds them."""
 
 
 def write_page(folder: Path, drive: Drive | None) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
-    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand. Raises
-    MapFileError where the folder is no result, or a file in it is damaged, DriveError where an image or the
-    truth of the drive is damaged.
+    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand: the
+    pictures are then those of the report that is there. Raises MapFileError where the folder is no result, or
+    a file in it is damaged, DriveError where an image or the truth of the drive is damaged.
     """
+    replace_text(folder / FILE, page_text(folder, drive))
+    return folder / FILE
+
+
+def page_text(folder: Path, drive: Drive | None, editing: Mapping[str, object] | None = None) -> str:
+    """The page of :func:`write_page`; ``editing`` is what its script for corrections has to know."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
         autoescape=True,
@@ -108,17 +124,27 @@ def write_page(folder: Path, drive: Drive | None) -> Path:
     )
     here = files("v2hdm.report.page")
     page = document(read_facts(folder, drive))
-    text = environment.get_template("page.html").render(
+    page.pictures = page.pictures or _kept_pictures(folder / FILE)
+    return environment.get_template("page.html").render(
         page=page,
         assets={name: (here / where / name).read_text(encoding="utf-8") for name, where in _ASSETS.items()},
-        map_json=_json(page.map_data),
-        pictures_json=_json(page.pictures),
+        map_json=json_text(page.map_data),
+        pictures_json=json_text(page.pictures),
+        editing_json=editing and json_text(editing),
     )
-    replace_text(folder / FILE, text)
-    return folder / FILE
 
 
-def _json(content: object) -> str:
+def _kept_pictures(path: Path) -> dict[str, Any]:
+    """The pictures of a report that was made while the images of its drive were at hand."""
+    text = read_text(path, MapFileError) if path.is_file() else ""
+    kept = re.search(r'<script type="application/json" id="pictures">(.*?)</script>', text, re.DOTALL)
+    try:
+        return dict(json.loads(kept[1])) if kept else {}
+    except (ValueError, RecursionError):
+        return {}
+
+
+def json_text(content: object) -> str:
     """JSON that may stand in a script element: nothing in it ends the element or begins a comment."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

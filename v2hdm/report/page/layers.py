@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
+from v2hdm.geometry.geodetic import geodetic_from_enu, utm_from_geodetic
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -93,6 +94,8 @@ SIGMAS_95 = 2.4477
 root of the chi-square quantile of two degrees of freedom."""
 
 _LEAST_ARROW_SIGHTINGS = 4
+_SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum", ".yaml", ".json", ".log")
+"""Endings of the files of a result that the page names."""
 
 
 def ellipses(marking: Marking) -> FloatArray | None:
@@ -153,7 +156,37 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             "recorded": [] if route is None or route.recorded is None else _metres(route.recorded[:, :2, 3]),
         },
         "mosaic": mosaic_layer(facts.folder),
+        "systems": _systems(facts),
+        "suspicion": {str(one["marking"]): float(one["p"]) for one in facts.best.get("suspicious") or []},
+        "files": sorted(one.name for one in facts.folder.iterdir() if one.suffix in _SHARED),
     }
+
+
+def _systems(facts: Facts) -> list[dict[str, Any]]:
+    """Coordinates beside local metres: by system cubics in x and y, m, which meet it to a millimetre.
+
+    Within 10 km the earth's curvature leaves no more; without an origin there are none.
+    """
+    hd_map, route = facts.hd_map, facts.route
+    if hd_map is None or hd_map.origin is None:
+        return []
+    places = [one.corners_map for one in hd_map.markings] + [one.points_map for one in hd_map.lanes]
+    places += [] if route is None else [route.map_from_vehicle[:, :2, 3]]
+    low, high = (of(np.concatenate([*places, np.zeros((1, 2))]), axis=0) for of in (np.min, np.max))
+    x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(low - 50.0, high + 50.0, 7).T))
+    earth = geodetic_from_enu(hd_map.origin, np.column_stack([x, y, np.zeros_like(x)]))
+    code, grid = utm_from_geodetic(hd_map.origin, earth)
+    scale = float(np.abs([x, y]).max())
+    terms = np.column_stack([(x / scale) ** a * (y / scale) ** b for a in range(4) for b in range(4 - a)])
+    return [
+        {
+            "name": name,
+            "digits": digits,
+            "scale": scale,
+            "of": np.linalg.lstsq(terms, to, rcond=None)[0].T.tolist(),
+        }
+        for name, to, digits in (("", earth[:, :2], 7), (code, grid, 2))
+    ]
 
 
 def _feature(

@@ -1,18 +1,20 @@
-"""The map against surveyed check points and known sizes: whether it is as good as stated, and why not."""
+"""The map against check points, known sizes and corrections: whether it is as stated, and why not."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
+from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.stated import known_lengths
 from v2hdm.records import FloatArray
 from v2hdm.report.check_points import CheckTable, squared
+from v2hdm.site.corrections import unmet
 from v2hdm.verdict.verdict import Finding, Status, passed
 
 CHECK = "check points"
@@ -133,3 +135,15 @@ def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
             about = f"mapping.known_sizes.by_class_m.{name}"
             found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
     return found
+
+
+def check_corrections(corrections: Sequence[Correction], best: MethodResult) -> list[Finding]:
+    """A finding where a person's corrections have found nothing to correct."""
+    missing = unmet(corrections, best.hd_map)
+    if not missing:
+        return []
+    says = (
+        f"{len(missing)} of {len(corrections)} have found no candidate, and change nothing: "
+        f"{', '.join(missing[:5])}; correct the map of this very drive, or drop them"
+    )
+    return [Finding("corrections", Status.WARN, float(len(missing)), 0.0, "", says, "map.corrections")]

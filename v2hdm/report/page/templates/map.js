@@ -47,7 +47,7 @@
   // ---- layers ----
   const layers = {};
   const small = { noClip: true, smoothFactor: 0 }; // four corners gain nothing by clipping and simplifying
-  const still = (renderer) => ({ renderer, interactive: false });
+  const still = (renderer) => ({ renderer, interactive: false, smoothFactor: 0.3 });
   if (data.mosaic) {
     const [west, south, east, north] = data.mosaic.bounds;
     layers.mosaic = L.imageOverlay(`data:${data.mosaic.type};base64,${data.mosaic.src}`, [[south, west], [north, east]],
@@ -121,8 +121,8 @@
   // ---- what is drawn only for what is in view ----
   function ring([x, y], [a, b, direction], times) {
     const [c, s] = [Math.cos(direction), Math.sin(direction)];
-    return Array.from({ length: 24 }, (_, n) => {
-      const [u, v] = [times * a * Math.cos(n * Math.PI / 12), times * b * Math.sin(n * Math.PI / 12)];
+    return Array.from({ length: 72 }, (_, n) => {
+      const [u, v] = [times * a * Math.cos(n * Math.PI / 36), times * b * Math.sin(n * Math.PI / 36)];
       return [y + s * u + c * v, x + c * u - s * v];
     });
   }
@@ -147,7 +147,7 @@
     for (const one of shown) {
       if (ellipses && one.e) one.c.forEach((corner, n) => {
         if (one.e[n][0] * times * px >= LEAST_PX) layers.ellipses.addLayer(
-          L.polygon(ring(corner, one.e[n], times), { ...still(above), color: colour("ink"), weight: 1, fill: false }));
+          L.polygon(ring(corner, one.e[n], times), { ...still(above), ...small, color: colour("ink"), weight: 1, fill: false }));
       });
       if (arrows) for (const [camera, dx, dy] of one.a ?? []) layers.arrows.addLayer(arrow(one, camera, dx, dy, times, px));
     }
@@ -257,7 +257,7 @@
   function shot(picture) {
     const [width, height] = picture.size;
     const points = (list) => list.map((point) => point.join(",")).join(" ");
-    const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img" });
+    const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `image of ${picture.camera}, ${picture.t.toFixed(2)} s` });
     svg.append(element("image", { href: `data:image/jpeg;base64,${picture.src}`, width, height }));
     if (picture.map.length > 1) svg.append(element("polygon", { class: "halo", points: points(picture.map) }), element("polygon", { class: "mapped", points: points(picture.map) }));
     else picture.map.forEach(([u, v]) => svg.append(element("circle", { class: "halo", cx: u, cy: v, r: 9 }), element("circle", { class: "mapped", cx: u, cy: v, r: 9 })));
@@ -284,6 +284,7 @@
       side.append(element("p", { class: "hint" }, what), shots);
     } else side.append(element("p", { class: "hint" }, "No picture of it in this report."));
     byId("details").replaceChildren(element("div", { class: "card", "data-key": about.key }, text, side));
+    dispatchEvent(new CustomEvent("v2hdm-selected", { detail: { shape, text } }));
   }
 
   function corners(about) {
@@ -302,15 +303,82 @@
     byId("find-id").setCustomValidity(found ? "" : "No marking of this number.");
     byId("find-id").reportValidity();
     if (!found) return;
-    map.fitBounds(found.getBounds().pad(3), { maxZoom: 7 });
-    select(found);
+    show(found);
   });
+  function show(shape) {
+    map.fitBounds(shape.getBounds().pad(3), { maxZoom: 7 });
+    select(shape);
+  }
   byId("find-id").addEventListener("input", () => byId("find-id").setCustomValidity(""));
 
   const place = L.control({ position: "bottomright" });
   place.onAdd = () => element("div", { id: "place" });
   place.addTo(map);
-  map.on("mousemove", ({ latlng }) => { byId("place").textContent = `${number(latlng.lng, 2)} m E, ${number(latlng.lat, 2)} m N`; });
+  const within = ({ scale, of }, x, y) => of.map((factors) => {
+    let [sum, n] = [0, 0];
+    for (let a = 0; a < 4; a++) for (let b = 0; b < 4 - a; b++) sum += factors[n++] * (x / scale) ** a * (y / scale) ** b;
+    return sum;
+  });
+  map.on("mousemove", ({ latlng: { lat, lng } }) => {
+    const lines = data.systems.map((system) => {
+      const [first, second] = within(system, lng, lat).map((value) => number(value, system.digits));
+      return system.name ? `${system.name} ${first} E, ${second} N` : `${first}\u00b0, ${second}\u00b0`;
+    });
+    byId("place").replaceChildren(...[`${number(lng, 2)} m E, ${number(lat, 2)} m N`, ...lines].map((line) => element("div", {}, line)));
+  });
+  map.on("mouseout", () => byId("place").replaceChildren());
+
+  // ---- the table of markings ----
+  const SHOWN = 200; // rows at once: a page of thousands is slow, and nobody reads them
+  const COLUMNS = [
+    { name: "marking", of: (one) => one.id, digits: 0 },
+    { name: "class", of: (one) => words(data.kinds[one.k]) },
+    { name: "sightings", of: (one) => one.n, digits: 0 },
+    { name: "relative (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
+    { name: "absolute (cm)", of: (one) => 100 * worst(one), digits: 1 },
+    { name: "off the truth (cm)", of: (one) => 100 * (one.t ?? NaN), digits: 1 },
+    { name: "suspicion p", of: (one) => data.suspicion[one.id] ?? NaN, digits: 3 },
+  ].filter((column) => !column.digits || things.some((shape) => Number.isFinite(column.of(shape.about))));
+  const listed = things.filter((shape) => ["marking", "symbol"].includes(shape.about.what));
+  let order = { column: COLUMNS.at(-1).name === "suspicion p" ? COLUMNS.length - 1 : 0, down: false };
+  function matching() {
+    const wanted = byId("search").value.trim().toLowerCase().split(/\s+/);
+    const { of } = COLUMNS[order.column];
+    const key = (shape) => { const value = of(shape.about); return typeof value === "string" || Number.isFinite(value) ? value : null; };
+    return listed.filter(({ about }) => wanted.every((word) => String(about.id) === word || words(data.kinds[about.k]).includes(word)))
+      .map((shape) => [key(shape), shape])
+      .sort(([a, one], [b, other]) => (a === null) - (b === null) || (order.down ? -1 : 1) * (a < b ? -1 : a > b ? 1 : 0) || one.about.id - other.about.id)
+      .map(([, shape]) => shape);
+  }
+  const cell = (column, about) => {
+    const value = column.of(about);
+    return column.digits === undefined ? value : Number.isFinite(value) ? number(value, column.digits) : "\u2013";
+  };
+  function list() {
+    const found = matching();
+    const head = COLUMNS.map((column, n) => {
+      const button = element("button", { type: "button" }, column.name);
+      button.addEventListener("click", () => { order = { column: n, down: order.column === n && !order.down }; list(); });
+      return element("th", { scope: "col", "aria-sort": n !== order.column ? "none" : order.down ? "descending" : "ascending", ...(column.digits === undefined ? {} : { class: "n" }) }, button);
+    });
+    const rows = found.slice(0, SHOWN).map((shape) => element("tr", {}, ...COLUMNS.map((column, n) => {
+      if (n) return element("td", column.digits === undefined ? {} : { class: "n" }, cell(column, shape.about));
+      const button = element("button", { type: "button", class: "link" }, cell(column, shape.about));
+      button.addEventListener("click", () => { show(shape); byId("map-section").scrollIntoView(); });
+      return element("th", { scope: "row", class: "n" }, button);
+    })));
+    byId("list").replaceChildren(element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
+    byId("listed").textContent = `${found.length} of ${listed.length}${found.length > SHOWN ? `, the first ${SHOWN} shown` : ""}`;
+  }
+  byId("search").addEventListener("input", list);
+  byId("save").addEventListener("click", () => {
+    const quoted = (text) => `"${String(text).replaceAll('"', '""')}"`;
+    const lines = [COLUMNS.map((column) => quoted(column.name)), ...matching().map(({ about }) => COLUMNS.map((column) => { const value = column.of(about); return typeof value === "string" ? quoted(value) : Number.isFinite(value) ? value : ""; }))];
+    const link = element("a", { href: URL.createObjectURL(new Blob([lines.map((line) => line.join(",")).join("\r\n")], { type: "text/csv" })), download: "markings.csv" });
+    link.click();
+    URL.revokeObjectURL(link.href);
+  });
+  byId("files").append(...data.files.map((name) => element("a", { href: encodeURIComponent(name), download: name }, name)));
 
   // ---- begin ----
   const everything = L.latLngBounds([]);
@@ -322,6 +390,7 @@
   for (const name of ["ellipses", "arrows"]) layers[name].on("add remove", legend);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
   paint();
+  list();
   addEventListener("DOMContentLoaded", () => { // the pictures stand below this script
     for (const cell of document.querySelectorAll("[data-shots]")) {
       const shots = picturesOf(cell.dataset.shots).slice(0, 1).map(shot);
@@ -329,5 +398,5 @@
     }
   });
   byId("map").dataset.ready = String(Math.round(performance.now()));
-  window.v2hdmMap = { map, things }; // for tests, and for those who want more of it
+  window.v2hdmMap = { map, things, element, kinds: data.kinds }; // for tests, and for those who want more of it
 })();

@@ -1,0 +1,126 @@
+"""What a person says of a map holds in the next run, and nothing else changes."""
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.ports import run_config
+from v2hdm.errors import MapFileError
+from v2hdm.io.maps.corrections import (
+    ACCEPTED,
+    CORRECTED,
+    REJECTED,
+    Correction,
+    read_corrections,
+    write_corrections,
+)
+from v2hdm.io.maps.evidence import read_exclusions
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.pipeline.config import MapConfig
+from v2hdm.pipeline.run import run
+from v2hdm.site.candidates import Candidates
+from v2hdm.site.corrections import Stated
+
+
+@pytest.fixture(scope="module")
+def corrected(small_mapped, small_drive, tmp_path_factory):
+    """The map before, what a person says of it, and the folder and verdict of the next run."""
+    folder, (result, cache) = tmp_path_factory.mktemp("corrected"), small_mapped
+    before = read_geojson(result / "map.geojson").markings
+    (left_out, *_) = read_exclusions(result / "excluded.geojson")
+    manhole, bar, dragged = before[:3]
+    place = (dragged.corners_map[1] + [0.04, -0.03]).tolist()
+    said = [
+        Correction(says=REJECTED, kind=manhole.kind, outline_map=manhole.corners_map.tolist(),
+                   marking=manhole.id, reason="a manhole"),
+        Correction(says=CORRECTED, kind=bar.kind, outline_map=bar.corners_map.tolist(),
+                   new_kind="crosswalk_bar"),
+        Correction(says=CORRECTED, kind=dragged.kind, outline_map=dragged.corners_map.tolist(),
+                   moved={2: place}, sigma_m=0.005),
+        Correction(says=ACCEPTED, kind=left_out.kind, outline_map=[left_out.position_map.tolist()]),
+        Correction(says=CORRECTED, kind="diamond", outline_map=[[500.0, 500.0]]),
+    ]  # fmt: skip
+    path = folder / "corrections.yaml"
+    write_corrections(said, str(result), path)
+    changes = {"cache": str(cache), "map": MapConfig(corrections=str(path))}
+    made = run(run_config(small_drive, folder / "out", **changes))
+    return before, left_out, made
+
+
+def nearest(markings, place):
+    return min(markings, key=lambda one: np.linalg.norm(one.corners_map.mean(axis=0) - place))
+
+
+def test_rejected_markings_stay_out_with_the_reason_and_accepted_ones_come_in(corrected):
+    before, left_out, made = corrected
+    after = read_geojson(made.folder / "map.geojson").markings
+    middle = before[0].corners_map.mean(axis=0)
+    assert np.linalg.norm(nearest(after, middle).corners_map.mean(axis=0) - middle) > 0.5
+    excluded = read_exclusions(made.folder / "excluded.geojson")
+    assert "rejected by a person: a manhole" in [one.reason for one in excluded]
+    came = nearest(after, left_out.position_map)
+    assert np.linalg.norm(came.corners_map.mean(axis=0) - left_out.position_map) < 0.4
+    assert len(after) == len(before)  # one out, one in
+
+
+def test_a_class_is_fixed_and_a_dragged_corner_is_where_it_was_put(corrected):
+    before, _, made = corrected
+    after = read_geojson(made.folder / "map.geojson").markings
+    assert nearest(after, before[1].corners_map.mean(axis=0)).kind == "crosswalk_bar"
+    moved = nearest(after, before[2].corners_map.mean(axis=0))
+    assert moved.corners_map[1] - before[2].corners_map[1] == pytest.approx([0.04, -0.03], abs=3e-3)
+    assert moved.corners_map[[0, 2, 3]] == pytest.approx(before[2].corners_map[[0, 2, 3]], abs=0.02)
+    same = [nearest(after, one.corners_map.mean(axis=0)) for one in before[3:]]
+    off_m = [np.abs(a.corners_map - b.corners_map).max() for a, b in zip(same, before[3:], strict=True)]
+    assert max(off_m) < 0.005
+
+
+def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
+    (finding,) = [one for one in corrected[2].verdict.findings if one.check == "corrections"]
+    assert "1 of 5 have found no candidate" in finding.says
+    assert "diamond at (500.00, 500.00)" in finding.says
+
+
+def test_a_dragged_corner_has_the_error_of_the_others_and_its_own():
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    common = 0.03**2 * np.tile(np.eye(2), (4, 4)) + 0.001**2 * np.eye(8)
+    shift = np.array([0.2, -0.1])  # of the whole map since the person saw it
+    now = Candidates((square + shift)[None], common[None])
+    one = Correction(says=CORRECTED, kind="diamond", outline_map=square.tolist(), moved={3: [1.1, 1.2]})
+    placed = Stated({}, {0: one}).placed(now, now)
+    assert placed.corners_map[0, 2] == pytest.approx(np.array([1.1, 1.2]) + shift)
+    assert placed.corners_map[0, [0, 1, 3]] == pytest.approx(square[[0, 1, 3]] + shift)
+    block = placed.covariance_m2[0][4:6, 4:6]
+    assert block == pytest.approx((0.03**2 + 0.001**2 / 3 + 0.02**2) * np.eye(2))
+    apart = np.kron([0, -1, 1, 0], np.eye(2))  # of two corners the common error cancels
+    assert np.sqrt(np.trace(apart @ placed.covariance_m2[0] @ apart.T) / 2) == pytest.approx(0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"says": "maybe"}, "expected one of accepted, rejected, corrected, got 'maybe'"),
+        ({"moved": {5: [0, 0]}}, "no corner 5; quadrilaterals have 1 to 4"),
+        ({"outline_map": [[0]]}, "outline_map: expected N x 2 numbers"),
+        ({"reasons": "x"}, "unknown key 'reasons'; did you mean 'reason'"),
+        ({"sigma_m": 0}, "sigma_m above 0"),
+    ],
+)
+def test_a_damaged_file_names_its_entry(change, says, tmp_path):
+    square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+    entry = {"says": "corrected", "class": "diamond", "outline_map": square} | change
+    path = tmp_path / "corrections.yaml"
+    path.write_text(yaml.safe_dump({"corrections": [entry]}))
+    with pytest.raises(MapFileError, match=r"corrections\[0\]") as error:
+        read_corrections(path)
+    assert says in str(error.value)
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    outline = [[0.0, 1.0], [1.0, 1.0], [1.0, 2.0], [0.0, 2.0]]
+    moved = {"moved": {2: [1.25, 1.0]}, "sigma_m": 0.01}
+    one = Correction(
+        says=CORRECTED, kind="diamond", marking=4, outline_map=outline, new_kind="arrow", **moved
+    )
+    write_corrections([one], "outputs/port1", tmp_path / "corrections.yaml")
+    assert read_corrections(tmp_path / "corrections.yaml") == [one]

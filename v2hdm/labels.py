@@ -1,0 +1,356 @@
+"""Labels from a finished map: its markings in every image of its drive, and which images hide them.
+
+A marking that some images were mapped by is projected into all others by the adjusted calibration and poses:
+corners to a fraction of a pixel, without a human hand. Whether an image shows it follows from all of them:
+each side of an outline has a contrast to the ground beside it, which those images state that it was detected
+in; whatever stands before it has another one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from v2hdm.association.sightings import row_shares
+from v2hdm.detection.batch import read_image
+from v2hdm.errors import MapFileError
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points, has_distortion
+from v2hdm.geometry.planar import clip_convex, clip_half, rectangle_size, signed_area
+from v2hdm.geometry.rigid import camera_centre, inverse
+from v2hdm.geometry.trajectory import interpolate
+from v2hdm.progress import Steps
+from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
+from v2hdm.report.outputs import write_json
+from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
+
+FILE = "instances.json"
+RANGE_M = 16.0  # how far from a camera markings are labelled: farther ones need not be in the map
+UNKNOWN = "unknown"  # the category of what nobody knows, as `data.coco_classes` calls it
+
+SHOWN, HIDDEN, PARTLY = range(3)
+_SURE = 0.9  # posterior probability from which a marking counts as shown, or as hidden
+_PRIOR = np.array([6.0, 3.0, 1.0])
+"""Dirichlet prior of that an image in which a marking was not detected shows, hides or partly hides it."""
+
+_DETECTED = np.array([0.98, 0.005, 0.015])  # the same where it was detected
+_FAINT_SHARE, _HIDDEN_SIGMA = 0.1, 0.5
+"""Share of the sides that are faint where shown; sigma of the contrast of what stands before them."""
+
+_ALIKE = 0.5
+"""Power of the likelihood of one side: the four of one image err alike."""
+
+_LEAST_PAIRS = 8  # detected sides below which nothing is said of images without a detection
+_LEAST_SIGMA = 0.03
+_NEAREST_M = 0.3  # ground nearer to the camera's plane is cut off
+_LEAST_PX2 = 2.0  # area of the smallest piece that is labelled
+_INSIDE_M, _BESIDE_M = 0.06, (0.1, 0.18)  # how far from an edge paint and ground are sampled, at most, m
+_CLEAR_M = 1.0  # radius about a candidate that was left out of which nothing is said
+
+
+@dataclass(frozen=True)
+class _Outline:
+    """One marking or symbol, counter-clockwise, and where paint and ground beside its sides are sampled.
+
+    ``side`` numbers each sample's side, 0 to 3; an outline of more edges has four runs of them.
+    """
+
+    id: int
+    kind: str
+    outline_map: FloatArray  # (N, 2)
+    inside_map: FloatArray  # (K, 2)
+    beside_map: FloatArray  # (K, 2)
+    side: IntArray  # (K,)
+
+    @classmethod
+    def of(cls, number: int, kind: str, outline_map: FloatArray) -> _Outline:
+        """With samples at the middle parts of all edges."""
+        inset_m = min(_INSIDE_M, 0.3 * rectangle_size(outline_map)[1])
+        ahead = np.roll(outline_map, -1, axis=0)
+        inside, beside, side = [], [], []
+        for n, (a, b) in enumerate(zip(outline_map, ahead, strict=True)):
+            along = b - a
+            outwards = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
+            middle = a + np.linspace(0.2, 0.8, 7)[:, None] * along
+            for away_m in _BESIDE_M:
+                inside.append(middle - inset_m * outwards)
+                beside.append(middle + away_m * outwards)
+            side += [4 * n // len(outline_map)] * (7 * len(_BESIDE_M))
+        return cls(number, kind, outline_map, np.concatenate(inside), np.concatenate(beside), np.array(side))
+
+
+@dataclass(frozen=True)
+class _View:
+    """One outline in one image: its polygon (N, 2), recorded px, the contrast of each side, nan if unseen."""
+
+    outline: int
+    image: int
+    polygon_px: FloatArray
+    whole: bool
+    contrast: FloatArray  # (4,)
+    detected: bool
+
+
+@dataclass(frozen=True)
+class _Eye:
+    """One image as a camera of the run: where it was, while each of its rows was read."""
+
+    info: CameraInfo
+    cam_from_map: FloatArray  # (2, 4, 4), when the first and the last row was read
+
+    @classmethod
+    def of(cls, image: Image, own: CameraFacts, facts: Facts) -> _Eye:
+        """By the adjusted poses of the run."""
+        info, route = own.calibration.info, facts.route
+        assert route is not None
+        read_out_s = own.read_out_s or 0.0
+        taken_s = image.stamp_s + (own.clock_offset_s or 0.0) + np.array([-0.5, 0.5]) * read_out_s
+        poses = interpolate(Trajectory(route.stamp_s, route.flat), taken_s, np.inf)[0]
+        return cls(info, own.calibration.cam_from_vehicle @ inverse(poses))
+
+    def project(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Recorded px (N, 2) of ground points (N, 2), and their depths (N,), m."""
+        first, last = (project_ground(self.info.intrinsic, one, points_map) for one in self.cam_from_map)
+        px = distort_points(self.info, (first[0] + last[0]) / 2)
+        if np.array_equal(*self.cam_from_map):
+            return px, first[1]
+        share = (row_shares(self.info, px) + 0.5)[:, None]
+        return distort_points(self.info, (1 - share) * first[0] + share * last[0]), first[1]
+
+    def polygon(self, outline_map: FloatArray) -> tuple[FloatArray, bool]:
+        """The part (N, 2), recorded px, of an outline that lies in the image, and whether that is all."""
+        depth_m = self.project(outline_map)[1]
+        part = outline_map
+        if (depth_m < _NEAREST_M).any():
+            part = clip_half(outline_map, depth_m - _NEAREST_M)
+        if has_distortion(self.info):  # lenses bend sides
+            steps = np.arange(6)[:, None] / 6
+            pairs = zip(part, np.roll(part, -1, axis=0), strict=True)
+            part = np.concatenate([a + steps * (b - a) for a, b in pairs] or [part])
+        if not len(part):
+            return part, False
+        px = self.project(part)[0]
+        last = np.array([self.info.width, self.info.height]) - 0.5
+        window = np.array([[-0.5, -0.5], [last[0], -0.5], last, [-0.5, last[1]]])
+        inside = bool((px >= -0.5).all() and (px <= last).all())
+        return (px if inside else clip_convex(px, window)), inside and len(part) >= len(outline_map)
+
+    def contrast(self, grey: NDArray[np.float32], outline: _Outline) -> FloatArray:
+        """The contrast (4,) of each side, log ratio of grey values; nan where no sample is in the image."""
+        values = []
+        for points_map in (outline.inside_map, outline.beside_map):
+            px, depth_m = self.project(points_map)
+            px = np.where((depth_m > _NEAREST_M)[:, None], px, -9.0).astype(np.float32)
+            seen = cv2.remap(grey, px[None, :, 0], px[None, :, 1], cv2.INTER_LINEAR, borderValue=-1e4)[0]
+            values.append(np.where(seen < 0, np.nan, seen + 1.0))
+        ratio, out = np.log(values[0] / values[1]), np.full(4, np.nan)
+        for side in range(4):
+            own = ratio[outline.side == side]
+            own = own[np.isfinite(own)]
+            out[side] = np.mean(own) if len(own) else np.nan
+        return out
+
+
+def write_labels(
+    folder: Path, drive: Drive, output: Path, range_m: float = RANGE_M, progress: Steps | None = None
+) -> dict[str, int]:
+    """Write ``instances.json`` (COCO) of a run's map in all images of its drive into the folder ``output``.
+
+    Args:
+        folder: result of a run.
+        drive: what it has mapped.
+        output: where the file is written; its ``file_name`` entries start from the drive's folder.
+        range_m: how far from a camera markings are labelled.
+        progress: counts images.
+
+    Returns:
+        How many labels are whole and shown ("shown"), of unsure visibility ("unsure"), and how many markings
+        in view are hidden ("hidden").
+
+    Raises:
+        MapFileError: the folder is no result, or its verdict is FAIL.
+        DriveError: an image cannot be read.
+    """
+    facts = read_facts(folder, drive)
+    status = (facts.metrics.get("verdict") or {}).get("status")
+    if facts.hd_map is None or facts.route is None or status not in ("PASS", "WARN"):
+        raise MapFileError(
+            f"{folder}: its verdict is {status or 'missing'}: labels of a map that may be wrong would teach "
+            "what is wrong; mend the drive (docs/verdict.md) and map it again"
+        )
+    outlines = [_Outline.of(one.id or 0, one.kind, one.corners_map) for one in facts.hd_map.markings]
+    outlines += [_Outline.of(one.id or 0, one.kind, one.outline_map) for one in facts.hd_map.symbols]
+    seen = _detected(facts)
+    images: list[Image] = []
+    views: list[_View] = []
+    silent: list[tuple[int, FloatArray]] = []
+    for number, image in enumerate(drive.images):
+        if image.camera in facts.cameras:
+            eye = _Eye.of(image, facts.cameras[image.camera], facts)
+            grey = read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32)
+            found = seen.get(drive.name_of(image.path), set())
+            views += _views(eye, grey, outlines, len(images), found, range_m)
+            silent += [(len(images), one) for one in _silent(eye, facts, range_m)]
+            images.append(image)
+        if progress:
+            progress(number + 1, len(drive.images))
+    states = _states(views, len(outlines))
+    write_json(output / FILE, _coco(drive, images, outlines, views, states, silent))
+    names = {SHOWN: "shown", HIDDEN: "hidden", PARTLY: "unsure"}
+    counted = Counter(names[state] for state in states.tolist())
+    return {"images": len(images), **{name: counted[name] for name in names.values()}}
+
+
+def _detected(facts: Facts) -> Mapping[str, set[int]]:
+    """By image the markings of which the mapping accepted three corners or more as points."""
+    residuals, out = facts.residuals, dict[str, set[int]]()
+    if residuals is not None:
+        used = residuals.is_point & (residuals.marking > 0)
+        pairs = np.stack([residuals.row_image[used], residuals.marking[used]], axis=1)
+        for (row, marking), count in zip(*np.unique(pairs, axis=0, return_counts=True), strict=True):
+            if count >= 3:
+                out.setdefault(residuals.image[row], set()).add(int(marking))
+    return out
+
+
+def _views(
+    eye: _Eye,
+    grey: NDArray[np.float32],
+    outlines: Sequence[_Outline],
+    image: int,
+    detected: set[int],
+    range_m: float,
+) -> list[_View]:
+    """What of the outlines lies in an image, within range."""
+    foot = camera_centre(eye.cam_from_map[:1])[0, :2]
+    out = []
+    for number, outline in enumerate(outlines):
+        if np.linalg.norm(outline.outline_map - foot, axis=1).min() > range_m:
+            continue
+        polygon, whole = eye.polygon(outline.outline_map)
+        area_px2 = abs(float(signed_area(polygon))) if len(polygon) > 2 else 0.0
+        if area_px2 >= _LEAST_PX2:
+            contrast = eye.contrast(grey, outline)
+            out.append(_View(number, image, polygon, whole, contrast, outline.id in detected))
+    return out
+
+
+def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
+    """Polygons of an image of which the map says nothing: ground beyond the range, candidates left out."""
+    centre, view = camera_centre(eye.cam_from_map[:1])[0], eye.cam_from_map[0, 2, :2]
+    ahead = np.arctan2(view[1], view[0]) + np.linspace(-1.2, 1.2, 25)
+    arc = np.column_stack([np.cos(ahead), np.sin(ahead)])
+    beyond = np.concatenate([centre[:2] + range_m * arc, centre[:2] + 1e3 * arc[::-1]])
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    disc = _CLEAR_M * np.column_stack([np.cos(turn), np.sin(turn)])
+    near = [one.position_map for one in facts.excluded]
+    near = [one for one in near if np.linalg.norm(one - centre[:2]) < range_m + _CLEAR_M]
+    found = [eye.polygon(one)[0] for one in (beyond, *(place + disc for place in near))]
+    return [one for one in found if len(one) > 2 and abs(float(signed_area(one))) >= _LEAST_PX2]
+
+
+def _states(views: Sequence[_View], outlines: int) -> IntArray:
+    """Whether each view is shown, hidden, or partly so or unsure (V,), by the contrasts of all of them."""
+    if not views:
+        return np.zeros(0, dtype=np.int64)
+    contrast = np.stack([one.contrast for one in views])
+    detected = np.array([one.detected for one in views])
+    outline = np.array([one.outline for one in views])
+    own = _own_contrasts(contrast, outline, detected, outlines)[outline]
+    known = np.isfinite(contrast) & np.isfinite(own)
+    off = np.where(known, contrast - own, 0.0)
+    # Of too few detected sides nothing is known: the sigma is that of anything.
+    used, sigma = np.abs(off[known & detected[:, None]]), _HIDDEN_SIGMA
+    if len(used) >= _LEAST_PAIRS:
+        sigma = max(1.4826 * float(np.median(used)), _LEAST_SIGMA)
+    faint = norm.logpdf(np.where(known, contrast - own / 2, 0.0), 0.0, np.abs(own) / 3 + sigma)
+    clear = np.log1p(-_FAINT_SHARE) + norm.logpdf(off, 0.0, sigma)
+    shown = logsumexp([clear, np.log(_FAINT_SHARE) + faint], axis=0)
+    hidden = norm.logpdf(np.where(known, contrast, 0.0), 0.0, _HIDDEN_SIGMA)
+    either = np.logaddexp(shown, hidden) + np.log(0.5)
+    sides = np.where(known[..., None], _ALIKE * np.stack([shown, hidden, either], axis=2), 0.0).sum(axis=1)
+    share, posterior = _PRIOR / _PRIOR.sum(), np.zeros((len(views), 3))
+    for _ in range(10):  # settles within five
+        prior = np.where(detected[:, None], _DETECTED, share)
+        posterior = sides + np.log(prior)
+        posterior = np.exp(posterior - logsumexp(posterior, axis=1, keepdims=True))
+        share = (_PRIOR + posterior[~detected].sum(axis=0)) / (_PRIOR.sum() + (~detected).sum())
+    states = np.full(len(views), PARTLY)
+    states[posterior[:, SHOWN] >= _SURE] = SHOWN
+    states[posterior[:, HIDDEN] >= _SURE] = HIDDEN
+    states[~known.any(axis=1) & ~detected] = PARTLY
+    return states
+
+
+def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray, count: int) -> FloatArray:
+    """The contrast of the sides of each outline (count, 4), by the images that it was detected in.
+
+    One that was detected in fewer than three, such as a symbol, takes the median of all images.
+    """
+    out = np.full((count, 4), np.nan)
+    for number in range(count):
+        own = outline == number
+        if np.count_nonzero(own & detected) >= 3:
+            own &= detected
+        values = contrast[own]
+        for side in range(4):
+            known = values[np.isfinite(values[:, side]), side]
+            out[number, side] = np.median(known) if len(known) else np.nan
+    return out
+
+
+def _coco(
+    drive: Drive,
+    images: Sequence[Image],
+    outlines: Sequence[_Outline],
+    views: Sequence[_View],
+    states: IntArray,
+    silent: Sequence[tuple[int, FloatArray]],
+) -> dict[str, Any]:
+    """COCO instances; what is unsure, and ground of which nothing is known, is ``iscrowd``."""
+    kinds = sorted({one.kind for one in outlines})
+    number_of = {kind: n for n, kind in enumerate([*kinds, UNKNOWN], start=1)}
+    # A marking that reaches beyond the range comes after the ground there, of which it is no part.
+    annotations = [_instance(number_of[UNKNOWN], image, polygon, True) for image, polygon in silent]
+    annotations += [
+        # COCO has its origin at the corner of the first pixel, this project at its centre.
+        {
+            **_instance(number_of[outlines[view.outline].kind], view.image, view.polygon_px, state == PARTLY),
+            "marking": outlines[view.outline].id,
+            "whole": view.whole,
+        }
+        for view, state in zip(views, states.tolist(), strict=True)
+        if state != HIDDEN
+    ]
+    infos = [drive.cameras[image.camera].info for image in images]
+    return {
+        "info": {"description": f"map of drive {drive.name} in its images, by v2hdm labels"},
+        "images": [
+            {"id": n + 1, "file_name": drive.name_of(image.path), "width": info.width, "height": info.height}
+            for n, (image, info) in enumerate(zip(images, infos, strict=True))
+        ],
+        "categories": [{"id": number, "name": kind} for kind, number in number_of.items()],
+        "annotations": [{"id": n, **one} for n, one in enumerate(annotations, start=1)],
+    }
+
+
+def _instance(category: int, image: int, polygon_px: FloatArray, unsure: bool) -> dict[str, Any]:
+    points = polygon_px + 0.5
+    low, high = points.min(axis=0), points.max(axis=0)
+    return {
+        "image_id": image + 1,
+        "category_id": category,
+        "segmentation": [np.round(points, 3).ravel().tolist()],
+        "bbox": np.round([*low, *(high - low)], 3).tolist(),
+        "area": round(abs(float(signed_area(points))), 2),
+        "iscrowd": int(unsure),
+    }

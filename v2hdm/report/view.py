@@ -1,0 +1,142 @@
+"""A result as a page of this machine alone, in which a person corrects its markings.
+
+The page is the report with a script more; what it sends is checked and written at once, whole, to a file
+beside the result, which is never changed. Only a page that knows the address, with the secret in it, can send
+anything: names that lead here from elsewhere (``Host``) and other pages (``Origin``) are refused.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import threading
+from collections.abc import Sequence
+from contextvars import Context
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.catalogue import SHIPPED
+from v2hdm.errors import MapFileError, V2hdmError, one_line
+from v2hdm.io.maps.corrections import (
+    Correction,
+    correction_of,
+    entry_of,
+    read_corrections,
+    write_corrections,
+)
+from v2hdm.records import Drive
+from v2hdm.report.page.document import json_text, page_text
+from v2hdm.report.page.facts import Facts, read_facts
+
+_SAME_M = 0.01  # a correction is of what lies where it says, m
+_MOST_BYTES = 100_000  # of one correction
+
+
+def file_beside(folder: Path) -> Path:
+    """Where the corrections of a result are kept unless another place is named."""
+    return folder.resolve().with_name(f"{folder.resolve().name}.corrections.yaml")
+
+
+@dataclass
+class Session:
+    """The corrections of the result in ``folder`` by key of what they are of, kept in the file ``path``."""
+
+    folder: Path
+    path: Path
+    corrections: dict[str, Correction] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @classmethod
+    def begun(cls, folder: Path, path: Path, facts: Facts) -> Session:
+        """With what the file holds already; raises MapFileError where it is no file of corrections."""
+        corrections = read_corrections(path) if path.exists() else []
+        return cls(folder, path, {_key(one, facts) or f"old{n}": one for n, one in enumerate(corrections)})
+
+    def take(self, sent: bytes) -> None:
+        """Keep a correction, or drop it, and write the file; raises MapFileError where it is none."""
+        try:
+            content = json.loads(sent)
+            key, entry = str(content["key"]), content["correction"]
+        except (ValueError, TypeError, LookupError, RecursionError):
+            raise MapFileError("no correction: expected a key and a correction") from None
+        with self._lock:
+            now = {name: one for name, one in self.corrections.items() if name != key}
+            if entry is not None:
+                now[key] = correction_of(entry, key)
+            # The file was read when the command began, and is written all the same: it is gone on with.
+            Context().run(write_corrections, list(now.values()), str(self.folder), self.path)
+            self.corrections = now
+
+
+def _key(one: Correction, facts: Facts) -> str | None:
+    """The key in the page of what a correction is of; None where that is not in the map."""
+    hd_map = facts.hd_map
+    places = {f"x{n}": out.position_map[None] for n, out in enumerate(facts.excluded)}
+    if hd_map is not None:
+        places |= {f"m{marking.id}": marking.corners_map for marking in hd_map.markings}
+        places |= {f"s{symbol.id}": symbol.outline_map for symbol in hd_map.symbols}
+    said = np.array(one.outline_map)
+    for key, place in places.items():
+        if place.shape == said.shape and np.abs(place - said).max() < _SAME_M:
+            return key
+    return None
+
+
+def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingHTTPServer, str, Session]:
+    """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its corrections.
+
+    Raises MapFileError where the folder is no result with a map, or ``path`` holds something else.
+    """
+    facts = read_facts(folder, drive)
+    if facts.hd_map is None:
+        raise MapFileError(f"{folder}: has no map to look at; mend its drive and map it again")
+    session, secret = Session.begun(folder, path, facts), secrets.token_urlsafe(16)
+    text, place = page_text(folder, drive, {"secret": secret}), json_text({"secret": secret})
+    kinds: Sequence[str] = sorted({*SHIPPED.names, *(one.kind for one in facts.hd_map.markings)})
+
+    class Handler(BaseHTTPRequestHandler):
+        timeout = 30
+
+        def log_message(self, *_: object) -> None:
+            """Say nothing: what went wrong is in the answer."""
+
+        def do_GET(self) -> None:
+            if not self._is_ours() or self.path != f"/{secret}/":
+                return self._answer(404, "no such page")
+            own = {key: entry_of(one) for key, one in session.corrections.items()}
+            editing = {"file": path.name, "corrections": own, "kinds": kinds}
+            return self._answer(200, text.replace(place, json_text(editing), 1), "text/html")
+
+        def do_POST(self) -> None:
+            length = self.headers.get("Content-Length", "")
+            elsewhere = self.headers.get("Origin") not in (None, base)
+            if elsewhere or not self._is_ours() or self.path != f"/{secret}/correct":
+                return self._answer(404, "no such page")
+            if not length.isdecimal() or int(length) > _MOST_BYTES:
+                return self._answer(400, "a correction is no larger than 100 kB")
+            try:
+                session.take(self.rfile.read(int(length)))
+            except (V2hdmError, OSError) as error:
+                return self._answer(400, one_line(str(error)))
+            return self._answer(200, "kept")
+
+        def _is_ours(self) -> bool:
+            return f"http://{self.headers.get('Host')}" == base
+
+        def _answer(self, status: int, says: str, kind: str = "text/plain") -> None:
+            content = says.encode()
+            self.send_response(status)
+            self.send_header("Content-Type", f"{kind}; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.send_header("Cache-Control", "no-store")
+            self.send_header("Referrer-Policy", "no-referrer")
+            self.end_headers()
+            self.wfile.write(content)
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    base = f"http://127.0.0.1:{server.server_address[1]}"
+    return server, f"{base}/{secret}/", session

@@ -1,0 +1,134 @@
+"""What a person says of candidates: it counts before all that images say, but for where other corners lie."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2hdm.geometry.planar import clip_convex, signed_area
+from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
+from v2hdm.records import FloatArray, HdMap, IntArray
+from v2hdm.site.candidates import Candidates, Exclusion
+
+_SAME_M = 0.4  # how far the middle of a candidate may be from that which a person saw, m
+MAX_OVERLAP = 0.2
+"""Share of the smaller one's area from which two outlines are of the same paint: markings never overlap."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Corrections by candidate: ``rejected`` with their reasons, ``kept`` with the one that says so."""
+
+    rejected: dict[int, str]
+    kept: dict[int, Correction]
+
+    @classmethod
+    def of(cls, corrections: Sequence[Correction], corners_map: FloatArray, kinds: Sequence[str]) -> Stated:
+        """The corrections of candidates with corners (G, 4, 2), each of the nearest one, of its class first.
+
+        All candidates on rejected paint are rejected: another reading of it would take its place.
+        """
+        rejected: dict[int, str] = {}
+        kept: dict[int, Correction] = {}
+        for one in corrections:
+            same = _same(one, corners_map)
+            if one.says == REJECTED:
+                rejected |= dict.fromkeys(same.tolist(), reason_of(one))
+            elif len(same):
+                middle = np.mean(one.outline_map, axis=0)
+                away_m = np.linalg.norm(corners_map[same].mean(axis=1) - middle, axis=1)
+                away_m = away_m + [0.0 if kinds[group] == one.kind else _SAME_M for group in same]
+                kept[int(same[np.argmin(away_m)])] = one
+        return cls({group: why for group, why in rejected.items() if group not in kept}, kept)
+
+    def placed(self, candidates: Candidates, uncorrected: Candidates) -> Candidates:
+        """The candidates with the corners that a person has moved.
+
+        The other corners of the ``uncorrected`` ones say how the map has shifted since the person saw it. A
+        corner was placed beside the others of its marking, so it has their error in common, and its own
+        sigma: a shift of the whole map does not make it less, nor do many of them make the map more certain.
+        """
+        corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
+        for group, one in self.kept.items():
+            if not one.moved:
+                continue
+            before = np.array(one.outline_map)
+            turns = [np.roll(np.arange(4), -k) for k in range(4)]
+            now = uncorrected.corners_map[group]
+            turn = min(turns, key=lambda order: float(np.sum((now[order] - before) ** 2)))
+            moved = [int(turn[number - 1]) for number in one.moved]
+            others = [int(k) for k in turn if k not in moved and candidates.known[group, k]] or turn.tolist()
+            seen = [turn.tolist().index(k) for k in others]
+            shift = (now[others] - before[seen]).mean(axis=0)
+            mixing = np.eye(4)
+            for place, corner in zip(one.moved.values(), moved, strict=True):
+                corners[group, corner] = np.array(place) + shift
+                mixing[corner] = np.isin(np.arange(4), others) / len(others)
+            by_axis = np.kron(mixing, np.eye(2))
+            covariance[group] = by_axis @ covariance[group] @ by_axis.T
+            for corner in moved:
+                own = slice(2 * corner, 2 * corner + 2)
+                covariance[group][own, own] += one.sigma_m**2 * np.eye(2)
+        return Candidates(corners, covariance)
+
+
+def reason_of(one: Correction) -> str:
+    """Why a marking that a person has rejected is not in the map."""
+    return "rejected by a person" + (f": {one.reason}" if one.reason else "")
+
+
+def _same(one: Correction, corners_map: FloatArray) -> IntArray:
+    """The candidates that are the paint that a person saw."""
+    outline = np.array(one.outline_map)
+    away_m = np.linalg.norm(corners_map.mean(axis=1) - outline.mean(axis=0), axis=1)
+    if len(outline) != 4:
+        return np.flatnonzero(away_m < _SAME_M)
+    reach_m = float(np.ptp(outline, axis=0).max()) + _SAME_M
+    near = np.flatnonzero(away_m < reach_m)
+    return near[[overlap(corners_map[group], outline) > MAX_OVERLAP for group in near]]
+
+
+def overlap(a: FloatArray, b: FloatArray) -> float:
+    """Common area of two convex quadrilaterals as a share of the smaller one's."""
+    common = abs(float(signed_area(clip_convex(a, b))))
+    return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)
+
+
+def with_symbols_corrected(
+    hd_map: HdMap, corrections: Sequence[Correction]
+) -> tuple[HdMap, tuple[Exclusion, ...]]:
+    """The map with what a person says of its symbols, and those that this rejects."""
+    kept, out = [], []
+    for symbol in hd_map.symbols:
+        middle = symbol.outline_map.mean(axis=0)
+        for one in corrections:
+            if len(one.outline_map) < 5 and symbol.kind != one.kind:
+                continue
+            if np.linalg.norm(np.mean(one.outline_map, axis=0) - middle) < _SAME_M:
+                if one.says == REJECTED:
+                    out.append(Exclusion(symbol.kind, middle, symbol.sightings, reason_of(one)))
+                    break
+                symbol = replace(symbol, kind=one.new_kind or symbol.kind)
+        else:
+            kept.append(symbol)
+    return replace(hd_map, symbols=tuple(kept)), tuple(out)
+
+
+def unmet(corrections: Sequence[Correction], hd_map: HdMap) -> list[str]:
+    """The corrections that a finished map does not show: nothing was found where they are."""
+    corners = np.array([one.corners_map for one in hd_map.markings]).reshape(-1, 4, 2)
+    missing = []
+    for one in corrections:
+        same = _same(one, corners)
+        kinds = {hd_map.markings[k].kind for k in same}
+        kinds |= {
+            symbol.kind
+            for symbol in hd_map.symbols
+            if np.linalg.norm(symbol.outline_map.mean(axis=0) - np.mean(one.outline_map, axis=0)) < _SAME_M
+        }
+        there = (one.new_kind or one.kind) in kinds if one.says != ACCEPTED or one.new_kind else bool(kinds)
+        if there == (one.says == REJECTED):
+            missing.append(one.place)
+    return missing
