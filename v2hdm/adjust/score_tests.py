@@ -366,8 +366,8 @@ class _Answer:
     @property
     def disagreement(self) -> float:
         """How many times as much the stretches' scores disagree as they would by the model's own noise."""
-        by_model = np.mean([self._apart(score) for score in self.drawn])
-        return self._apart(self.score) / max(float(by_model), 1e-300)
+        by_model = float(np.mean([self._apart(score) for score in self.drawn]))
+        return self._apart(self.score) / max(by_model, 1e-300)
 
     def _apart(self, score: FloatArray) -> float:
         """Square sum of what is left of scores (G + 1,); neighbours err alike (Bartlett's weights)."""
@@ -521,19 +521,18 @@ def _principal(problem: Problem, camera: int, axis: int, bench: _Bench) -> Rows:
 
 
 def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[_Bench], Rows]:
-    """The column of a motion ``about`` a fault: (C, J, 6) of the vehicle in its own frame."""
+    """The column of a motion (C, J, 6) of the vehicle in its own frame, by central differences.
+
+    ``motion`` is given what it is ``about``, the problem's arrays and a motion of zeros to write into.
+    """
 
     def column(bench: _Bench) -> Rows:
         engine, estimate, arrays = bench.whitening.engine, bench.whitening.estimate, bench.arrays
         still = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
         extrinsic, poses = estimate.cam_from_vehicle[:, None], engine.poses(estimate)
         tangent = arrays.at_moments(motion(*about, arrays, still), axis=1) * _STEP
-        high, low = (
-            engine.residuals(
-                extrinsic @ exp(-sign * tangent) @ inverse(extrinsic) @ poses, estimate.corners_map
-            )
-            for sign in (1.0, -1.0)
-        )
+        turned = (extrinsic @ exp(sign * tangent) @ inverse(extrinsic) @ poses for sign in (-1.0, 1.0))
+        high, low = (engine.residuals(one, estimate.corners_map) for one in turned)
         return {"observations": (high - low) / (2 * _STEP) * bench.root}
 
     return column

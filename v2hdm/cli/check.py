@@ -74,6 +74,5 @@ def _recording_of(drive: Path) -> Path:
     from v2hdm.io.drive.folder import DRIVE_FILE
     from v2hdm.io.safe.texts import read_yaml
 
-    described = drive / DRIVE_FILE
-    bag = read_yaml(described, DriveError).get("bag", "") if described.is_file() else ""
-    return (drive / bag).resolve()
+    file = drive / DRIVE_FILE
+    return (drive / (read_yaml(file, DriveError).get("bag", "") if file.is_file() else "")).resolve()

@@ -293,8 +293,8 @@ def _foreign(evidence: SolveEvidence) -> Finding:
 def _jitter_odds(evidence: SolveEvidence) -> float:
     """The log odds that stamps scatter: of unequal variances along the way and across it, a stretch each."""
     ratio = max(evidence.along_over_across, 1.0)
-    likelier = STRETCHES * math.log((ratio + 1 / ratio) / 2)
-    return likelier - math.log1p((evidence.jitter_s / _USUAL_JITTER_S) ** 2)
+    size = math.log1p((evidence.jitter_s / _USUAL_JITTER_S) ** 2)
+    return STRETCHES * math.log((ratio + 1 / ratio) / 2) - size
 
 
 def _stamps(evidence: SolveEvidence) -> Finding:
