@@ -7,9 +7,9 @@ false ones, the share of markings with four corners known well, the corners' err
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
 
-With ``--verdict`` instead what each column of the table of the sizes of faults (mapping/recovery.py) earns,
-on made drives of these seeds, as they are and with every fault: right drives failed, wrong maps without a
-word, and of those with one how many are named rightly, first.
+With ``--verdict`` instead what each column of the table of the sizes of faults (mapping/recovery.py) and each
+number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
+drives failed, wrong maps without a word, and of those with one how many are named rightly, first.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from v2hdm.detection import classifier as find
 from v2hdm.detection import fit, lattice, propose
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.mapping import recovery
+from v2hdm.mapping import foreign, recovery
 from v2hdm.records import FloatArray
+from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
 """No seed of training, of the judge's fit or of the quality benchmark."""
@@ -147,11 +148,15 @@ def row(name: str, shown: Sequence[Example]) -> str:
 
 
 def sizes() -> Iterator[Part]:
-    """Each column of the table of sizes, and within which context it says nothing."""
+    """Each column of the table of sizes, each number of the foreign images, and the context that lacks it."""
     yield "nothing off", nullcontext
     for column, nothing in (("least", 0.0), ("sigma", np.inf), ("usual", np.inf), ("most", np.inf)):
         flat = {fault: replace(size, **{column: nothing}) for fault, size in recovery._SIZES.items()}
         yield f"{column} size of each fault", partial(patch.object, recovery, "_SIZES", flat)
+    yield "foreign: views that share counts for", partial(patch.object, foreign, "_PSEUDO_VIEWS", 100.0)
+    yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
+    yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)
+    yield "jitter that does not matter", partial(patch.object, solution, "_LEAST_JITTER_S", 0.0)
 
 
 def row_of_verdict(name: str, seeds: Sequence[int]) -> str:

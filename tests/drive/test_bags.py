@@ -4,6 +4,7 @@ import bz2
 import json
 import logging
 import re
+import shutil
 import sqlite3
 import struct
 import tracemalloc
@@ -120,6 +121,18 @@ def test_a_bag_without_description_is_a_drive_where_its_frames_tell_the_mounting
     got = read_drive(bags[kind], ReadOptions(cache=str(tmp_path)))
     assert_same_poses(got, read_drive(folder))
     assert_mounted(got)
+
+
+def test_a_bag_and_the_drive_written_of_it_have_one_check(folder, bags, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    bag = Path(shutil.copytree(bags["mcap"], tmp_path / "site"))
+    check = ["check", "--no-ground"]
+    assert run([*check, "site"]) in (0, 3)
+    assert run([*check, "site", "--write", "drives/site"]) in (0, 3), capsys.readouterr().err
+    (tmp_path / "other").mkdir()
+    shutil.copytree(bag, tmp_path / "other" / "site")
+    assert run([*check, "other/site"]) == 2, "another recording's check stays"
+    assert "move it" in capsys.readouterr().err
 
 
 def test_a_bag_without_mounting_asks_for_it_and_becomes_a_drive(folder, tmp_path, monkeypatch, capsys):

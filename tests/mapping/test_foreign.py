@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from v2hdm.mapping import foreign
+from v2hdm.adjust import Fault, ScoreTest
+from v2hdm.errors import MappingError
+from v2hdm.mapping import foreign, recovery
 from v2hdm.mapping.foreign import foreign_stretch
 
 FRAMES, IN_VIEW = 90, 8
@@ -52,3 +54,46 @@ def test_worn_markings_and_missed_ones_are_no_other_drive(monkeypatch):
     rng = np.random.default_rng(0)
     worn = rng.random(len(OWN)) < 0.2
     assert stretch(monkeypatch, lambda g, f: rng.random() < (0.3 if worn[g] else 0.85), OWN)[2] < 0
+
+
+def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
+    """Log odds of images from 3 to 6 s beside a fault that has ``left`` odds in a solve without them."""
+    fault = ScoreTest(Fault.FOCAL, -1, 0, -1, 0.0, gain=worst)
+    solved = []
+
+    def settled(inputs, _):
+        solved.append([one.image for one in inputs.detections])
+        if left is None:
+            raise MappingError("no marking is left")
+        return SimpleNamespace(row=np.arange(rows)), (ScoreTest(Fault.CLOCK, -1, 0, -1, gain=left),), None
+
+    for name, value in (
+        ("foreign_stretch", (3.0, 6.0, gain)),
+        ("views_of", None),
+        ("collect_sightings", None),
+    ):
+        monkeypatch.setattr(recovery, name, lambda *_, value=value: value)
+    monkeypatch.setattr(recovery, "_settled", settled)
+    images = [SimpleNamespace(stamp_s=float(n)) for n in range(10)]
+    detections = [SimpleNamespace(image=n) for n in range(10)]
+    inputs = recovery.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
+    whole = SimpleNamespace(row=np.arange(1200))
+    told = recovery._foreign(inputs, whole, fault if worst else None, lambda _: None)  # type: ignore[arg-type]
+    return told[2], solved
+
+
+def test_a_stretch_explains_what_a_solve_without_its_images_leaves_less_contradicted(monkeypatch):
+    odds, solved = odds_beside(monkeypatch, 7.0, 2.0)
+    assert odds == pytest.approx(7 + 20 - 2 * 2), "half as many corners hold half as much against it"
+    assert solved == [[0, 1, 2, 7, 8, 9]]
+    assert odds_beside(monkeypatch, 7.0, 15.0)[0] == 7.0, "a clock that wanders is as wrong without them"
+
+
+@pytest.mark.parametrize(("gain", "worst"), [(-1.0, 20.0), (7.0, 0.0)])
+def test_a_stretch_that_nothing_speaks_for_costs_no_solve(monkeypatch, gain, worst):
+    assert odds_beside(monkeypatch, gain, 0.0, worst) == (gain, [])
+
+
+def test_a_drive_without_its_stretch_that_cannot_be_mapped_explains_nothing_more(monkeypatch, caplog):
+    assert odds_beside(monkeypatch, 7.0, None)[0] == 7.0
+    assert "from 3.0 to 6.0 s" in caplog.text

@@ -90,6 +90,31 @@ def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(driv
     assert found["held out"].says.endswith("see focal length")
 
 
+@pytest.mark.parametrize(
+    ("odds", "named"),
+    [
+        (9.0, ["focal length"]),
+        (19.0, ["focal length", "foreign images"]),
+        (21.0, ["foreign images", "focal length"]),
+        (30.0, ["foreign images"]),
+    ],
+)
+def test_foreign_images_are_named_by_their_odds_among_other_causes(odds, named):
+    focal = replace(contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.02, 0.003, 7.0), gain=20.7)
+    evidence = replace(FINE, score_tests=(focal,), foreign=(4.0, 8.0, odds))
+    assert [f.check for f in check_inputs(evidence) if f.status is Status.FAIL] == named
+
+
+@pytest.mark.parametrize(("model_sigma", "is_told"), [(0.015, True), (0.023, False)])
+def test_a_step_within_the_noise_that_is_stated_is_unobservable_however_quiet_the_drive(model_sigma, is_told):
+    step = contradiction(Fault.STEP, ("front", "rear"), 2, "from 9.0 s on", -0.048, 0.018, 1.5)
+    evidence = replace(FINE, score_tests=(replace(step, model_sigma=model_sigma),))
+    (finding,) = [f for f in check_inputs(evidence) if f.check == "position step"]
+    assert finding.status is Status.PASS
+    assert finding.is_unobservable is not is_told
+    assert is_told or "below 9.2 cm" in finding.says
+
+
 def test_a_rival_that_explains_as_much_is_named_as_well():
     one = contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
     other = contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of, steps_of
-from v2hdm.errors import EXIT_USER_ERROR
+from v2hdm.errors import EXIT_USER_ERROR, DriveError
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -57,7 +57,7 @@ def run(arguments: Sequence[str]) -> int:
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
     settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras), "ground": parsed.ground}
-    with result_of(folder, f"v2hdm check of {parsed.drive.resolve()}", settings) as unfinished:
+    with result_of(folder, f"v2hdm check of {_recording_of(parsed.drive)}", settings) as unfinished:
         matched = steps_of("match bare ground, cameras")
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
@@ -67,3 +67,12 @@ def run(arguments: Sequence[str]) -> int:
     passed = [finding.line for finding in verdict.passed if parsed.all]
     print(*passed, *verdict.lines[1:], verdict.lines[0], f"pictures in {folder}", sep="\n")
     return exit_code(verdict)
+
+
+def _recording_of(drive: Path) -> Path:
+    """The bag that a drive folder describes, so that both have one result; else the drive itself."""
+    from v2hdm.io.drive.folder import DRIVE_FILE
+    from v2hdm.io.safe.texts import read_yaml
+
+    file = drive / DRIVE_FILE
+    return (drive / (read_yaml(file, DriveError).get("bag", "") if file.is_file() else "")).resolve()

@@ -19,6 +19,7 @@ from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faul
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Sightings, collect_sightings
+from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
@@ -172,9 +173,10 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             taken = "a cross-section" if is_curved else "a plane: no cross-section explains the drive"
             _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
-        # 3. Begin anew without the input that is contradicted most, if the drive can do without.
-        left = None
-        if worst is not None and len(corrected) < _MOST_CORRECTIONS and not _is_ambiguous(worst, found):
+        # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
+        foreign, left = _foreign(inputs, settled, worst, progress), None
+        is_likeliest = worst is not None and log_odds(worst) > foreign[2]
+        if is_likeliest and len(corrected) < _MOST_CORRECTIONS and not _is_ambiguous(worst, found):
             left = _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
@@ -191,9 +193,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
-    views, cameras = views_of(drive, inputs.cameras), tuple(drive.cameras[name] for name in inputs.cameras)
-    evidence = replace(evidence, foreign=foreign_stretch(settled, inputs.sightings, views, cameras))
-    return Outcome(inputs, optimised.bundle, evidence), optimised
+    return Outcome(inputs, optimised.bundle, replace(evidence, foreign=foreign)), optimised
 
 
 def _settled(
@@ -206,8 +206,35 @@ def _settled(
         settled = inputs.optimiser.settle(inputs.tracks, progress)
     progress("tests of the inputs")
     found = score_faults(settled.problem, settled.solution)
-    found = tuple(one for one in found if _is_stated(one, settled, inputs.drive))
+    stated = (one for one in found if _is_stated(one, settled, inputs.drive))
+    found = tuple(sorted(stated, key=log_odds, reverse=True))
     return settled, found, next((one for one in found if is_contradicted(one)), None)
+
+
+def _foreign(
+    inputs: Inputs, settled: Bundle, worst: ScoreTest | None, progress: Callable[[str], None]
+) -> tuple[float, float, float]:
+    """The likeliest stretch of foreign images, s, and its log odds as the cause of all that is contradicted.
+
+    The tests look at corners, the stretch at which markings are found at all. What it explains of the corners
+    is what a solve without its images leaves less contradicted, as if that had as many of them.
+    """
+    drive, names = inputs.drive, inputs.cameras
+    cameras = tuple(drive.cameras[name] for name in names)
+    begin_s, end_s, gain = foreign_stretch(settled, inputs.sightings, views_of(drive, names), cameras)
+    if worst is None or gain <= 0:
+        return begin_s, end_s, gain
+    stamp_s = np.array([drive.images[one.image].stamp_s for one in inputs.detections])
+    beyond = np.flatnonzero((stamp_s < begin_s) | (stamp_s > end_s))
+    rest = replace(inputs, detections=[inputs.detections[n] for n in beyond])
+    try:
+        without, found, _ = _settled(rest, progress)
+    except (AdjustError, MappingError) as failure:
+        _log.warning("whether images from %.1f to %.1f s are foreign: %s", begin_s, end_s, failure)
+        return begin_s, end_s, gain
+    left = max([0.0, *map(log_odds, found)]) * len(settled.row) / len(without.row)
+    gain += max(log_odds(worst) - left, 0.0)
+    return begin_s, end_s, gain
 
 
 def _is_bent(one: ScoreTest) -> bool:

@@ -8,12 +8,14 @@ and spoilt drives.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from v2hdm.adjust import Fault
+from v2hdm.adjust.score_tests import STRETCHES
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.recovery import (
     CLOCK_OBSERVABLE_S,
@@ -44,9 +46,10 @@ _REJECTED_LIMIT = 0.06
 _VARIANCE_LIMIT = 3.0
 # Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
 _POSE_NOISE_LIMIT = 3.0
-# Noise of poses along the way over that across it, from image to image: right drives reach 1.4, stamps that
-# jitter by 20 ms begin at 13; and what stamps may scatter by, s, before it matters.
-_ALONG_LIMIT, _LEAST_JITTER_S = 3.0, 0.005
+# Log odds from which a cause is named that no score test looks for.
+_ODDS_LIMIT = CONTRADICTED_SIGMAS**2 / 2
+# Scatter of stamps, s, that does not matter, and that is usual where there is any.
+_LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
 # Sigma, m, of the point that the poses are of, up to which a drive observes it: the usual accuracy goal.
 _LEVER_OBSERVABLE_M = 0.05
@@ -96,6 +99,8 @@ _CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no know
 
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
+# What units are shown as, and by what values are multiplied for it.
+_SHOWN = {"m": (100.0, "cm"), "s": (1e3, "ms"), "rad": (180 / np.pi, "deg"), "px": (1.0, "px"), "": (1.0, "")}
 _MAP_AXES = ("east", "north", "north-east", "north-west")
 
 
@@ -124,7 +129,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
     causes: list[Finding] = []
     symptoms: list[Finding] = []
     if best.evidence is not None:
-        causes = [*_foreign(best.evidence), *_stamps(best.evidence), *check_inputs(best.evidence)]
+        causes = check_inputs(best.evidence)
         symptoms = [*check_fit(best.evidence), _excluded(best)]
     symptoms += check_doubles(best)
     if len(methods) > 1:
@@ -148,13 +153,17 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     findings = [_corrected(one) for one in evidence.corrected]
     raised = {finding.check for finding in findings}
     still = [one for one in evidence.score_tests if is_contradicted(one)]
+    foreign = _foreign(evidence)
+    causes = {foreign: evidence.foreign[2], _stamps(evidence): _jitter_odds(evidence)}
     if still:
-        # Other inputs would explain part of the same residuals: the one that explains most is named.
-        findings.append(_contradicted(still[0], still[1:]) if is_physical(still[0]) else _unknown(still[0]))
-        raised.add(findings[-1].check)
-    elif likely := [one for one in evidence.score_tests if is_likely(one)]:
-        findings.append(_likely(likely[0]))
-        raised.add(findings[-1].check)
+        causes[_contradicted(still) if is_physical(still[0]) else _unknown(still[0])] = log_odds(still[0])
+    # Each would explain part of the same contradictions: the likeliest is named, and what nearly is.
+    causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
+    least = max(causes.values(), default=0.0) - _RIVAL_LOG_ODDS
+    named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
+    named = named or [_likely(one) for one in evidence.score_tests if is_likely(one)][:1]
+    findings += named if foreign in causes else [*named, foreign]
+    raised |= {one.check for one in named}
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.score_tests:
         by_check.setdefault(_CHECKS[one.fault][0], []).append(one)
@@ -165,7 +174,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
 
 
 def _observable(tested: list[Contradiction]) -> list[Contradiction]:
-    return [one for one in tested if one.sigma <= OBSERVABLE_SIGMA[one.fault]]
+    return [one for one in tested if max(one.sigma, one.model_sigma) <= OBSERVABLE_SIGMA[one.fault]]
 
 
 def _corrected(one: Contradiction) -> Finding:
@@ -183,9 +192,10 @@ def _unknown(one: Contradiction) -> Finding:
     return Finding("cause unknown", Status.FAIL, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, "map")
 
 
-def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
-    rivals = [_words(other) for other in others if log_odds(other) > log_odds(one) - _RIVAL_LOG_ODDS]
-    says = f"{_words(one)}{f' or {rivals[0]}' if rivals else ''} ({one.sigmas:.0f} sigmas)"
+def _contradicted(still: list[Contradiction]) -> Finding:
+    one = still[0]
+    rivals = [_words(other) for other in still if log_odds(other) > log_odds(one) - _RIVAL_LOG_ODDS]
+    says = f"{' or '.join(rivals)} ({one.sigmas:.0f} sigmas)"
     return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
 
 
@@ -202,7 +212,10 @@ def _input(one: Contradiction, status: Status, says: str) -> Finding:
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     observable = _observable(tested)
     if not observable:
-        says = "the markings of this drive do not tell it: drive a turn, and past more of them"
+        size = CONTRADICTED_SIGMAS * min(max(one.sigma, one.model_sigma) for one in tested)
+        scale, unit = _SHOWN[tested[0].fault.unit]
+        below = f" below {scale * size:.2g} {unit}".rstrip() if np.isfinite(size) else ""
+        says = f"the markings of this drive do not tell errors{below}: drive a turn, and past more of them"
         return passed(check, ", ".join(tested[0].cameras), says)
     worst = max(observable, key=lambda one: one.sigmas)
     if is_contradicted(worst):
@@ -266,26 +279,33 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         yield from _poses(evidence)
 
 
-def _foreign(evidence: SolveEvidence) -> Iterator[Finding]:
+def _foreign(evidence: SolveEvidence) -> Finding:
     """Images of another place than those before and after them, and than their poses."""
     begin_s, end_s, gain = evidence.foreign
-    yield judge(
-        "foreign images", "map", max(gain, 0.0), CONTRADICTED_SIGMAS**2 / 2, "",
+    return judge(
+        "foreign images", "map", max(gain, 0.0), _ODDS_LIMIT, "",
         fine="no stretch has markings that the other images lack",
         wrong=f"from {begin_s:.1f} to {end_s:.1f} s the images show other markings than before and after, as "
         "those of another drive do: compare the lists of images and poses",
     )  # fmt: skip
 
 
-def _stamps(evidence: SolveEvidence) -> Iterator[Finding]:
+def _jitter_odds(evidence: SolveEvidence) -> float:
+    """The log odds that stamps scatter: of unequal variances along the way and across it, a stretch each."""
+    ratio = max(evidence.along_over_across, 1.0)
+    size = math.log1p((evidence.jitter_s / _USUAL_JITTER_S) ** 2)
+    return STRETCHES * math.log((ratio + 1 / ratio) / 2) - size
+
+
+def _stamps(evidence: SolveEvidence) -> Finding:
     """Stamps that scatter: the poses err more than stated, from image to image, and only along the way."""
-    ratio = evidence.along_over_across
-    if ratio > _ALONG_LIMIT and evidence.jitter_s > _LEAST_JITTER_S:
-        says = (
-            f"the stamps of the images jitter by {1e3 * evidence.jitter_s:.0f} ms: poses err {ratio:.0f} "
-            "times as much along the way as across it: stamp images when exposed, not when they arrive"
-        )
-        yield Finding("image stamps", Status.FAIL, ratio, _ALONG_LIMIT, "", says, "poses")
+    ratio, by_ms = evidence.along_over_across, 1e3 * evidence.jitter_s
+    return judge(
+        "image stamps", "poses", _jitter_odds(evidence) * (evidence.jitter_s > _LEAST_JITTER_S), _ODDS_LIMIT,
+        "", fine="the poses err as much across the way as along it",
+        wrong=f"the stamps of the images jitter by {by_ms:.0f} ms: poses err {ratio:.0f} times as much along "
+        "the way as across it: stamp images when exposed, not when they arrive",
+    )  # fmt: skip
 
 
 def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
