@@ -181,8 +181,10 @@ def clock_residual(arrays: Arrays, clock_s: Tensor) -> Tensor:
 
 
 def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
-    """Corners (N, 2) against what a survey measured."""
-    return (corners_map - arrays.control) * arrays.control_information.sqrt()
+    """Corners (N, 2) against what a survey measured; knots of lanes do not wander along their line."""
+    x, y = (corners_map - arrays.control).unbind(1)
+    a, b, c = arrays.control_root.unbind(1)
+    return torch.stack([a * x, b * x + c * y], dim=1)
 
 
 def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:

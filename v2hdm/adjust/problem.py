@@ -99,11 +99,31 @@ class Drift:
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2)."""
+    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2).
+
+    Sigmas are those of x and y or, where directions ``along`` (M, 2) are given, along and across these;
+    an infinite one says nothing.
+    """
 
     corner: IntArray
     points_map: FloatArray
     sigma_m: FloatArray
+    along: FloatArray | None = None
+
+    def take(self, rows: IntArray | BoolArray, corner: IntArray) -> ControlPoints:
+        """Those at ``rows``, of corners that are now called ``corner``."""
+        along = None if self.along is None else self.along[rows]
+        return ControlPoints(corner, self.points_map[rows], self.sigma_m[rows], along)
+
+    @property
+    def root_information(self) -> FloatArray:
+        """a, b, c (M, 3) of the whitened residuals (a dx, b dx + c dy)."""
+        t = np.array([[1.0, 0.0]]) if self.along is None else self.along
+        one, other = (1 / self.sigma_m**2).T
+        xx, yy = one * t[:, 0] ** 2 + other * t[:, 1] ** 2, one * t[:, 1] ** 2 + other * t[:, 0] ** 2
+        c = np.sqrt(yy)
+        b = np.where(c > 0, (one - other) * t[:, 0] * t[:, 1] / np.where(c > 0, c, 1.0), 0.0)
+        return np.column_stack([np.sqrt(np.maximum(xx - b**2, 0.0)), b, c])
 
 
 @dataclass(frozen=True)

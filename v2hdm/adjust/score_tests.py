@@ -447,7 +447,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
                 yield _Hypothesis(Fault.SURVEY, _survey(camera, axis), camera, axis)
             if arrays.camera_count > 1:
                 yield _Hypothesis(Fault.LEVER, _survey(-1, axis), -1, axis)
-    if bool((arrays.control_information > 0).any()):
+    if bool((arrays.control_root > 0).any()):
         for axis in (0, 1):
             yield _Hypothesis(Fault.DATUM, _datum(axis), axis=axis)
     for item, length_m in enumerate(torch.unique(arrays.lengths.length_m)):
@@ -709,7 +709,7 @@ def _survey(camera: int, axis: int) -> Callable[[_Bench], Rows]:
 def _datum(axis: int) -> Callable[[_Bench], Rows]:
     def column(bench: _Bench) -> Rows:
         out = torch.zeros_like(bench.arrays.control)
-        out[:, axis] = -bench.arrays.control_information[:, axis].sqrt()
+        out[:, axis:] = -bench.arrays.control_root[:, 2 * axis : 2 + axis]
         return {"control_points": out}
 
     return column

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from v2hdm.association.groups import Association, fuse_groups, group_kinds, know
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
+from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
@@ -77,7 +79,8 @@ VARIANCE_FACTORS = (0.05, 20.0)
 class Model:
     """The unknowns of a solve, and its noise beyond that of the corners.
 
-    ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``.
+    ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``; what
+    was seen of lanes has a ``lane_factor`` of its own.
     ``sizes`` and ``survey`` are stated by the user; ``clock_sigma_s`` is the prior of clock offsets,
     ``pose_sigma`` that of each visit's poses.
     """
@@ -89,6 +92,7 @@ class Model:
     sizes: SizeOptions = field(default_factory=SizeOptions)
     survey: SurveyOptions = field(default_factory=SurveyOptions)
     clock_sigma_s: float = Problem.clock_sigma_s
+    lane_factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,10 @@ class Bundle:
     ``rig`` holds the adjusted extrinsics and poses, ``model`` is what was solved for. Observation k is
     corner ``corner`` (K,) of group ``group`` (K,), seen at ``row`` (K,) of the sightings.
     ``corner_index`` (G, 4) finds a corner in the solution, -1 where it had fewer than two observations.
-    ``camera_index`` maps camera names to rows of the solution's extrinsics.
+    ``camera_index`` maps camera names to rows of the solution's extrinsics, ``frames`` (J,) are those of its
+    poses. Lanes, if they took part, are the problem's last corners and observations, in the order of
+    ``knots``; what the solution says of single observations is of the markings alone, and by it the variances
+    of what was seen of lanes are ``lane_factor`` times those stated.
     """
 
     rig: Rig
@@ -111,6 +118,9 @@ class Bundle:
     corner: IntArray
     corner_index: IntArray
     camera_index: Mapping[str, int]
+    frames: IntArray
+    knots: Knots | None = None
+    lane_factor: float = 1.0
 
     @property
     def corners_map(self) -> FloatArray:
@@ -173,6 +183,7 @@ def solve_bundle(
     rig: Rig,
     cameras: Mapping[str, Camera],
     model: Model,
+    knots: Knots | None = None,
 ) -> Bundle:
     """Estimate extrinsics, poses and the corners of all groups together.
 
@@ -188,27 +199,39 @@ def solve_bundle(
             "no marking was seen in two images, so nothing can be optimised; drive past the markings "
             "at a lower speed or raise the image rate."
         )
-    used = _Used(
-        *np.unique(sightings.camera[row], return_inverse=True),
-        *np.unique(sightings.frame[row], return_inverse=True),
-    )
+    camera, frame = sightings.camera[row], sightings.frame[row]
+    if knots is not None:
+        camera, frame = np.append(camera, knots.camera), np.append(frame, knots.frame)
+    used = _Used(*np.unique(camera, return_inverse=True), *np.unique(frame, return_inverse=True))
     own_corner = association.corner_order()[row, corner]
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
     covariance_px[on_line] = line_only(covariance_px[on_line], _OPEN_END_PX)
     observations = Observations(
-        camera=used.camera.astype(np.int64),
-        frame=used.frame.astype(np.int64),
+        camera=sightings.camera[row],
+        frame=sightings.frame[row],
         corner=corner_index[group, corner],
         pinhole_px=sightings.corners_pinhole_px[row, own_corner],
         covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
         row_share=sightings.row_share[row, own_corner],
     )
+    first = int(corner_index.max(initial=-1)) + 1
+    if knots is not None:
+        observations = _joined(observations, knots.observations(first, model.lane_factor))
+    observations = replace(observations, camera=used.camera, frame=used.frame)
     names = [sightings.cameras[c] for c in used.cameras]
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
     problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
+    if knots is not None:
+        held = knots.held(first)
+        axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
+        control = held if control is None else _joined(replace(control, along=axes), held)
     problem = replace(problem, lengths=lengths, control=control)
     solution = solve(problem, model.solver)
+    lane_factor = model.lane_factor
+    if knots is not None:
+        solution, of_lanes = _of_markings(solution, len(row))
+        lane_factor *= _variance_factor(of_lanes, knots.count)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
     cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
     map_from_vehicle[used.frames] = solution.map_from_vehicle
@@ -218,7 +241,32 @@ def solve_bundle(
         read_out_s[used.cameras] = solution.read_out_s
         adjusted = replace(adjusted, read_out_s=read_out_s)
     index = {n: c for c, n in enumerate(names)}
-    return Bundle(adjusted, model, problem, solution, association, row, group, corner, corner_index, index)
+    return Bundle(
+        adjusted, model, problem, solution, association, row, group, corner, corner_index, index, used.frames,
+        knots, lane_factor,
+    )  # fmt: skip
+
+
+def _of_markings(solution: Solution, count: int) -> tuple[Solution, FloatArray]:
+    """The solution with the first ``count`` observations only, and the squared residuals of the others."""
+    squared = solution.mahalanobis2
+    own = {name: getattr(solution, name)[:count] for name in ("residual_px", "mahalanobis2", "verdict")}
+    return replace(solution, **own), squared[count:]
+
+
+def _variance_factor(squared: FloatArray, unknowns: int) -> float:
+    """How many times as large as stated the variance of lines is, by the median of squared residuals (K,)."""
+    spare = max(1 - unknowns / len(squared), 0.1)
+    return float(np.clip(np.median(squared) / (2 * np.log(2) * spare), *VARIANCE_FACTORS))
+
+
+_Rows = TypeVar("_Rows", Observations, ControlPoints)
+
+
+def _joined(one: _Rows, other: _Rows) -> _Rows:
+    """The rows of one, then those of the other."""
+    pairs = zip(vars(one).values(), vars(other).values(), strict=True)
+    return type(one)(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ from v2hdm.mapping.bundle import (
 )
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
+from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import AUTO, CROSS_SECTION, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, largest_noise
 
@@ -129,8 +130,16 @@ class Optimiser:
         progress("noise of the poses")
         return self._weigh_poses(bundle)
 
-    def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
-        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
+    def finish(
+        self,
+        bundle: Bundle,
+        progress: Callable[[str], None] = silent,
+        find_knots: Callable[[Rig, CrossSection | None], Knots | None] = lambda rig, section: None,
+    ) -> Optimised:
+        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude.
+
+        ``find_knots`` gives the knots of lanes that take part, by what is known of the rig without them.
+        """
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -138,6 +147,12 @@ class Optimiser:
         inlier, usable = bundle.inliers, np.zeros_like(self.sightings.valid)
         usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         final = self._solve(bundle.association, usable, bundle.rig)
+        knots = find_knots(final.rig, self.cross_section)
+        if knots is not None and knots.count:
+            progress("lanes")
+            # Twice: how well lines are seen, only their residuals say.
+            for _ in range(2):
+                final = self._solve_with_lanes(final, usable, knots)
         return conclude(
             Evidence(self.sightings, self._views, self._cameras, final, bundle, inlier, usable),
             self.initial_rig,
@@ -283,11 +298,13 @@ class Optimiser:
             if coarse
             else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
-        bundle = solve_bundle(self.sightings, association, usable, rig, self._cameras, model)
-        status = bundle.solution.status
-        if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
-            raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
-        return bundle
+        return _sound(solve_bundle(self.sightings, association, usable, rig, self._cameras, model))
+
+    def _solve_with_lanes(self, bundle: Bundle, usable: BoolArray, knots: Knots) -> Bundle:
+        """The solve of ``bundle`` with ``knots`` of lanes, as certain as its residuals say they are seen."""
+        model = replace(bundle.model, lane_factor=bundle.lane_factor)
+        groups, cameras = bundle.association, self._cameras
+        return _sound(solve_bundle(self.sightings, groups, usable, bundle.rig, cameras, model, knots))
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
@@ -334,6 +351,14 @@ class Optimiser:
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
+
+
+def _sound(bundle: Bundle) -> Bundle:
+    """The bundle, if its solve came to an end; raises MappingError."""
+    status = bundle.solution.status
+    if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
+        raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
+    return bundle
 
 
 def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:

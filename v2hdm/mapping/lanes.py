@@ -1,0 +1,319 @@
+"""Lanes in the adjustment: cubic splines whose knots are unknowns, seen as lines that pass them.
+
+A lane is a Catmull-Rom spline, which runs through its knots. So what an image shows of it is compared with it
+where it passes a knot: the points of a piece of paint about there give the place of one point of the line.
+That is an observation like that of a corner, but for its information, which has rank one: it says nothing of
+where along the line the point lies. Nor is that an unknown; a knot moves across its line only, since a prior
+holds it along the line. All else is as with corners: elimination, robust loss and covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from v2hdm.adjust import ControlPoints, Observations, Solution
+from v2hdm.association.cross_section import CrossSection
+from v2hdm.association.sightings import Rig, frames_of
+from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
+from v2hdm.site.lane_points import (
+    CENTRE_SIGMA_PX,
+    OWN_SIGMA_M,
+    PaintPoints,
+    collect_lane_points,
+    ground_by_rig,
+    paint_points,
+)
+from v2hdm.site.lanes import map_lanes
+from v2hdm.site.options import LaneOptions
+
+_SPACING_M = 2.0
+"""Distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle."""
+
+_HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
+_OPEN_END_PX = 1000.0  # sigma along the line of where an image shows it: anywhere
+_SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
+_SAME_DIRECTION = np.cos(
+    np.deg2rad(20.0)
+)  # cosine from which a point is of a line: of a crossing one it is not
+
+_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
+"""Directions (N, 2) times it are turned to their left."""
+
+
+@dataclass(frozen=True)
+class Knots:
+    """The knots of lanes, and where images show a line pass them.
+
+    Attributes:
+        lanes: as they were drawn under the adjustment without them.
+        lane, at_m, points_map, along: (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that
+            it lies, its place on it and the unit direction there.
+        unknown: (N,) its number among those that enough images show, -1 where they do not.
+        camera, frame, knot: (K,) of each observation; ``knot`` counts those with a number.
+        pinhole_px, covariance_px, row_share: (K, 2), (K, 2, 2) and (K,) of it.
+    """
+
+    lanes: tuple[Lane, ...]
+    lane: IntArray
+    at_m: FloatArray
+    points_map: FloatArray
+    along: FloatArray
+    unknown: IntArray
+    camera: IntArray
+    frame: IntArray
+    knot: IntArray
+    pinhole_px: FloatArray
+    covariance_px: FloatArray
+    row_share: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Knots that are unknowns of the adjustment."""
+        return int(self.unknown.max(initial=-1)) + 1
+
+    def observations(self, first: int, variance_factor: float) -> Observations:
+        """As observations of corners from number ``first``; cameras and frames are those of the rig."""
+        return Observations(
+            self.camera,
+            self.frame,
+            first + self.knot,
+            self.pinhole_px,
+            variance_factor * self.covariance_px,
+            self.row_share,
+        )
+
+    def held(self, first: int) -> ControlPoints:
+        """The prior that keeps the corners from number ``first`` from moving along their lines."""
+        own = self.unknown >= 0
+        sigma_m = np.tile([_HELD_M, np.inf], (self.count, 1))
+        return ControlPoints(first + self.unknown[own], self.points_map[own], sigma_m, self.along[own])
+
+
+def find_knots(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    rig: Rig,
+    section: CrossSection | None,
+    options: LaneOptions,
+) -> Knots | None:
+    """Knots along the lanes that a drive shows under ``rig``, which is over ``cameras``; None without any."""
+    ground = ground_by_rig(drive, cameras, rig, section)
+    paint = paint_points(drive, detections, ground, options.max_range_m)
+    cloud = collect_lane_points(
+        drive, detections, ground, options.max_range_m, drive.pose_noise.roll_pitch_rad
+    )
+    lanes = map_lanes(cloud, options)
+    if paint is None or not lanes:
+        return None
+    course = _Course.of(lanes)
+    lane, at_m = course.stations()
+    points_map, along = course.at(lane, at_m), course.along(lane, at_m)
+    point, knot = _pairs(paint, course, lane, at_m, options.half_width_m)
+    image, at, pinhole_px, covariance_px, row_share = _passing(paint, point, knot, course, lane, at_m)
+    enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
+    unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
+    camera = np.array([list(cameras).index(i.camera) if i.camera in cameras else -1 for i in drive.images])
+    frame = frames_of(drive).frame_of_image
+    at, image = unknown[at[kept]], image[kept]
+    seen = camera[image], frame[image], at, pinhole_px[kept], covariance_px[kept], row_share[kept]
+    return Knots(lanes, lane, at_m, points_map, along, unknown, *seen)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Lanes as polylines by their length: ``arc_m`` (V,) of all vertices ``points_map`` (V, 2).
+
+    Lane l begins at ``begin_m[l]``, is ``length_m[l]`` long and a metre away from the next.
+    """
+
+    arc_m: FloatArray
+    points_map: FloatArray
+    begin_m: FloatArray
+    length_m: FloatArray
+
+    @classmethod
+    def of(cls, lanes: Sequence[Lane]) -> _Course:
+        arcs = [_arc_m(one.points_map) for one in lanes]
+        length_m = np.array([arc[-1] for arc in arcs])
+        begin_m = np.cumsum(length_m + 1.0) - length_m
+        arc_m = np.concatenate([arc + begin for arc, begin in zip(arcs, begin_m, strict=True)])
+        return cls(arc_m, np.concatenate([one.points_map for one in lanes]), begin_m, length_m)
+
+    def stations(self) -> tuple[IntArray, FloatArray]:
+        """The lane of each knot, and how far along it."""
+        count = np.maximum(np.round(self.length_m / _SPACING_M), 1).astype(np.int64) + 1
+        at_m = [np.linspace(0.0, length, n) for length, n in zip(self.length_m, count, strict=True)]
+        return np.repeat(np.arange(len(count)), count), np.concatenate(at_m)
+
+    def at(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
+        """The points (N, 2) of lanes (N,), as far along them (N,)."""
+        arc_m = self.begin_m[lane] + np.clip(at_m, 0.0, self.length_m[lane])
+        return np.column_stack([np.interp(arc_m, self.arc_m, axis) for axis in self.points_map.T])
+
+    def along(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
+        """Unit directions (N, 2) there."""
+        ahead, behind = (self.at(lane, at_m + sign * _SPACING_M / 2) for sign in (1, -1))
+        return np.asarray((ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True))
+
+
+def _arc_m(points_map: FloatArray) -> FloatArray:
+    """How far along a polyline each vertex (N,) lies."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_map, axis=0), axis=1))])
+
+
+def _pairs(
+    paint: PaintPoints, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
+) -> tuple[IntArray, IntArray]:
+    """Points and the knots that they tell of: points of the nearest line, at most half a spacing away."""
+    knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
+    reach_m = float(np.hypot(_SPACING_M / 2, half_width_m))
+    near = cKDTree(paint.points_map).sparse_distance_matrix(
+        cKDTree(knots_map), reach_m, output_type="coo_matrix"
+    )
+    point, knot = near.row.astype(np.int64), near.col.astype(np.int64)
+    ahead_m, off_m = _beside(paint, point, knot, course, lane, at_m)
+    same = np.abs((paint.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
+    fits = np.flatnonzero(same & (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= half_width_m))
+    order = fits[np.lexsort((np.abs(off_m[fits]), point[fits]))]
+    first = np.unique(point[order], return_index=True)[1]
+    return point[order][first], knot[order][first]
+
+
+def _beside(
+    paint: PaintPoints, point: IntArray, knot: IntArray, course: _Course, lane: IntArray, at_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """How far ahead of a knot points lie (P,), m, and how far to the left of its lane there (P,)."""
+    lane, at_m = lane[knot], at_m[knot]
+    points_map = paint.points_map[point]
+    ahead_m = ((points_map - course.at(lane, at_m)) * course.along(lane, at_m)).sum(axis=1)
+    left = course.along(lane, at_m + ahead_m) @ _TURN
+    return ahead_m, ((points_map - course.at(lane, at_m + ahead_m)) * left).sum(axis=1)
+
+
+def _passing(
+    paint: PaintPoints, point: IntArray, knot: IntArray, course: _Course, lane: IntArray, at_m: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Where images show lines pass knots: image, knot, pinhole pixel, its covariance and row share.
+
+    A line through the points of a piece, as turned as they are, gives how far to the left of the lane it is.
+    Their errors are taken for one, since neighbouring cells of the network err alike.
+    """
+    ahead_m, off_m = _beside(paint, point, knot, course, lane, at_m)
+    groups, own = np.unique(np.column_stack([paint.image[point], knot]), axis=0, return_inverse=True)
+    image, at = groups.T
+    own = own.ravel()
+    left = course.along(lane[knot], at_m[knot]) @ _TURN
+    across = np.einsum("pi,pij->pj", left, paint.jacobian[point])
+    weight = 1 / ((CENTRE_SIGMA_PX * across) ** 2).sum(axis=1)
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.bincount(own, weight * values, len(groups)).astype(np.float64)
+
+    w, x, y, xy = (total(one) for one in (np.ones(len(own)), ahead_m, off_m, ahead_m * off_m))
+    xx = total(ahead_m**2) + _SLOPE_SIGMA**-2
+    left_m, loss = (xx * y - x * xy) / (w * xx - x**2), w * xx / (w * xx - x**2)
+    order = np.lexsort((np.abs(ahead_m), own))
+    nearest = point[order][np.unique(own[order], return_index=True)[1]]
+    along = course.along(lane[at], at_m[at])
+    left, px_by_map = along @ _TURN, np.linalg.inv(paint.jacobian[nearest])
+    shown_map = course.at(lane[at], at_m[at]) + left_m[:, None] * left
+    off_px = (px_by_map @ (shown_map - paint.points_map[nearest])[..., None])[..., 0]
+    line = (px_by_map @ along[..., None])[..., 0]
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    normal = line @ _TURN
+    own_px = OWN_SIGMA_M * (normal * (px_by_map @ left[..., None])[..., 0]).sum(axis=1)
+    variance = loss * (CENTRE_SIGMA_PX**2 + own_px**2)
+    covariance_px = variance[:, None, None] * normal[:, :, None] * normal[:, None]
+    covariance_px += _OPEN_END_PX**2 * line[:, :, None] * line[:, None]
+    return image, at, paint.points_px[nearest] + off_px, covariance_px, paint.row_share[nearest]
+
+
+def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane, ...]:
+    """The lanes as splines through the adjusted knots, vertices about ``spacing_m`` apart with their sigmas.
+
+    The first corner of ``solution`` that is a knot follows those of the markings. Where no image shows the
+    line, as between dashes, it keeps its course beside the knots around.
+    """
+    first = len(solution.corners_map) - knots.count
+    own = first + knots.unknown
+    seen = knots.unknown >= 0
+    moved_m = np.zeros(len(own))
+    left = knots.along @ _TURN
+    moved_m[seen] = ((solution.corners_map[own[seen]] - knots.points_map[seen]) * left[seen]).sum(axis=1)
+    lanes = []
+    for number, lane in enumerate(knots.lanes):
+        rows = np.flatnonzero(knots.lane == number)
+        lanes.append(_drawn(lane, knots, rows, moved_m, own, solution, spacing_m))
+    return tuple(lanes)
+
+
+def _drawn(
+    lane: Lane,
+    knots: Knots,
+    rows: IntArray,
+    moved_m: FloatArray,
+    own: IntArray,
+    solution: Solution,
+    spacing_m: float,
+) -> Lane:
+    seen = np.flatnonzero(knots.unknown[rows] >= 0)
+    if not len(seen):
+        return lane
+    at_m = knots.at_m[rows]
+    vertex_m = np.linspace(0.0, at_m[-1], max(round(float(at_m[-1]) / spacing_m), 1) + 1)
+    by_knot, by_seen = _catmull_rom(at_m, vertex_m), _between(at_m[seen], at_m)
+    left = knots.along[rows] @ _TURN
+    points_map = by_knot @ (knots.points_map[rows] + (by_seen @ moved_m[rows][seen])[:, None] * left)
+    along = np.gradient(points_map, axis=0)
+    left = along / np.linalg.norm(along, axis=1, keepdims=True) @ _TURN
+    weight = (by_knot @ by_seen).tocsr()
+    weight.eliminate_zeros()
+    weight.sort_indices()
+    # No vertex hangs on more than four neighbouring knots.
+    begin = np.minimum(weight.indices[weight.indptr[:-1]], max(len(seen) - 4, 0))
+    begins, group = np.unique(begin, return_inverse=True)
+    column = np.minimum(begin[:, None] + np.arange(4), len(seen) - 1)
+    share = weight[np.arange(len(vertex_m))[:, None], column].toarray()
+    share[:, 1:][column[:, 1:] == column[:, :-1]] = 0.0
+    joint = solution.corner_covariance(
+        own[rows][seen][np.minimum(begins[:, None] + np.arange(4), len(seen) - 1)]
+    )
+    by_corner = (share[:, :, None] * left[:, None]).reshape(len(share), 8)
+    variance = np.einsum("vi,vij,vj->v", by_corner, joint[group], by_corner) * max(1.0, solution.chi2_per_dof)
+    return replace(lane, points_map=points_map, sigma_m=np.sqrt(variance))
+
+
+def _between(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
+    """Weights (M, N) of N rising places at M wanted ones: linear between them, the end's beyond."""
+    number = np.interp(wanted_m, at_m, np.arange(len(at_m)))
+    low = np.minimum(number.astype(np.int64), max(len(at_m) - 2, 0))
+    high = np.minimum(low + 1, len(at_m) - 1)
+    row = np.tile(np.arange(len(wanted_m)), 2)
+    value = np.concatenate([1 - (number - low), number - low])
+    return csr_array((value, (row, np.concatenate([low, high]))), shape=(len(wanted_m), len(at_m)))
+
+
+def _catmull_rom(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
+    """Weights (M, N) of N knots, evenly spaced, at M places along a Catmull-Rom spline through them."""
+    last = len(at_m) - 1
+    number = wanted_m / (at_m[1] - at_m[0])
+    low = np.clip(number.astype(np.int64), 0, last - 1)
+    t = number - low
+    value = 0.5 * np.array(
+        [-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2]
+    )
+    knot = low + np.arange(-1, 3)[:, None]
+    # Beyond its ends a spline goes on straight: P_-1 = 2 P_0 - P_1.
+    value[1] += np.where(knot[0] < 0, 2 * value[0], 0.0)
+    value[2] += np.where(knot[3] > last, 2 * value[3], 0.0) - np.where(knot[0] < 0, value[0], 0.0)
+    value[1] -= np.where(knot[3] > last, value[3], 0.0)
+    value[0, knot[0] < 0] = value[3, knot[3] > last] = 0.0
+    row = np.broadcast_to(np.arange(len(wanted_m)), knot.shape)
+    column = np.clip(knot, 0, last)
+    return csr_array((value.ravel(), (row.ravel(), column.ravel())), shape=(len(wanted_m), len(at_m)))
