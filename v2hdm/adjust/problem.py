@@ -43,6 +43,9 @@ _LINE_RATIO = 1e3
 LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
 """Squared trace over determinant of a covariance from which an observation is one of a line."""
 
+_ROUNDED = 1e-12
+"""Share of an information below which what another axis has left of it is rounding."""
+
 READ_OUT_SIGMA_S = 0.03
 """How far a read-out time may be from the stated one, s: a global shutter's is 0, that of CMOS cameras in
 phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
@@ -123,7 +126,8 @@ class ControlPoints:
         xx, yy = one * t[:, 0] ** 2 + other * t[:, 1] ** 2, one * t[:, 1] ** 2 + other * t[:, 0] ** 2
         c = np.sqrt(yy)
         b = np.where(c > 0, (one - other) * t[:, 0] * t[:, 1] / np.where(c > 0, c, 1.0), 0.0)
-        return np.column_stack([np.sqrt(np.maximum(xx - b**2, 0.0)), b, c])
+        left = xx - b**2
+        return np.column_stack([np.sqrt(np.where(left > _ROUNDED * xx, left, 0.0)), b, c])
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from v2hdm.adjust import (
     Solution,
     SolveOptions,
     Verdict,
+    line_variance_factor,
     solve,
     with_model,
 )
@@ -183,9 +184,11 @@ def solve_bundle(
     rig: Rig,
     cameras: Mapping[str, Camera],
     model: Model,
-    knots: Knots | None = None,
+    lanes: tuple[Knots, FloatArray] | None = None,
 ) -> Bundle:
-    """Estimate extrinsics, poses and the corners of all groups together.
+    """Estimate extrinsics, poses and the corners of all groups together, with ``lanes`` if there are any.
+
+    These are knots and where the corners of the groups are about: rays to a knot meet nowhere in particular.
 
     ``usable`` (S, 4) are the corners, in the sightings' own order, that may be used. The extrinsics start
     from those of ``rig``, the poses always from the recorded ones.
@@ -199,6 +202,7 @@ def solve_bundle(
             "no marking was seen in two images, so nothing can be optimised; drive past the markings "
             "at a lower speed or raise the image rate."
         )
+    knots, corners_start = lanes or (None, None)
     camera, frame = sightings.camera[row], sightings.frame[row]
     if knots is not None:
         camera, frame = np.append(camera, knots.camera), np.append(frame, knots.frame)
@@ -226,12 +230,15 @@ def solve_bundle(
         held = knots.held(first)
         axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
         control = held if control is None else _joined(replace(control, along=axes), held)
-    problem = replace(problem, lengths=lengths, control=control)
+        corners_start = np.concatenate([corners_start, held.points_map])
+    problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
     lane_factor = model.lane_factor
     if knots is not None:
         solution, of_lanes = _of_markings(solution, len(row))
-        lane_factor *= _variance_factor(of_lanes, knots.count)
+        # Lines have their share in what observations take of the poses' own degrees of freedom.
+        of_poses = 2 * solution.cost_terms["frame_states"] / (len(of_lanes) + 2 * len(row))
+        lane_factor *= line_variance_factor(of_lanes, knots.count / max(len(of_lanes), 1) + of_poses)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
     cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
     map_from_vehicle[used.frames] = solution.map_from_vehicle
@@ -252,12 +259,6 @@ def _of_markings(solution: Solution, count: int) -> tuple[Solution, FloatArray]:
     squared = solution.mahalanobis2
     own = {name: getattr(solution, name)[:count] for name in ("residual_px", "mahalanobis2", "verdict")}
     return replace(solution, **own), squared[count:]
-
-
-def _variance_factor(squared: FloatArray, unknowns: int) -> float:
-    """How many times as large as stated the variance of lines is, by the median of squared residuals (K,)."""
-    spare = max(1 - unknowns / len(squared), 0.1)
-    return float(np.clip(np.median(squared) / (2 * np.log(2) * spare), *VARIANCE_FACTORS))
 
 
 _Rows = TypeVar("_Rows", Observations, ControlPoints)

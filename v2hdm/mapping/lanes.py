@@ -158,6 +158,7 @@ class _Course:
 
     def along(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
         """Unit directions (N, 2) there."""
+        at_m = np.clip(at_m, 0.0, self.length_m[lane])
         ahead, behind = (self.at(lane, at_m + sign * _SPACING_M / 2) for sign in (1, -1))
         return np.asarray((ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True))
 

@@ -70,6 +70,9 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 _GROUND_ROUNDS = 6
 """Solves under better and better cross-sections, at most: four are enough for a crown of 4 %."""
 
+_LANE_ROUNDS = 3
+"""Solves with lanes: the stated variance of their points may be thirty times as large as the true one."""
+
 _SETTLED_SLOPE = 5e-4  # change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path
 
 
@@ -150,8 +153,8 @@ class Optimiser:
         knots = find_knots(final.rig, self.cross_section)
         if knots is not None and knots.count:
             progress("lanes")
-            # Twice: how well lines are seen, only their residuals say.
-            for _ in range(2):
+            # By turns: how well lines are seen, only their residuals say.
+            for _ in range(_LANE_ROUNDS):
                 final = self._solve_with_lanes(final, usable, knots)
         return conclude(
             Evidence(self.sightings, self._views, self._cameras, final, bundle, inlier, usable),
@@ -304,7 +307,8 @@ class Optimiser:
         """The solve of ``bundle`` with ``knots`` of lanes, as certain as its residuals say they are seen."""
         model = replace(bundle.model, lane_factor=bundle.lane_factor)
         groups, cameras = bundle.association, self._cameras
-        return _sound(solve_bundle(self.sightings, groups, usable, bundle.rig, cameras, model, knots))
+        lanes = knots, bundle.solution.corners_map[: int(bundle.corner_index.max()) + 1]
+        return _sound(solve_bundle(self.sightings, groups, usable, bundle.rig, cameras, model, lanes))
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
