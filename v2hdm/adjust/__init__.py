@@ -25,6 +25,6 @@ from v2hdm.adjust.validation import Verdict, line_variance_factor
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
     "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise", "height_step",
-    "line_variance_factor", "observability", "pose_innovations", "predicts_better", "score_faults", "select_model",
-    "sigmas_of", "solve", "with_model",
+    "line_variance_factor", "observability", "pose_innovations", "predicts_better", "score_faults",
+    "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

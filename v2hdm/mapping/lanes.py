@@ -9,6 +9,7 @@ holds it along the line. All else is as with corners: elimination, robust loss a
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,13 +24,14 @@ from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
     OWN_SIGMA_M,
-    PaintPoints,
+    LaneCloud,
     collect_lane_points,
     ground_by_rig,
-    paint_points,
 )
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
+
+_log = logging.getLogger(__name__)
 
 _SPACING_M = 2.0
 """Distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle."""
@@ -37,9 +39,7 @@ _SPACING_M = 2.0
 _HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
 _OPEN_END_PX = 1000.0  # sigma along the line of where an image shows it: anywhere
 _SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
-_SAME_DIRECTION = np.cos(
-    np.deg2rad(20.0)
-)  # cosine from which a point is of a line: of a crossing one it is not
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
 
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 """Directions (N, 2) times it are turned to their left."""
@@ -78,14 +78,8 @@ class Knots:
 
     def observations(self, first: int, variance_factor: float) -> Observations:
         """As observations of corners from number ``first``; cameras and frames are those of the rig."""
-        return Observations(
-            self.camera,
-            self.frame,
-            first + self.knot,
-            self.pinhole_px,
-            variance_factor * self.covariance_px,
-            self.row_share,
-        )
+        at, covariance_px = first + self.knot, variance_factor * self.covariance_px
+        return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
 
     def held(self, first: int) -> ControlPoints:
         """The prior that keeps the corners from number ``first`` from moving along their lines."""
@@ -103,26 +97,27 @@ def find_knots(
     options: LaneOptions,
 ) -> Knots | None:
     """Knots along the lanes that a drive shows under ``rig``, which is over ``cameras``; None without any."""
-    ground = ground_by_rig(drive, cameras, rig, section)
-    paint = paint_points(drive, detections, ground, options.max_range_m)
-    cloud = collect_lane_points(
-        drive, detections, ground, options.max_range_m, drive.pose_noise.roll_pitch_rad
-    )
+    ground, jitter_rad = ground_by_rig(drive, cameras, rig, section), drive.pose_noise.roll_pitch_rad
+    cloud = collect_lane_points(drive, detections, ground, options.max_range_m, jitter_rad)
     lanes = map_lanes(cloud, options)
-    if paint is None or not lanes:
+    if not lanes:
         return None
     course = _Course.of(lanes)
     lane, at_m = course.stations()
-    points_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    point, knot = _pairs(paint, course, lane, at_m, options.half_width_m)
-    image, at, pinhole_px, covariance_px, row_share = _passing(paint, point, knot, course, lane, at_m)
+    places = course.at(lane, at_m), course.along(lane, at_m)
+    image, at, *seen = _passing(cloud, *places, *_pairs(cloud, course, lane, at_m, options.half_width_m))
     enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
     unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
+    alone = np.flatnonzero(np.bincount(lane[enough], minlength=len(lanes)) == 0)
+    if len(alone):
+        _log.warning(
+            "%d of %d lane lines take no part in the adjustment, the first at (%.1f, %.1f): too few images "
+            "show any one place of them; drive past once more, or lower mapping.lanes.min_images",
+            len(alone), len(lanes), *lanes[alone[0]].points_map[0],
+        )  # fmt: skip
     camera = np.array([list(cameras).index(i.camera) if i.camera in cameras else -1 for i in drive.images])
-    frame = frames_of(drive).frame_of_image
-    at, image = unknown[at[kept]], image[kept]
-    seen = camera[image], frame[image], at, pinhole_px[kept], covariance_px[kept], row_share[kept]
-    return Knots(lanes, lane, at_m, points_map, along, unknown, *seen)
+    index = camera[image], frames_of(drive).frame_of_image[image], unknown[at]
+    return Knots(lanes, lane, at_m, *places, unknown, *(one[kept] for one in (*index, *seen)))
 
 
 @dataclass(frozen=True)
@@ -169,48 +164,47 @@ def _arc_m(points_map: FloatArray) -> FloatArray:
 
 
 def _pairs(
-    paint: PaintPoints, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
-) -> tuple[IntArray, IntArray]:
-    """Points and the knots that they tell of: points of the nearest line, at most half a spacing away."""
+    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Points (P,) and knots that they tell of: of the nearest line, at most half a spacing away.
+
+    Lastly how far ahead of its knot each lies, and how far to the left of its lane there, m.
+    """
     knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
     reach_m = float(np.hypot(_SPACING_M / 2, half_width_m))
-    near = cKDTree(paint.points_map).sparse_distance_matrix(
-        cKDTree(knots_map), reach_m, output_type="coo_matrix"
+    near = cKDTree(cloud.points_map).sparse_distance_matrix(
+        cKDTree(knots_map), reach_m, output_type="ndarray"
     )
-    point, knot = near.row.astype(np.int64), near.col.astype(np.int64)
-    ahead_m, off_m = _beside(paint, point, knot, course, lane, at_m)
-    same = np.abs((paint.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
-    fits = np.flatnonzero(same & (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= half_width_m))
-    order = fits[np.lexsort((np.abs(off_m[fits]), point[fits]))]
-    first = np.unique(point[order], return_index=True)[1]
-    return point[order][first], knot[order][first]
-
-
-def _beside(
-    paint: PaintPoints, point: IntArray, knot: IntArray, course: _Course, lane: IntArray, at_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """How far ahead of a knot points lie (P,), m, and how far to the left of its lane there (P,)."""
-    lane, at_m = lane[knot], at_m[knot]
-    points_map = paint.points_map[point]
-    ahead_m = ((points_map - course.at(lane, at_m)) * course.along(lane, at_m)).sum(axis=1)
-    left = course.along(lane, at_m + ahead_m) @ _TURN
-    return ahead_m, ((points_map - course.at(lane, at_m + ahead_m)) * left).sum(axis=1)
+    point, knot = near["i"].astype(np.int64), near["j"].astype(np.int64)
+    points_map = cloud.points_map[point]
+    ahead_m = ((points_map - knots_map[knot]) * along[knot]).sum(axis=1)
+    here = lane[knot], at_m[knot] + ahead_m
+    off_m = ((points_map - course.at(*here)) * (course.along(*here) @ _TURN)).sum(axis=1)
+    fits = np.abs((cloud.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
+    fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= half_width_m)
+    order = np.lexsort((np.abs(off_m), ~fits, point))
+    best = order[np.unique(point[order], return_index=True)[1]]
+    best = best[fits[best]]
+    return point[best], knot[best], ahead_m[best], off_m[best]
 
 
 def _passing(
-    paint: PaintPoints, point: IntArray, knot: IntArray, course: _Course, lane: IntArray, at_m: FloatArray
+    cloud: LaneCloud,
+    knots_map: FloatArray,
+    along: FloatArray,
+    point: IntArray,
+    knot: IntArray,
+    ahead_m: FloatArray,
+    off_m: FloatArray,
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
     """Where images show lines pass knots: image, knot, pinhole pixel, its covariance and row share.
 
     A line through the points of a piece, as turned as they are, gives how far to the left of the lane it is.
     Their errors are taken for one, since neighbouring cells of the network err alike.
     """
-    ahead_m, off_m = _beside(paint, point, knot, course, lane, at_m)
-    groups, own = np.unique(np.column_stack([paint.image[point], knot]), axis=0, return_inverse=True)
-    image, at = groups.T
-    own = own.ravel()
-    left = course.along(lane[knot], at_m[knot]) @ _TURN
-    across = np.einsum("pi,pij->pj", left, paint.jacobian[point])
+    groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
+    (image, at), own = groups.T, own.ravel()
+    across = np.einsum("pi,pij->pj", along[knot] @ _TURN, cloud.jacobian[point])
     weight = 1 / ((CENTRE_SIGMA_PX * across) ** 2).sum(axis=1)
 
     def total(values: FloatArray) -> FloatArray:
@@ -221,10 +215,10 @@ def _passing(
     left_m, loss = (xx * y - x * xy) / (w * xx - x**2), w * xx / (w * xx - x**2)
     order = np.lexsort((np.abs(ahead_m), own))
     nearest = point[order][np.unique(own[order], return_index=True)[1]]
-    along = course.along(lane[at], at_m[at])
-    left, px_by_map = along @ _TURN, np.linalg.inv(paint.jacobian[nearest])
-    shown_map = course.at(lane[at], at_m[at]) + left_m[:, None] * left
-    off_px = (px_by_map @ (shown_map - paint.points_map[nearest])[..., None])[..., 0]
+    along, px_by_map = along[at], np.linalg.inv(cloud.jacobian[nearest])
+    left = along @ _TURN
+    shown_map = knots_map[at] + left_m[:, None] * left
+    off_px = (px_by_map @ (shown_map - cloud.points_map[nearest])[..., None])[..., 0]
     line = (px_by_map @ along[..., None])[..., 0]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     normal = line @ _TURN
@@ -232,7 +226,7 @@ def _passing(
     variance = loss * (CENTRE_SIGMA_PX**2 + own_px**2)
     covariance_px = variance[:, None, None] * normal[:, :, None] * normal[:, None]
     covariance_px += _OPEN_END_PX**2 * line[:, :, None] * line[:, None]
-    return image, at, paint.points_px[nearest] + off_px, covariance_px, paint.row_share[nearest]
+    return image, at, cloud.points_px[nearest] + off_px, covariance_px, cloud.row_share[nearest]
 
 
 def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane, ...]:
@@ -310,11 +304,12 @@ def _catmull_rom(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
         [-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2]
     )
     knot = low + np.arange(-1, 3)[:, None]
-    # Beyond its ends a spline goes on straight: P_-1 = 2 P_0 - P_1.
-    value[1] += np.where(knot[0] < 0, 2 * value[0], 0.0)
-    value[2] += np.where(knot[3] > last, 2 * value[3], 0.0) - np.where(knot[0] < 0, value[0], 0.0)
-    value[1] -= np.where(knot[3] > last, value[3], 0.0)
-    value[0, knot[0] < 0] = value[3, knot[3] > last] = 0.0
+    # Beyond an end it goes on as bent as there, P_-1 = 3 P_0 - 3 P_1 + P_2; straight where there are but two.
+    beyond = np.array([3.0, -3.0, 1.0] if last > 1 else [2.0, -1.0, 0.0])
+    before, after = knot[0] < 0, knot[3] > last
+    value[1:, before] += beyond[:, None] * value[0, before]
+    value[2::-1, after] += beyond[:, None] * value[3, after]
+    value[0, before], value[3, after] = 0.0, 0.0
     row = np.broadcast_to(np.arange(len(wanted_m)), knot.shape)
     column = np.clip(knot, 0, last)
     return csr_array((value.ravel(), (row.ravel(), column.ravel())), shape=(len(wanted_m), len(at_m)))

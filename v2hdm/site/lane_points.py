@@ -60,7 +60,8 @@ class LaneCloud:
 
     ``points_map`` (P, 2) m, unit ``tangent`` (P, 2) of either sense, ``weight`` (P,) = 1 / variance
     across the line in 1 / m^2, ``image`` (P,) that a point was seen in, ``dash`` (P,) whether its
-    detection was a dash; beside them the ``guides``.
+    detection was a dash; beside them the ``guides``. Images show them at pinhole pixels ``points_px`` (P, 2)
+    and row shares (P,); ``jacobian`` (P, 2, 2) is that of a point by its pixel.
     """
 
     points_map: FloatArray
@@ -69,25 +70,9 @@ class LaneCloud:
     image: IntArray
     dash: BoolArray
     guides: Guides = field(default_factory=Guides)
-
-
-@dataclass(frozen=True)
-class PaintPoints:
-    """P points of detected pieces of lane paint, in images and on the ground.
-
-    ``image`` (P,), ``dash`` (P,) whether the piece is one, ``points_px`` (P, 2) pinhole pixels of the plane,
-    ``row_share`` (P,), ``points_map`` (P, 2), their ``jacobian`` (P, 2, 2) by the pixel, the ``ray`` (P, 2)
-    from below the camera and the unit ``tangent`` (P, 2) of the piece.
-    """
-
-    image: IntArray
-    dash: BoolArray
-    points_px: FloatArray
-    row_share: FloatArray
-    points_map: FloatArray
-    jacobian: FloatArray
-    ray: FloatArray
-    tangent: FloatArray
+    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    row_share: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
 
 Flattening = Callable[[IntArray, FloatArray], FloatArray]
@@ -195,36 +180,29 @@ def collect_lane_points(
     ``jitter_rad`` of viewing direction goes into the weights, so that near points count for more.
     """
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
-    paint = paint_points(drive, detections, ground, max_range_m)
-    if paint is None:
-        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
-        return LaneCloud(*empty, guides)
-    covariance = CENTRE_SIGMA_PX**2 * paint.jacobian @ np.swapaxes(paint.jacobian, 1, 2)
-    height_m = np.maximum(ground.centre_map[paint.image, 2], LEAST_HEIGHT_M)
-    covariance += direction_covariance(paint.ray, height_m, jitter_rad)
-    normal = paint.tangent @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    weight = 1.0 / (np.einsum("pi,pij,pj->p", normal, covariance, normal) + OWN_SIGMA_M**2)
-    return LaneCloud(paint.points_map, paint.tangent, weight, paint.image, paint.dash, guides)
-
-
-def paint_points(
-    drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, max_range_m: float
-) -> PaintPoints | None:
-    """The points of all pieces, up to ``max_range_m``, of images that ``ground`` covers; None without any."""
     lanes = _lanes(detections, ground, whole=False)
     if not lanes:
-        return None
+        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
+        return LaneCloud(*empty, guides)
     piece, image, points_px, row_share = _points(drive, lanes)
     points_px = ground.flattened_px(image, points_px)
-    points_map, jacobian = ground_points_with_jacobian(ground.map_from_pinhole_px[image], points_px[:, None])
+    homographies = ground.map_from_pinhole_px[image]
+    points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
     points_map, jacobian = ground.at_rows(points_map[:, 0], image, row_share), jacobian[:, 0]
-    tangent, ray = _tangents(points_map, piece), points_map - ground.centre_map[image, :2]
-    dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
-    every = (image, dash, points_px, row_share, points_map, jacobian, ray, tangent)
+    tangent = _tangents(points_map, piece)
+    centre = ground.centre_map[image]
+    ray = points_map - centre[:, :2]
+    covariance = CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
+    covariance += direction_covariance(ray, np.maximum(centre[:, 2], LEAST_HEIGHT_M), jitter_rad)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    variance = np.einsum("pi,pij,pj->p", normal, covariance, normal)
     with np.errstate(invalid="ignore"):
         keep = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
-    keep &= np.isfinite(jacobian).all(axis=(1, 2))
-    return PaintPoints(*(one[keep] for one in every))
+        keep &= np.isfinite(variance)
+    dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
+    weight = 1.0 / (variance[keep] + OWN_SIGMA_M**2)
+    own = points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides
+    return LaneCloud(*own, points_px[keep], row_share[keep], jacobian[keep])
 
 
 def _lanes(
