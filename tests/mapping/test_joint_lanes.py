@@ -59,7 +59,7 @@ def test_lanes_leave_the_markings_and_what_is_said_of_them_as_they_were(solved):
 
 def test_the_stated_variance_of_lines_is_corrected_by_what_they_show(solved):
     """The scene's points are off by half a pixel each, and five of them make an observation."""
-    assert 0.01 < solved[1].bundle.lane_factor < 0.15
+    assert 0.01 < solved[1].bundle.knots.variance_factor < 0.15
 
 
 def test_lane_vertices_are_as_far_off_as_their_sigmas_say(highway, solved):

@@ -80,8 +80,7 @@ VARIANCE_FACTORS = (0.05, 20.0)
 class Model:
     """The unknowns of a solve, and its noise beyond that of the corners.
 
-    ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``; what
-    was seen of lanes has a ``lane_factor`` of its own.
+    ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``.
     ``sizes`` and ``survey`` are stated by the user; ``clock_sigma_s`` is the prior of clock offsets,
     ``pose_sigma`` that of each visit's poses.
     """
@@ -93,7 +92,6 @@ class Model:
     sizes: SizeOptions = field(default_factory=SizeOptions)
     survey: SurveyOptions = field(default_factory=SurveyOptions)
     clock_sigma_s: float = Problem.clock_sigma_s
-    lane_factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -105,8 +103,7 @@ class Bundle:
     ``corner_index`` (G, 4) finds a corner in the solution, -1 where it had fewer than two observations.
     ``camera_index`` maps camera names to rows of the solution's extrinsics, ``frames`` (J,) are those of its
     poses. Lanes, if they took part, are the problem's last corners and observations, in the order of
-    ``knots``; what the solution says of single observations is of the markings alone, and by it the variances
-    of what was seen of lanes are ``lane_factor`` times those stated.
+    ``knots``; what the solution says of single observations is of the markings alone.
     """
 
     rig: Rig
@@ -121,7 +118,11 @@ class Bundle:
     camera_index: Mapping[str, int]
     frames: IntArray
     knots: Knots | None = None
-    lane_factor: float = 1.0
+
+    @property
+    def markings_map(self) -> FloatArray:
+        """The corners (N, 2) of the solution that are of markings."""
+        return self.solution.corners_map[: int(self.corner_index.max(initial=-1)) + 1]
 
     @property
     def corners_map(self) -> FloatArray:
@@ -188,7 +189,7 @@ def solve_bundle(
 ) -> Bundle:
     """Estimate extrinsics, poses and the corners of all groups together, with ``lanes`` if there are any.
 
-    These are knots and where the corners of the groups are about: rays to a knot meet nowhere in particular.
+    These are knots, and where the groups' corners are about: rays to a knot meet nowhere in particular.
 
     ``usable`` (S, 4) are the corners, in the sightings' own order, that may be used. The extrinsics start
     from those of ``rig``, the poses always from the recorded ones.
@@ -221,7 +222,7 @@ def solve_bundle(
     )
     first = int(corner_index.max(initial=-1)) + 1
     if knots is not None:
-        observations = _joined(observations, knots.observations(first, model.lane_factor))
+        observations = _joined(observations, knots.observations(first))
     observations = replace(observations, camera=used.camera, frame=used.frame)
     names = [sightings.cameras[c] for c in used.cameras]
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
@@ -233,12 +234,13 @@ def solve_bundle(
         corners_start = np.concatenate([corners_start, held.points_map])
     problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
-    lane_factor = model.lane_factor
     if knots is not None:
-        solution, of_lanes = _of_markings(solution, len(row))
+        own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
+        squared, solution = solution.mahalanobis2[len(row) :], replace(solution, **own)
         # Lines have their share in what observations take of the poses' own degrees of freedom.
-        of_poses = 2 * solution.cost_terms["frame_states"] / (len(of_lanes) + 2 * len(row))
-        lane_factor *= line_variance_factor(of_lanes, knots.count / max(len(of_lanes), 1) + of_poses)
+        of_poses = 2 * solution.cost_terms["frame_states"] / (len(squared) + 2 * len(row))
+        factor = line_variance_factor(squared, knots.count / len(squared) + of_poses)
+        knots = replace(knots, variance_factor=knots.variance_factor * factor)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
     cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
     map_from_vehicle[used.frames] = solution.map_from_vehicle
@@ -250,17 +252,11 @@ def solve_bundle(
     index = {n: c for c, n in enumerate(names)}
     return Bundle(
         adjusted, model, problem, solution, association, row, group, corner, corner_index, index, used.frames,
-        knots, lane_factor,
+        knots,
     )  # fmt: skip
 
 
-def _of_markings(solution: Solution, count: int) -> tuple[Solution, FloatArray]:
-    """The solution with the first ``count`` observations only, and the squared residuals of the others."""
-    squared = solution.mahalanobis2
-    own = {name: getattr(solution, name)[:count] for name in ("residual_px", "mahalanobis2", "verdict")}
-    return replace(solution, **own), squared[count:]
-
-
+_OF_OBSERVATIONS = "residual_px", "mahalanobis2", "verdict"
 _Rows = TypeVar("_Rows", Observations, ControlPoints)
 
 

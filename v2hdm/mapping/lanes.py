@@ -56,6 +56,7 @@ class Knots:
         unknown: (N,) its number among those that enough images show, -1 where they do not.
         camera, frame, knot: (K,) of each observation; ``knot`` counts those with a number.
         pinhole_px, covariance_px, row_share: (K, 2), (K, 2, 2) and (K,) of it.
+        variance_factor: what its covariance is to be multiplied by, as residuals say.
     """
 
     lanes: tuple[Lane, ...]
@@ -70,15 +71,16 @@ class Knots:
     pinhole_px: FloatArray
     covariance_px: FloatArray
     row_share: FloatArray
+    variance_factor: float = 1.0
 
     @property
     def count(self) -> int:
         """Knots that are unknowns of the adjustment."""
         return int(self.unknown.max(initial=-1)) + 1
 
-    def observations(self, first: int, variance_factor: float) -> Observations:
+    def observations(self, first: int) -> Observations:
         """As observations of corners from number ``first``; cameras and frames are those of the rig."""
-        at, covariance_px = first + self.knot, variance_factor * self.covariance_px
+        at, covariance_px = first + self.knot, self.variance_factor * self.covariance_px
         return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
 
     def held(self, first: int) -> ControlPoints:
@@ -235,53 +237,38 @@ def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane
     The first corner of ``solution`` that is a knot follows those of the markings. Where no image shows the
     line, as between dashes, it keeps its course beside the knots around.
     """
-    first = len(solution.corners_map) - knots.count
-    own = first + knots.unknown
-    seen = knots.unknown >= 0
-    moved_m = np.zeros(len(own))
-    left = knots.along @ _TURN
-    moved_m[seen] = ((solution.corners_map[own[seen]] - knots.points_map[seen]) * left[seen]).sum(axis=1)
-    lanes = []
-    for number, lane in enumerate(knots.lanes):
-        rows = np.flatnonzero(knots.lane == number)
-        lanes.append(_drawn(lane, knots, rows, moved_m, own, solution, spacing_m))
-    return tuple(lanes)
+    return tuple(
+        _drawn(lane, knots, np.flatnonzero(knots.lane == number), solution, spacing_m)
+        for number, lane in enumerate(knots.lanes)
+    )
 
 
-def _drawn(
-    lane: Lane,
-    knots: Knots,
-    rows: IntArray,
-    moved_m: FloatArray,
-    own: IntArray,
-    solution: Solution,
-    spacing_m: float,
-) -> Lane:
+def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing_m: float) -> Lane:
+    """One lane, whose knots are those at ``rows``; as it is where none of them is an unknown."""
     seen = np.flatnonzero(knots.unknown[rows] >= 0)
     if not len(seen):
         return lane
-    at_m = knots.at_m[rows]
+    corner = len(solution.corners_map) - knots.count + knots.unknown[rows[seen]]
+    at_m, points_map, left = knots.at_m[rows], knots.points_map[rows], knots.along[rows] @ _TURN
     vertex_m = np.linspace(0.0, at_m[-1], max(round(float(at_m[-1]) / spacing_m), 1) + 1)
     by_knot, by_seen = _catmull_rom(at_m, vertex_m), _between(at_m[seen], at_m)
-    left = knots.along[rows] @ _TURN
-    points_map = by_knot @ (knots.points_map[rows] + (by_seen @ moved_m[rows][seen])[:, None] * left)
-    along = np.gradient(points_map, axis=0)
+    moved_m = ((solution.corners_map[corner] - points_map[seen]) * left[seen]).sum(axis=1)
+    drawn_map = by_knot @ (points_map + (by_seen @ moved_m)[:, None] * left)
+    along = np.gradient(drawn_map, axis=0)
     left = along / np.linalg.norm(along, axis=1, keepdims=True) @ _TURN
+    # No vertex hangs on more than four neighbouring knots: their joint covariances give those of all.
     weight = (by_knot @ by_seen).tocsr()
-    weight.eliminate_zeros()
     weight.sort_indices()
-    # No vertex hangs on more than four neighbouring knots.
     begin = np.minimum(weight.indices[weight.indptr[:-1]], max(len(seen) - 4, 0))
     begins, group = np.unique(begin, return_inverse=True)
-    column = np.minimum(begin[:, None] + np.arange(4), len(seen) - 1)
-    share = weight[np.arange(len(vertex_m))[:, None], column].toarray()
-    share[:, 1:][column[:, 1:] == column[:, :-1]] = 0.0
-    joint = solution.corner_covariance(
-        own[rows][seen][np.minimum(begins[:, None] + np.arange(4), len(seen) - 1)]
+    window = np.minimum(begins[:, None] + np.arange(4), len(seen) - 1)
+    share = weight[np.arange(len(vertex_m))[:, None], window[group]].toarray()
+    share[:, len(seen) :] = 0.0
+    by_corner = (share[:, :, None] * left[:, None]).reshape(-1, 8)
+    joint = solution.corner_covariance(corner[window])[group] * max(1.0, solution.chi2_per_dof)
+    return replace(
+        lane, points_map=drawn_map, sigma_m=np.sqrt(np.einsum("vi,vij,vj->v", by_corner, joint, by_corner))
     )
-    by_corner = (share[:, :, None] * left[:, None]).reshape(len(share), 8)
-    variance = np.einsum("vi,vij,vj->v", by_corner, joint[group], by_corner) * max(1.0, solution.chi2_per_dof)
-    return replace(lane, points_map=points_map, sigma_m=np.sqrt(variance))
 
 
 def _between(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:

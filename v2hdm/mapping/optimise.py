@@ -155,7 +155,8 @@ class Optimiser:
             progress("lanes")
             # By turns: how well lines are seen, only their residuals say.
             for _ in range(_LANE_ROUNDS):
-                final = self._solve_with_lanes(final, usable, knots)
+                lanes = final.knots or knots, final.markings_map
+                final = self._solve(final.association, usable, final.rig, lanes=lanes)
         return conclude(
             Evidence(self.sightings, self._views, self._cameras, final, bundle, inlier, usable),
             self.initial_rig,
@@ -294,21 +295,25 @@ class Optimiser:
             steep = located.valid & (sine >= threshold)
         return self._solve(tracks, steep, self.initial_rig, coarse=True)
 
-    def _solve(self, association: Association, usable: BoolArray, rig: Rig, coarse: bool = False) -> Bundle:
+    def _solve(
+        self,
+        association: Association,
+        usable: BoolArray,
+        rig: Rig,
+        coarse: bool = False,
+        lanes: tuple[Knots, FloatArray] | None = None,
+    ) -> Bundle:
         noises, options = self._noise_of_visits, self._options
         model = (
             coarse_model(rig, noises, options)
             if coarse
             else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
-        return _sound(solve_bundle(self.sightings, association, usable, rig, self._cameras, model))
-
-    def _solve_with_lanes(self, bundle: Bundle, usable: BoolArray, knots: Knots) -> Bundle:
-        """The solve of ``bundle`` with ``knots`` of lanes, as certain as its residuals say they are seen."""
-        model = replace(bundle.model, lane_factor=bundle.lane_factor)
-        groups, cameras = bundle.association, self._cameras
-        lanes = knots, bundle.solution.corners_map[: int(bundle.corner_index.max()) + 1]
-        return _sound(solve_bundle(self.sightings, groups, usable, bundle.rig, cameras, model, lanes))
+        bundle = solve_bundle(self.sightings, association, usable, rig, self._cameras, model, lanes)
+        status = bundle.solution.status
+        if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
+            raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
+        return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
@@ -355,14 +360,6 @@ class Optimiser:
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
-
-
-def _sound(bundle: Bundle) -> Bundle:
-    """The bundle, if its solve came to an end; raises MappingError."""
-    status = bundle.solution.status
-    if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
-        raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
-    return bundle
 
 
 def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
