@@ -31,6 +31,7 @@ def mounting_of(optimised: Optimised, scene: Scene) -> tuple[FloatArray, FloatAr
     rotation = true[:3, :3]
     turn = rotation.T @ found.cam_from_vehicle[:3, :3]
     covariance = found.covariance
+    assert covariance is not None
     height = found.centre_vehicle[2] + (rotation.T @ true[:3, 3])[2]
     turns = rotation.T @ covariance[3:, 3:] @ rotation
     up = rotation.T @ covariance[:3, :3] @ rotation
@@ -54,8 +55,8 @@ def main() -> None:
         settled = inputs.optimiser.settle(inputs.tracks)
         for name in ("after", "joint"):
             began = time.process_time()
-            find = {"find_knots": inputs.find_knots} if name == JOINT else {}
-            done = inputs.optimiser.finish(settled, **find)
+            find = inputs.find_knots if name == JOINT else lambda rig, section: None
+            done = inputs.optimiser.finish(settled, find_knots=find)
             error, sigma = mounting_of(done, scene)
             spent, said = time.process_time() - began, f"errors {np.round(unit * error, 2)}"
             print(f"seed {seed} {name}: {said}, sigmas {np.round(unit * sigma, 2)}, {spent:.1f} s")
@@ -65,6 +66,7 @@ def main() -> None:
 
 def _print_lanes(done: Optimised, made: SceneOptions) -> None:
     """How far solid lines are off, and how often within 1.96 sigmas."""
+    assert done.bundle.knots is not None
     lanes = draw_lanes(done.bundle.knots, done.bundle.solution, 0.5)
     off, sigma = [], []
     for lane in lanes:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -106,8 +107,9 @@ def find_knots(
         return None
     course = _Course.of(lanes)
     lane, at_m = course.stations()
-    places = course.at(lane, at_m), course.along(lane, at_m)
-    image, at, *seen = _passing(cloud, *places, *_pairs(cloud, course, lane, at_m, options.half_width_m))
+    points_map, along = course.at(lane, at_m), course.along(lane, at_m)
+    pairs = _pairs(cloud, course, lane, at_m, options.half_width_m)
+    image, at, *shown = _passing(cloud, points_map, along, *pairs)
     enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
     unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
     alone = np.flatnonzero(np.bincount(lane[enough], minlength=len(lanes)) == 0)
@@ -119,7 +121,8 @@ def find_knots(
         )  # fmt: skip
     camera = np.array([list(cameras).index(i.camera) if i.camera in cameras else -1 for i in drive.images])
     index = camera[image], frames_of(drive).frame_of_image[image], unknown[at]
-    return Knots(lanes, lane, at_m, *places, unknown, *(one[kept] for one in (*index, *seen)))
+    seen: list[Any] = [one[kept] for one in (*index, *shown)]
+    return Knots(lanes, lane, at_m, points_map, along, unknown, *seen)
 
 
 @dataclass(frozen=True)
