@@ -352,7 +352,9 @@ class Symbol:
 class Lane:
     """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
 
-    ``heights_m`` (N,) and ``id`` are as a :class:`Marking` has them.
+    ``sigma_m`` (N,) is the standard deviation of each vertex across the line, of extrinsics and poses too,
+    None where lanes take no part in the adjustment. ``heights_m`` (N,) and ``id`` are as a :class:`Marking`
+    has them.
     """
 
     kind: str
@@ -360,6 +362,7 @@ class Lane:
     sightings: int
     heights_m: FloatArray | None = None
     id: int | None = None
+    sigma_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)

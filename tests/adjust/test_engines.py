@@ -38,7 +38,10 @@ def example(*, lengths=True, frames=40, seed=3):
     second = np.concatenate([diamonds + 1, diamonds + 2, diamonds[:3] + 3])
     known = KnownLengths(first, second, np.full(len(first), 0.5), np.full(len(first), 0.004))
     control = ControlPoints(
-        np.array([3, 17]), scene.corners_map[[3, 17]] + 0.01, np.array([[0.02, 0.03], [0.05, 0.01]])
+        np.array([3, 17, 9]),
+        scene.corners_map[[3, 17, 9]] + 0.01,
+        np.array([[0.02, 0.03], [0.05, 0.01], [0.01, np.inf]]),
+        np.array([[1.0, 0.0], [0.6, 0.8], [-0.8, 0.6]]),
     )
     return replace(
         problem,

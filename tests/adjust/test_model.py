@@ -23,7 +23,10 @@ def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14, cloc
     scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
     twist = np.tile([5.0, 0.1, 0.0, 0.0, 0.0, 0.4], (frames, 1)) * np.linspace(0.8, 1.2, frames)[:, None]
     control = ControlPoints(
-        np.array([2, 5]), scene.corners_map[[2, 5]] + 0.01, np.array([[0.01, 0.02], [0.02, 0.005]])
+        np.array([2, 5]),
+        scene.corners_map[[2, 5]] + 0.01,
+        np.array([[0.01, np.inf], [0.02, 0.005]]),
+        np.array([[0.8, 0.6], [1.0, 0.0]]),
     )
     lengths = KnownLengths(np.array([0, 7, 6]), np.array([1, 4, 7]), np.full(3, 0.5), np.full(3, 0.01))
     problem = replace(scene.problem, twist_vehicle=twist, control=control, lengths=lengths)
@@ -101,6 +104,16 @@ def test_behind_the_camera_the_residual_grows_on_and_leads_back_to_the_front():
     assert bool((residual[:, 0].diff() > 0).all())
     (slope,) = torch.autograd.grad(residual[:, 0].sum(), points)
     assert bool((slope[:, 2] < 0).all())
+
+
+def test_a_corner_that_a_survey_holds_in_one_direction_is_free_across_it():
+    arrays, estimate = example(())
+    corners = estimate.corners_map.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda moved: model.control_residual(arrays, moved), corners)
+    across = torch.zeros_like(estimate.corners_map)
+    across[arrays.corner_order == 2] = torch.tensor([-0.6, 0.8], dtype=torch.float64)
+    moved = model.control_residual(arrays, estimate.corners_map + across)
+    torch.testing.assert_close(moved, model.control_residual(arrays, estimate.corners_map))
 
 
 @pytest.mark.parametrize("apart_m", [30.0, 1e-3])

@@ -20,11 +20,11 @@ from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_step, sco
 from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.validation import Verdict
+from v2hdm.adjust.validation import Verdict, line_variance_factor
 
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
     "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise", "height_step",
-    "observability", "pose_innovations", "predicts_better", "score_faults", "select_model", "sigmas_of",
-    "solve", "with_model",
+    "line_variance_factor", "observability", "pose_innovations", "predicts_better", "score_faults",
+    "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

@@ -91,8 +91,8 @@ class Arrays:
         clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offsets; Q is the number of visits,
             or 0 where no offset is estimated, and one more where the read-out time is: the last.
         clock_information_root: (Q,) 1 / sigma of each.
-        control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N, 2), 0 where
-            there is no survey.
+        control, control_root: surveyed positions (N, 2) of the corners and a, b, c (N, 3) as those of
+            ``root_information``, 0 where there is no survey.
         lengths: known distances between corners.
         camera_prior: what earlier markings say of the cameras, None if nothing.
         frame_of_moment: (M,) the frame of each moment, None where frames are moments themselves.
@@ -116,7 +116,7 @@ class Arrays:
     clock_twist: Tensor
     clock_information_root: Tensor
     control: Tensor
-    control_information: Tensor
+    control_root: Tensor
     lengths: Lengths
     camera_prior: CameraQuadratic | None = None
     frame_of_moment: Tensor | None = None
@@ -259,7 +259,7 @@ class Arrays:
             measured=self.measured[:, keep],
             root_information=self.root_information[:, keep],
             control=self.control[corners],
-            control_information=self.control_information[corners],
+            control_root=self.control_root[corners],
             lengths=Lengths(
                 first[both], second[both], self.lengths.length_m[both], self.lengths.information_root[both]
             ),

@@ -137,10 +137,10 @@ def make_arrays(
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
     if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
         centre, centre_root = problem.centre_vehicle, 1 / problem.centre_sigma_m
-    control, control_information = np.zeros((2, problem.corner_count, 2))
+    control, control_root = np.zeros((problem.corner_count, 2)), np.zeros((problem.corner_count, 3))
     if problem.control is not None:
         control[problem.control.corner] = problem.control.points_map
-        control_information[problem.control.corner] = 1 / problem.control.sigma_m**2
+        control_root[problem.control.corner] = problem.control.root_information
     clock_twist, sigma_s = _clock_twist(problem, clock_offset)
     moments: IntArray | None = None
     motion: FloatArray | None = None
@@ -173,7 +173,7 @@ def make_arrays(
         clock_twist=real(clock_twist),
         clock_information_root=1 / real(np.array(sigma_s, dtype=np.float64)),
         control=real(control[corner_order]),
-        control_information=real(control_information[corner_order]),
+        control_root=real(control_root[corner_order]),
         lengths=Lengths(
             index(rank[known.first]), index(rank[known.second]), real(known.length_m), real(1 / known.sigma_m)
         ),

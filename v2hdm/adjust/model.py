@@ -11,6 +11,9 @@ which is the paper's for s = 0 and q = 0. Beyond it, frames have states s (what 
 some of it drifting) and cameras clock offsets q (images are late, and the vehicle moves with the twist v).
 A rolling shutter reads the first row r / 2 before the image's stamp and the last r / 2 after it: for q_c
 there stands q_c + r_c rho_k, with rho_k from -1/2 to 1/2 by the row of the observation.
+A lane is a spline through knots, which are points l as corners are, seen as a line that passes them: of
+:math:`\Sigma_k^{-1/2}` but the row across the line is left. A knot moves across its lane alone, since
+t'(l - l0) along it is held at zero.
 The cost is half the sum of all squares, where a robust loss takes the squares of the observations.
 
 Tangents are (translation, rotation), as kornia's ``Se3`` has them, and act from the left: exp(x) T.
@@ -181,8 +184,10 @@ def clock_residual(arrays: Arrays, clock_s: Tensor) -> Tensor:
 
 
 def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
-    """Corners (N, 2) against what a survey measured."""
-    return (corners_map - arrays.control) * arrays.control_information.sqrt()
+    """Corners (N, 2) against what a survey measured; knots of lanes do not wander along their line."""
+    x, y = (corners_map - arrays.control).unbind(1)
+    a, b, c = arrays.control_root.unbind(1)
+    return torch.stack([a * x, b * x + c * y], dim=1)
 
 
 def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:

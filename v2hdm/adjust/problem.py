@@ -43,6 +43,9 @@ _LINE_RATIO = 1e3
 LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
 """Squared trace over determinant of a covariance from which an observation is one of a line."""
 
+_ROUNDED = 1e-12
+"""Share of an information below which what another axis has left of it is rounding."""
+
 READ_OUT_SIGMA_S = 0.03
 """How far a read-out time may be from the stated one, s: a global shutter's is 0, that of CMOS cameras in
 phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
@@ -99,11 +102,32 @@ class Drift:
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2)."""
+    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2).
+
+    Sigmas are those of x and y or, where directions ``along`` (M, 2) are given, along and across these;
+    an infinite one says nothing.
+    """
 
     corner: IntArray
     points_map: FloatArray
     sigma_m: FloatArray
+    along: FloatArray | None = None
+
+    def take(self, rows: IntArray | BoolArray, corner: IntArray) -> ControlPoints:
+        """Those at ``rows``, of corners that are now called ``corner``."""
+        along = None if self.along is None else self.along[rows]
+        return ControlPoints(corner, self.points_map[rows], self.sigma_m[rows], along)
+
+    @property
+    def root_information(self) -> FloatArray:
+        """a, b, c (M, 3) of the whitened residuals (a dx, b dx + c dy)."""
+        t = np.array([[1.0, 0.0]]) if self.along is None else self.along
+        one, other = (1 / self.sigma_m**2).T
+        xx, yy = one * t[:, 0] ** 2 + other * t[:, 1] ** 2, one * t[:, 1] ** 2 + other * t[:, 0] ** 2
+        c = np.sqrt(yy)
+        b = np.where(c > 0, (one - other) * t[:, 0] * t[:, 1] / np.where(c > 0, c, 1.0), 0.0)
+        left = xx - b**2
+        return np.column_stack([np.sqrt(np.where(left > _ROUNDED * xx, left, 0.0)), b, c])
 
 
 @dataclass(frozen=True)

@@ -487,7 +487,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
                 yield _Hypothesis(Fault.SURVEY, partial(_survey, camera, axis), camera, axis)
             if arrays.camera_count > 1:
                 yield _Hypothesis(Fault.LEVER, partial(_survey, -1, axis), -1, axis)
-    if bool((arrays.control_information > 0).any()):
+    if bool((arrays.control_root > 0).any()):
         for axis in (0, 1):
             yield _Hypothesis(Fault.DATUM, partial(_datum, axis), axis=axis)
     for item, length_m in enumerate(torch.unique(arrays.lengths.length_m)):
@@ -692,7 +692,7 @@ def _survey(camera: int, axis: int, bench: _Bench) -> Rows:
 
 def _datum(axis: int, bench: _Bench) -> Rows:
     out = torch.zeros_like(bench.arrays.control)
-    out[:, axis] = -bench.arrays.control_information[:, axis].sqrt()
+    out[:, axis:] = -bench.arrays.control_root[:, 2 * axis : 2 + axis]
     return {"control_points": out}
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
+from v2hdm.adjust.problem import KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
 from v2hdm.errors import AdjustError
@@ -38,7 +38,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     if control is not None:
         left = np.isin(control.corner, corners)
         number = np.searchsorted(corners, control.corner[left])
-        control = ControlPoints(number, control.points_map[left], control.sigma_m[left])
+        control = control.take(left, number)
     lengths = problem.lengths
     if lengths is not None:
         left = np.isin(lengths.first, corners) & np.isin(lengths.second, corners)

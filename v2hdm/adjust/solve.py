@@ -135,7 +135,7 @@ def _report(
         mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
     scale = noise_scale(mahalanobis2)
     of_priors = 2 * sum(cost for name, cost in cost_terms.items() if name != "observations")
-    held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_information > 0).sum())
+    held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_root[:, ::2] > 0).sum())
     free = 2 * arrays.corner_count + 6 * arrays.camera_count - held - len(arrays.lengths.first)
     variance = variance_factors(mahalanobis2, of_priors, free, scale)
     corners_map = np.empty(estimate.corners_map.shape)

@@ -44,6 +44,19 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
+def line_variance_factor(squared: FloatArray, taken: float) -> float:
+    """How many times as large as stated the variance of lines is, by the median.
+
+    Args:
+        squared: (K,) squared residuals of lines, :func:`as_of_point`.
+        taken: share of their degrees of freedom that unknowns take.
+    """
+    if not len(squared):
+        return 1.0
+    of_line = float(chi2.isf(np.exp(-np.median(squared) / 2), 1))
+    return of_line / float(chi2.median(1)) / max(1 - taken, 0.1)
+
+
 def classify(
     observations: Observations,
     mahalanobis2: FloatArray,

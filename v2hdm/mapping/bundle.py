@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from v2hdm.adjust import (
     Solution,
     SolveOptions,
     Verdict,
+    line_variance_factor,
     solve,
     with_model,
 )
@@ -29,6 +31,7 @@ from v2hdm.association.groups import Association, fuse_groups, group_kinds, know
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
+from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
@@ -98,7 +101,9 @@ class Bundle:
     ``rig`` holds the adjusted extrinsics and poses, ``model`` is what was solved for. Observation k is
     corner ``corner`` (K,) of group ``group`` (K,), seen at ``row`` (K,) of the sightings.
     ``corner_index`` (G, 4) finds a corner in the solution, -1 where it had fewer than two observations.
-    ``camera_index`` maps camera names to rows of the solution's extrinsics.
+    ``camera_index`` maps camera names to rows of the solution's extrinsics, ``frames`` (J,) are those of its
+    poses. Lanes, if they took part, are the problem's last corners and observations, in the order of
+    ``knots``; what the solution says of single observations is of the markings alone.
     """
 
     rig: Rig
@@ -111,6 +116,13 @@ class Bundle:
     corner: IntArray
     corner_index: IntArray
     camera_index: Mapping[str, int]
+    frames: IntArray
+    knots: Knots | None = None
+
+    @property
+    def markings_map(self) -> FloatArray:
+        """The corners (N, 2) of the solution that are of markings."""
+        return self.solution.corners_map[: int(self.corner_index.max(initial=-1)) + 1]
 
     @property
     def corners_map(self) -> FloatArray:
@@ -173,8 +185,11 @@ def solve_bundle(
     rig: Rig,
     cameras: Mapping[str, Camera],
     model: Model,
+    lanes: tuple[Knots, FloatArray] | None = None,
 ) -> Bundle:
-    """Estimate extrinsics, poses and the corners of all groups together.
+    """Estimate extrinsics, poses and the corners of all groups together, with ``lanes`` if there are any.
+
+    These are knots, and where the groups' corners are about: rays to a knot meet nowhere in particular.
 
     ``usable`` (S, 4) are the corners, in the sightings' own order, that may be used. The extrinsics start
     from those of ``rig``, the poses always from the recorded ones.
@@ -188,27 +203,44 @@ def solve_bundle(
             "no marking was seen in two images, so nothing can be optimised; drive past the markings "
             "at a lower speed or raise the image rate."
         )
-    used = _Used(
-        *np.unique(sightings.camera[row], return_inverse=True),
-        *np.unique(sightings.frame[row], return_inverse=True),
-    )
+    knots, corners_start = lanes or (None, None)
+    camera, frame = sightings.camera[row], sightings.frame[row]
+    if knots is not None:
+        camera, frame = np.append(camera, knots.camera), np.append(frame, knots.frame)
+    used = _Used(*np.unique(camera, return_inverse=True), *np.unique(frame, return_inverse=True))
     own_corner = association.corner_order()[row, corner]
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
     covariance_px[on_line] = line_only(covariance_px[on_line], _OPEN_END_PX)
     observations = Observations(
-        camera=used.camera.astype(np.int64),
-        frame=used.frame.astype(np.int64),
+        camera=sightings.camera[row],
+        frame=sightings.frame[row],
         corner=corner_index[group, corner],
         pinhole_px=sightings.corners_pinhole_px[row, own_corner],
         covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
         row_share=sightings.row_share[row, own_corner],
     )
+    first = int(corner_index.max(initial=-1)) + 1
+    if knots is not None:
+        observations = _joined(observations, knots.observations(first))
+    observations = replace(observations, camera=used.camera, frame=used.frame)
     names = [sightings.cameras[c] for c in used.cameras]
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
     problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
-    problem = replace(problem, lengths=lengths, control=control)
+    if knots is not None:
+        held = knots.held(first)
+        axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
+        control = held if control is None else _joined(replace(control, along=axes), held)
+        corners_start = np.concatenate([corners_start, held.points_map])
+    problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
+    if knots is not None:
+        own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
+        squared, solution = solution.mahalanobis2[len(row) :], replace(solution, **own)
+        # Lines have their share in what observations take of the poses' own degrees of freedom.
+        of_poses = 2 * solution.cost_terms["frame_states"] / (len(squared) + 2 * len(row))
+        factor = line_variance_factor(squared, knots.count / len(squared) + of_poses)
+        knots = replace(knots, variance_factor=knots.variance_factor * factor)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
     cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
     map_from_vehicle[used.frames] = solution.map_from_vehicle
@@ -218,7 +250,20 @@ def solve_bundle(
         read_out_s[used.cameras] = solution.read_out_s
         adjusted = replace(adjusted, read_out_s=read_out_s)
     index = {n: c for c, n in enumerate(names)}
-    return Bundle(adjusted, model, problem, solution, association, row, group, corner, corner_index, index)
+    return Bundle(
+        adjusted, model, problem, solution, association, row, group, corner, corner_index, index, used.frames,
+        knots,
+    )  # fmt: skip
+
+
+_OF_OBSERVATIONS = "residual_px", "mahalanobis2", "verdict"
+_Rows = TypeVar("_Rows", Observations, ControlPoints)
+
+
+def _joined(one: _Rows, other: _Rows) -> _Rows:
+    """The rows of one, then those of the other."""
+    pairs = zip(vars(one).values(), vars(other).values(), strict=True)
+    return type(one)(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)

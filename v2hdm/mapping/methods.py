@@ -26,6 +26,7 @@ from v2hdm.geometry.quadrilateral import is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.lanes import draw_lanes
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
@@ -45,7 +46,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     """The poses of all frames of the drive."""
     drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
     sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
-    used = np.unique(sightings.frame[bundle.row])
+    used = bundle.frames
     if bundle.model.solver.pose_states:
         inflation = max(1.0, bundle.solution.chi2_per_dof)
         sigma[used] = np.sqrt(bundle.solution.covariance.poses() * inflation)
@@ -311,7 +312,10 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         )  # fmt: skip
     known = observability(bundle.problem, solution)
     section = inputs.optimiser.cross_section
-    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, section))
+    if bundle.knots is not None:
+        lanes = draw_lanes(bundle.knots, solution, options.lanes.node_spacing_m)
+    else:
+        lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, section))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
     odds = options.acceptance.min_probability
     seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad

@@ -50,6 +50,7 @@ from v2hdm.mapping.bundle import (
 )
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
+from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import AUTO, CROSS_SECTION, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, largest_noise
 
@@ -67,6 +68,9 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 
 _GROUND_ROUNDS = 6
 """Solves under better and better cross-sections, at most: four are enough for a crown of 4 %."""
+
+_LANE_ROUNDS = 3
+"""Solves with lanes: the stated variance of their points may be thirty times as large as the true one."""
 
 _SETTLED_SLOPE = 5e-4  # change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path
 
@@ -127,8 +131,16 @@ class Optimiser:
         progress("noise of the poses")
         return self._weigh_poses(bundle)
 
-    def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
-        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
+    def finish(
+        self,
+        bundle: Bundle,
+        progress: Callable[[str], None] = silent,
+        find_knots: Callable[[Rig, CrossSection | None], Knots | None] = lambda rig, section: None,
+    ) -> Optimised:
+        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude.
+
+        ``find_knots`` gives the knots of lanes that take part, by what is known of the rig without them.
+        """
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -136,6 +148,13 @@ class Optimiser:
         inlier, usable = bundle.inliers, np.zeros_like(self.sightings.valid)
         usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         final = self._solve(bundle.association, usable, bundle.rig)
+        knots = find_knots(final.rig, self.cross_section)
+        if knots is not None and knots.count:
+            progress("lanes")
+            # By turns: how well lines are seen, only their residuals say.
+            for _ in range(_LANE_ROUNDS):
+                lanes = final.knots or knots, final.markings_map
+                final = self._solve(final.association, usable, final.rig, lanes=lanes)
         return conclude(
             Evidence(self.sightings, self._views, self._cameras, final, bundle, inlier, usable),
             self.initial_rig,
@@ -272,14 +291,21 @@ class Optimiser:
             steep = located.valid & (sine >= threshold)
         return self._solve(tracks, steep, self.initial_rig, coarse=True)
 
-    def _solve(self, association: Association, usable: BoolArray, rig: Rig, coarse: bool = False) -> Bundle:
+    def _solve(
+        self,
+        association: Association,
+        usable: BoolArray,
+        rig: Rig,
+        coarse: bool = False,
+        lanes: tuple[Knots, FloatArray] | None = None,
+    ) -> Bundle:
         noises, options = self._noise_of_visits, self._options
         model = (
             coarse_model(rig, noises, options)
             if coarse
             else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
-        bundle = solve_bundle(self.sightings, association, usable, rig, self._cameras, model)
+        bundle = solve_bundle(self.sightings, association, usable, rig, self._cameras, model, lanes)
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from v2hdm.association.options import AssociationOptions
 from v2hdm.errors import ConfigError
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
-from v2hdm.site.options import AcceptanceOptions, LaneOptions
+from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
 
 BATCH = "batch"
 INCREMENTAL = "incremental"
@@ -169,6 +169,8 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
         if value not in allowed:
             which = " or ".join(allowed) if len(allowed) == 2 else f"from {', '.join(allowed)}"
             raise ConfigError(f"mapping.{key} is '{value}'; choose {which}.")
+    if options.lanes.model not in (AFTER, JOINT):
+        raise ConfigError(f"mapping.lanes.model is '{options.lanes.model}'; choose {AFTER} or {JOINT}.")
     check_settings(options, _RANGES, "mapping.")
     _check_sizes(options, kinds)
     _check_survey(options)

@@ -16,20 +16,23 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faults
+from v2hdm.association.cross_section import CrossSection
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
-from v2hdm.association.sightings import Sightings, collect_sightings
+from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.foreign import foreign_stretch
+from v2hdm.mapping.lanes import Knots, find_knots
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, CROSS_SECTION, INCREMENTAL, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.stated import name_of
 from v2hdm.records import Drive, FloatArray, ImageDetections
+from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
@@ -133,6 +136,13 @@ class Inputs:
         views = views_of(drive, self.cameras)
         return Optimiser(self.sightings, views, drive.cameras, drive.noises, options)
 
+    def find_knots(self, rig: Rig, section: CrossSection | None) -> Knots | None:
+        """The knots of the lanes that take part in the adjustment, found under ``rig``; None if none does."""
+        options = self.options.lanes
+        if options.model != JOINT:
+            return None
+        return find_knots(self.drive, self.detections, self.sightings.cameras, rig, section, options)
+
     @cached_property
     def tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
@@ -189,7 +199,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         )  # fmt: skip
         inputs = left
     # 4. Choose the pose model, solve without outliers and conclude.
-    optimised = optimiser.finish(settled, progress)
+    optimised = optimiser.finish(settled, progress, inputs.find_knots)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)

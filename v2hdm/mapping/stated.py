@@ -85,5 +85,5 @@ def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:
 
 def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list[str]:
     """The names of the control points that ``control`` makes no use of."""
-    used = set() if control is None else {name_of(survey, point) for point in control.points_map}
-    return [one.id for one in survey.control if one.id not in used]
+    used = set() if control is None else set(map(tuple, control.points_map.tolist()))
+    return [one.id for one in survey.control if tuple(one.position_map) not in used]

@@ -31,10 +31,10 @@ from v2hdm.records import (
 )
 from v2hdm.site.options import LaneOptions
 
-_CENTRE_SIGMA_PX = 1.0
+CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""
 
-_OWN_SIGMA_M = 0.01
+OWN_SIGMA_M = 0.01
 """Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
 
 _TANGENT_REACH = 2  # points to either side whose difference gives a point's direction
@@ -60,7 +60,8 @@ class LaneCloud:
 
     ``points_map`` (P, 2) m, unit ``tangent`` (P, 2) of either sense, ``weight`` (P,) = 1 / variance
     across the line in 1 / m^2, ``image`` (P,) that a point was seen in, ``dash`` (P,) whether its
-    detection was a dash; beside them the ``guides``.
+    detection was a dash; beside them the ``guides``. Images show them at pinhole pixels ``points_px`` (P, 2)
+    and row shares (P,); ``jacobian`` (P, 2, 2) is that of a point by its pixel.
     """
 
     points_map: FloatArray
@@ -69,6 +70,9 @@ class LaneCloud:
     image: IntArray
     dash: BoolArray
     guides: Guides = field(default_factory=Guides)
+    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    row_share: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
 
 Flattening = Callable[[IntArray, FloatArray], FloatArray]
@@ -188,7 +192,7 @@ def collect_lane_points(
     tangent = _tangents(points_map, piece)
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
-    covariance = _CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
+    covariance = CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
     covariance += direction_covariance(ray, np.maximum(centre[:, 2], LEAST_HEIGHT_M), jitter_rad)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     variance = np.einsum("pi,pij,pj->p", normal, covariance, normal)
@@ -196,8 +200,9 @@ def collect_lane_points(
         keep = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
         keep &= np.isfinite(variance)
     dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
-    weight = 1.0 / (variance[keep] + _OWN_SIGMA_M**2)
-    return LaneCloud(points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides)
+    weight = 1.0 / (variance[keep] + OWN_SIGMA_M**2)
+    own = points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides
+    return LaneCloud(*own, points_px[keep], row_share[keep], jacobian[keep])
 
 
 def _lanes(

@@ -22,10 +22,16 @@ class AcceptanceOptions:
     corrections: list[Correction] = field(default_factory=list)
 
 
+AFTER, JOINT = "after", "joint"
+"""Values of ``mapping.lanes.model``."""
+
+
 @dataclass(kw_only=True)
 class LaneOptions:
     """How lane paint becomes polylines.
 
+    ``model`` is ``after``: lanes are drawn under the finished adjustment; or ``joint``: they take part in it
+    as cubic splines, and each vertex states its sigma.
     ``max_range_m`` from the camera; ``node_spacing_m`` between the vertices of a polyline;
     ``half_width_m`` across and ``half_length_m`` along bound the neighbourhood that is averaged;
     ``max_dash_gap_m`` is the longest gap between two dashes of one line and ``max_break_m`` the
@@ -33,6 +39,7 @@ class LaneOptions:
     vertex, ``min_images``.
     """
 
+    model: str = AFTER
     max_range_m: float = 12.0
     node_spacing_m: float = 0.5
     half_width_m: float = 0.3

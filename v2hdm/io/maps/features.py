@@ -26,7 +26,8 @@ class Feature:
     ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one. A closed
     one is a marking of four corners unless it is a ``symbol``, of which ``place_sigma_m`` may be known.
     ``heights_m`` (N,) are those of the ground there in the map frame, None where it is the plane z = 0.
-    ``covariance_m2`` (2N, 2N) is that of the stacked points, None where it is not known.
+    ``covariance_m2`` (2N, 2N) is that of the stacked points, ``vertex_sigma_m`` (N,) how well a lane's
+    vertices are known across it; None where that is not known.
     """
 
     id: int
@@ -39,6 +40,7 @@ class Feature:
     relative_sigma_m: float | None = None
     symbol: bool = False
     place_sigma_m: float | None = None
+    vertex_sigma_m: FloatArray | None = None
 
     @property
     def key(self) -> str:
@@ -90,7 +92,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
         if isinstance(one, Symbol):
             points, more = one.outline_map, dict[str, Any](symbol=True, place_sigma_m=one.sigma_m)
         elif isinstance(one, Lane):
-            points, more = one.points_map, {}
+            points, more = one.points_map, {"vertex_sigma_m": one.sigma_m}
         else:
             sigma_m, points = one.relative_sigma_m, one.corners_map
             more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m}
@@ -111,7 +113,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
         elif one.closed:
             markings.append(Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number))
         else:
-            lanes.append(Lane(*own, one.heights_m, number))
+            lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
@@ -137,6 +139,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "sigma_m": feature.sigma_m,
         "covariance_m2": feature.covariance_m2,
         "relative_sigma_m": feature.relative_sigma_m,
+        "vertex_sigma_m": feature.vertex_sigma_m,
     }
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value

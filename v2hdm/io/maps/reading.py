@@ -185,9 +185,8 @@ def _believed(
             xyz = xyz[::-1]
         raised = np.abs(xyz[:, 2]).max(initial=0.0) > rounding[2]
         heights_m = xyz[:, 2] if raised else None
-        return replace(
-            stored, points_map=xyz[:, :2], heights_m=heights_m, covariance_m2=None, relative_sigma_m=None
-        )
+        drawn = replace(stored, points_map=xyz[:, :2], heights_m=heights_m, vertex_sigma_m=None)
+        return replace(drawn, covariance_m2=None, relative_sigma_m=None)
     drawn = stored.positions(origin)
     expected = np.zeros((len(positions), 3))
     expected[stored.ring, : drawn.shape[1]] = drawn
@@ -241,6 +240,9 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         relative_sigma_m=optional("relative_sigma_m", take_number),
         symbol=symbol,
         place_sigma_m=optional("sigma_m", take_number) if symbol else None,
+        vertex_sigma_m=None
+        if closed or not len(points)
+        else optional("vertex_sigma_m", take_array, (len(points),)),
     )
 
 

@@ -99,12 +99,13 @@ def add_corner_priors(
     """Add a unit's survey and known lengths to its gradient (2g,) and to ``costs[1]`` and ``costs[2]``."""
     first = layout.unit[u]
     for c in range(first, layout.unit[u + 1]):
-        along_x, along_y = layout.control_information[c, 0], layout.control_information[c, 1]
-        if along_x > 0:
-            dx, dy = corners[c, 0] - layout.control[c, 0], corners[c, 1] - layout.control[c, 1]
-            gradient[2 * (c - first)] += dx * along_x
-            gradient[2 * (c - first) + 1] += dy * along_y
-            costs[1] += (dx * dx * along_x + dy * dy * along_y) / 2
+        x, y = layout.control_root[c, 0], layout.control_root[c, 2]
+        if x > 0 or y > 0:
+            yx, dx = layout.control_root[c, 1], corners[c, 0] - layout.control[c, 0]
+            top, low = x * dx, yx * dx + y * (corners[c, 1] - layout.control[c, 1])
+            gradient[2 * (c - first)] += x * top + yx * low
+            gradient[2 * (c - first) + 1] += y * low
+            costs[1] += (top * top + low * low) / 2
     for m in range(layout.length_at[u], layout.length_at[u + 1]):
         residual, jx, jy = length_residual(layout, m, corners)
         a, b = 2 * (layout.length_first[m] - first), 2 * (layout.length_second[m] - first)

@@ -31,7 +31,7 @@ class Layout(NamedTuple):
         joint_at: (M,) where the factor of a unit of several corners begins among those of all.
         chunk: (Q + 1,) where each chunk's units begin.
         touched, touched_at: the pairs that chunks touch, ascending in each, and (Q + 1,) where they begin.
-        control, control_information: as in Arrays.
+        control, control_root: as in Arrays.
         length_at: (M + 1,) where each unit's known lengths begin.
         length_first, length_second, length_m, length_root: the lengths, sorted by unit.
         most_seen, most_joined: observations and corners of a unit, at most.
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
     touched: IntArray
     touched_at: IntArray
     control: FloatArray
-    control_information: FloatArray
+    control_root: FloatArray
     length_at: IntArray
     length_first: IntArray
     length_second: IntArray
@@ -85,7 +85,7 @@ def make_layout(arrays: Arrays) -> Layout:
         touched=np.concatenate(touched),
         touched_at=np.cumsum([0, *(len(part) for part in touched)]),
         control=arrays.control.numpy(),
-        control_information=arrays.control_information.numpy(),
+        control_root=arrays.control_root.numpy(),
         length_at=np.searchsorted(of_length[order], np.arange(len(joined) + 1)),
         length_first=known.first.numpy()[order],
         length_second=known.second.numpy()[order],

@@ -159,8 +159,9 @@ def linearise(
                             by_clock = clock[layout.pair[k], p * (each - 6) + v]
                             rows[i, column + 6 + v] += coupling[j, p] * by_clock
                             rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
-                block[i, i] = xx + layout.control_information[c, 0]
-                block[i + 1, i], block[i + 1, i + 1] = yx, yy + layout.control_information[c, 1]
+                a, b, d = layout.control_root[c, 0], layout.control_root[c, 1], layout.control_root[c, 2]
+                block[i, i] = xx + a * a + b * b
+                block[i + 1, i], block[i + 1, i + 1] = yx + b * d, yy + d * d
                 gradient[i], gradient[i + 1] = gx, gy
             add_corner_priors(layout, u, corners, gradient, out.costs[q])
             _add_lengths(layout, u, corners, block)

@@ -1,0 +1,150 @@
+"""Lanes that take part in the adjustment: knots on splines, seen as lines that pass them."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.highway import LINES, few_dashes, mounting_of
+from tests.mapping.scene import SceneOptions, make_scene
+from v2hdm.adjust import ControlPoints
+from v2hdm.errors import ConfigError
+from v2hdm.io.maps.features import features_of, map_of
+from v2hdm.mapping.lanes import _catmull_rom, draw_lanes, find_knots
+from v2hdm.mapping.optimise import Optimiser
+from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.recovery import Inputs
+from v2hdm.records import HdMap
+from v2hdm.site.options import JOINT, LaneOptions
+
+JOINTLY = MappingOptions(lanes=LaneOptions(model=JOINT))
+
+
+@pytest.fixture(scope="module")
+def highway():
+    """A straight road between two solid lines, with few dashes, and one camera."""
+    options = SceneOptions(seed=5, length_m=120.0, turns=False, dashes_only=True, lines=LINES)
+    return make_scene(replace(options, cameras=("front",)), few_dashes)
+
+
+@pytest.fixture(scope="module")
+def inputs(highway):
+    return Inputs(highway.drive, highway.detections, ("front",), JOINTLY)
+
+
+@pytest.fixture(scope="module")
+def solved(inputs):
+    """The same settled drive, concluded without lanes and with them."""
+    optimiser: Optimiser = inputs.optimiser
+    settled = optimiser.settle(inputs.tracks)
+    return optimiser.finish(settled), optimiser.finish(settled, find_knots=inputs.find_knots)
+
+
+def test_on_a_highway_lanes_make_yaw_and_pitch_much_surer(highway, solved):
+    (_, without), (error, joint) = (mounting_of(one, highway) for one in solved)
+    assert (joint[1:3] <= 0.6 * without[1:3]).all()
+    assert (joint <= without).all()
+    assert (np.abs(error) < 3 * joint).all()
+
+
+def test_lanes_leave_the_markings_and_what_is_said_of_them_as_they_were(solved):
+    without, joint = solved
+    assert len(joint.markings) == len(without.markings)
+    bundle = joint.bundle
+    assert len(bundle.solution.residual_px) == len(bundle.row) == len(bundle.solution.verdict)
+    assert bundle.corners_map.shape == without.bundle.corners_map.shape
+    assert 0.7 < bundle.solution.chi2_per_dof < 1.3
+
+
+def test_the_stated_variance_of_lines_is_corrected_by_what_they_show(solved):
+    """The scene's points are off by half a pixel each, and five of them make an observation."""
+    assert 0.01 < solved[1].bundle.knots.variance_factor < 0.15
+
+
+def test_lane_vertices_are_as_far_off_as_their_sigmas_say(highway, solved):
+    bundle = solved[1].bundle
+    lanes = draw_lanes(bundle.knots, bundle.solution, 0.5)
+    heading, off = 0.3, []
+    for lane in lanes:
+        assert lane.sigma_m is not None
+        assert lane.sigma_m.shape == (len(lane.points_map),)
+        if lane.kind == "lane_line":
+            lateral = lane.points_map @ [-np.sin(heading), np.cos(heading)]
+            off.append((lateral - LINES[int(lateral.mean() > 0)]) / lane.sigma_m)
+    assert len(off) == 2
+    assert np.abs(np.concatenate(off)).max() < 3
+
+
+def test_a_vertex_states_what_extrinsics_and_poses_leave_open(solved):
+    """All vertices of a line share the camera's own uncertainty: no sigma is below what is common to them."""
+    bundle = solved[1].bundle
+    camera_m = np.sqrt(bundle.solution.extrinsic_covariance[0, 0, 0])
+    sigmas = np.concatenate([lane.sigma_m for lane in draw_lanes(bundle.knots, bundle.solution, 0.5)])
+    assert sigmas.min() > 0.3 * camera_m
+
+
+def test_knots_move_across_their_line_only(solved):
+    knots, solution = solved[1].bundle.knots, solved[1].bundle.solution
+    seen = knots.unknown >= 0
+    moved = solution.corners_map[-knots.count :] - knots.points_map[seen]
+    assert np.abs((moved * knots.along[seen]).sum(axis=1)).max() < 1e-3
+    assert np.abs(moved).max() > 2e-3
+
+
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_a_spline_runs_through_its_knots_and_follows_lines_and_bends(count):
+    knots, wanted = 2.0 * np.arange(count), np.linspace(0, 2.0 * (count - 1), 23)
+    weight = _catmull_rom(knots, wanted).toarray()
+    np.testing.assert_allclose(weight.sum(axis=1), 1)
+    np.testing.assert_allclose(weight @ knots, wanted, atol=1e-12)
+    np.testing.assert_allclose(_catmull_rom(knots, knots).toarray(), np.eye(count), atol=1e-12)
+    if count > 2:
+        np.testing.assert_allclose(weight @ knots**2, wanted**2, atol=1e-10)
+
+
+def test_a_turn_of_eight_metres_is_followed_to_a_millimetre():
+    knots = np.arange(0, 20.0, 2.0)
+    circle = 8 * np.column_stack([np.sin(knots / 8), np.cos(knots / 8)])
+    radius = np.linalg.norm(_catmull_rom(knots, np.linspace(0, 18, 91)) @ circle, axis=1)
+    assert np.abs(radius - 8)[5:-5].max() < 1e-3
+    assert np.abs(radius - 8).max() < 4e-3
+
+
+def test_a_line_that_too_few_images_show_is_named_and_keeps_its_place(highway, inputs, solved, caplog):
+    options = replace(JOINTLY.lanes, min_images=1)
+    few = [one for one in highway.detections if one.image in (20, 21)]
+    rig = solved[0].bundle.rig
+    arguments = highway.drive, few, ("front",), rig, None
+    assert find_knots(*arguments, options).count
+    with caplog.at_level(logging.WARNING):
+        drawn_by_one = find_knots(highway.drive, few[:1], *arguments[2:], options)
+    assert "lane lines take no part in the adjustment" in caplog.text
+    assert not drawn_by_one.count
+    assert draw_lanes(drawn_by_one, solved[0].bundle.solution, 0.5) == drawn_by_one.lanes
+
+
+def test_a_drive_without_lane_paint_has_no_knots(highway, inputs, solved):
+    bare = [replace(one, lanes=()) for one in highway.detections]
+    assert find_knots(highway.drive, bare, ("front",), solved[0].bundle.rig, None, JOINTLY.lanes) is None
+
+
+def test_sigmas_survive_writing_and_reading_as_features(solved):
+    bundle = solved[1].bundle
+    lanes = draw_lanes(bundle.knots, bundle.solution, 0.5)
+    again = map_of(features_of(HdMap((), lanes)), range(1, len(lanes) + 1), None)
+    for one, other in zip(lanes, again.lanes, strict=True):
+        np.testing.assert_array_equal(one.sigma_m, other.sigma_m)
+
+
+def test_an_unknown_model_of_lanes_is_refused_by_name():
+    with pytest.raises(ConfigError, match=r"mapping\.lanes\.model is 'spline'; choose after or joint"):
+        check_options(MappingOptions(lanes=LaneOptions(model="spline")))
+
+
+@pytest.mark.parametrize("along", [[1.0, 0.0], [0.0, 1.0], [-0.6, 0.8], [1e-9, 1.0]])
+def test_a_survey_that_knows_one_direction_holds_a_corner_in_that_alone(along):
+    point = ControlPoints(np.zeros(1, int), np.zeros((1, 2)), np.array([[0.1, np.inf]]), np.array([along]))
+    ((a, b, c),) = point.root_information
+    root = np.array([[a, 0], [b, c]])
+    np.testing.assert_allclose(root.T @ root, 100 * np.outer(along, along), atol=1e-6)

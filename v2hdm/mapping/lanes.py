@@ -1,0 +1,305 @@
+"""Lanes in the adjustment: cubic splines whose knots are unknowns, seen as lines that pass them.
+
+A lane is a Catmull-Rom spline, which runs through its knots. So what an image shows of it is compared with it
+where it passes a knot: the points of a piece of paint about there give the place of one point of the line.
+That is an observation like that of a corner, but for its information, which has rank one: it says nothing of
+where along the line the point lies. Nor is that an unknown; a knot moves across its line only, since a prior
+holds it along the line. All else is as with corners: elimination, robust loss and covariance.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from v2hdm.adjust import ControlPoints, Observations, Solution
+from v2hdm.association.cross_section import CrossSection
+from v2hdm.association.sightings import Rig, frames_of
+from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
+from v2hdm.site.lane_points import (
+    CENTRE_SIGMA_PX,
+    OWN_SIGMA_M,
+    LaneCloud,
+    collect_lane_points,
+    ground_by_rig,
+)
+from v2hdm.site.lanes import map_lanes
+from v2hdm.site.options import LaneOptions
+
+_log = logging.getLogger(__name__)
+
+_SPACING_M = 2.0
+"""Distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle."""
+
+_HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
+_OPEN_END_PX = 1000.0  # sigma along the line of where an image shows it: anywhere
+_SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
+
+_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
+"""Directions (N, 2) times it are turned to their left."""
+
+
+@dataclass(frozen=True)
+class Knots:
+    """The knots of lanes, and where images show a line pass them.
+
+    Attributes:
+        lanes: as they were drawn under the adjustment without them.
+        lane, at_m, points_map, along: (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that
+            it lies, its place on it and the unit direction there.
+        unknown: (N,) its number among those that enough images show, -1 where they do not.
+        camera, frame, knot: (K,) of each observation; ``knot`` counts those with a number.
+        pinhole_px, covariance_px, row_share: (K, 2), (K, 2, 2) and (K,) of it.
+        variance_factor: what its covariance is to be multiplied by, as residuals say.
+    """
+
+    lanes: tuple[Lane, ...]
+    lane: IntArray
+    at_m: FloatArray
+    points_map: FloatArray
+    along: FloatArray
+    unknown: IntArray
+    camera: IntArray
+    frame: IntArray
+    knot: IntArray
+    pinhole_px: FloatArray
+    covariance_px: FloatArray
+    row_share: FloatArray
+    variance_factor: float = 1.0
+
+    @property
+    def count(self) -> int:
+        """Knots that are unknowns of the adjustment."""
+        return int(self.unknown.max(initial=-1)) + 1
+
+    def observations(self, first: int) -> Observations:
+        """As observations of corners from number ``first``; cameras and frames are those of the rig."""
+        at, covariance_px = first + self.knot, self.variance_factor * self.covariance_px
+        return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
+
+    def held(self, first: int) -> ControlPoints:
+        """The prior that keeps the corners from number ``first`` from moving along their lines."""
+        own = self.unknown >= 0
+        sigma_m = np.tile([_HELD_M, np.inf], (self.count, 1))
+        return ControlPoints(first + self.unknown[own], self.points_map[own], sigma_m, self.along[own])
+
+
+def find_knots(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    rig: Rig,
+    section: CrossSection | None,
+    options: LaneOptions,
+) -> Knots | None:
+    """Knots along the lanes that a drive shows under ``rig``, which is over ``cameras``; None without any."""
+    ground, jitter_rad = ground_by_rig(drive, cameras, rig, section), drive.pose_noise.roll_pitch_rad
+    cloud = collect_lane_points(drive, detections, ground, options.max_range_m, jitter_rad)
+    lanes = map_lanes(cloud, options)
+    if not lanes:
+        return None
+    course = _Course.of(lanes)
+    lane, at_m = course.stations()
+    points_map, along = course.at(lane, at_m), course.along(lane, at_m)
+    pairs = _pairs(cloud, course, lane, at_m, options.half_width_m)
+    image, at, *shown = _passing(cloud, points_map, along, *pairs)
+    enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
+    unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
+    alone = np.flatnonzero(np.bincount(lane[enough], minlength=len(lanes)) == 0)
+    if len(alone):
+        _log.warning(
+            "%d of %d lane lines take no part in the adjustment, the first at (%.1f, %.1f): too few images "
+            "show any one place of them; drive past once more, or lower mapping.lanes.min_images",
+            len(alone), len(lanes), *lanes[alone[0]].points_map[0],
+        )  # fmt: skip
+    camera = np.array([list(cameras).index(i.camera) if i.camera in cameras else -1 for i in drive.images])
+    index = camera[image], frames_of(drive).frame_of_image[image], unknown[at]
+    seen: list[Any] = [one[kept] for one in (*index, *shown)]
+    return Knots(lanes, lane, at_m, points_map, along, unknown, *seen)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Lanes as polylines by their length: ``arc_m`` (V,) of all vertices ``points_map`` (V, 2).
+
+    Lane l begins at ``begin_m[l]``, is ``length_m[l]`` long and a metre away from the next.
+    """
+
+    arc_m: FloatArray
+    points_map: FloatArray
+    begin_m: FloatArray
+    length_m: FloatArray
+
+    @classmethod
+    def of(cls, lanes: Sequence[Lane]) -> _Course:
+        arcs = [_arc_m(one.points_map) for one in lanes]
+        length_m = np.array([arc[-1] for arc in arcs])
+        begin_m = np.cumsum(length_m + 1.0) - length_m
+        arc_m = np.concatenate([arc + begin for arc, begin in zip(arcs, begin_m, strict=True)])
+        return cls(arc_m, np.concatenate([one.points_map for one in lanes]), begin_m, length_m)
+
+    def stations(self) -> tuple[IntArray, FloatArray]:
+        """The lane of each knot, and how far along it."""
+        count = np.maximum(np.round(self.length_m / _SPACING_M), 1).astype(np.int64) + 1
+        at_m = [np.linspace(0.0, length, n) for length, n in zip(self.length_m, count, strict=True)]
+        return np.repeat(np.arange(len(count)), count), np.concatenate(at_m)
+
+    def at(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
+        """The points (N, 2) of lanes (N,), as far along them (N,)."""
+        arc_m = self.begin_m[lane] + np.clip(at_m, 0.0, self.length_m[lane])
+        return np.column_stack([np.interp(arc_m, self.arc_m, axis) for axis in self.points_map.T])
+
+    def along(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
+        """Unit directions (N, 2) there."""
+        at_m = np.clip(at_m, 0.0, self.length_m[lane])
+        ahead, behind = (self.at(lane, at_m + sign * _SPACING_M / 2) for sign in (1, -1))
+        return np.asarray((ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True))
+
+
+def _arc_m(points_map: FloatArray) -> FloatArray:
+    """How far along a polyline each vertex (N,) lies."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_map, axis=0), axis=1))])
+
+
+def _pairs(
+    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Points (P,) and knots that they tell of: of the nearest line, at most half a spacing away.
+
+    Lastly how far ahead of its knot each lies, and how far to the left of its lane there, m.
+    """
+    knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
+    reach_m = float(np.hypot(_SPACING_M / 2, half_width_m))
+    near = cKDTree(cloud.points_map).sparse_distance_matrix(
+        cKDTree(knots_map), reach_m, output_type="ndarray"
+    )
+    point, knot = near["i"].astype(np.int64), near["j"].astype(np.int64)
+    points_map = cloud.points_map[point]
+    ahead_m = ((points_map - knots_map[knot]) * along[knot]).sum(axis=1)
+    here = lane[knot], at_m[knot] + ahead_m
+    off_m = ((points_map - course.at(*here)) * (course.along(*here) @ _TURN)).sum(axis=1)
+    fits = np.abs((cloud.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
+    fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= half_width_m)
+    order = np.lexsort((np.abs(off_m), ~fits, point))
+    best = order[np.unique(point[order], return_index=True)[1]]
+    best = best[fits[best]]
+    return point[best], knot[best], ahead_m[best], off_m[best]
+
+
+def _passing(
+    cloud: LaneCloud,
+    knots_map: FloatArray,
+    along: FloatArray,
+    point: IntArray,
+    knot: IntArray,
+    ahead_m: FloatArray,
+    off_m: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Where images show lines pass knots: image, knot, pinhole pixel, its covariance and row share.
+
+    A line through the points of a piece, as turned as they are, gives how far to the left of the lane it is.
+    Their errors are taken for one, since neighbouring cells of the network err alike.
+    """
+    groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
+    (image, at), own = groups.T, own.ravel()
+    across = np.einsum("pi,pij->pj", along[knot] @ _TURN, cloud.jacobian[point])
+    weight = 1 / ((CENTRE_SIGMA_PX * across) ** 2).sum(axis=1)
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.bincount(own, weight * values, len(groups)).astype(np.float64)
+
+    w, x, y, xy = (total(one) for one in (np.ones(len(own)), ahead_m, off_m, ahead_m * off_m))
+    xx = total(ahead_m**2) + _SLOPE_SIGMA**-2
+    left_m, loss = (xx * y - x * xy) / (w * xx - x**2), w * xx / (w * xx - x**2)
+    order = np.lexsort((np.abs(ahead_m), own))
+    nearest = point[order][np.unique(own[order], return_index=True)[1]]
+    along, px_by_map = along[at], np.linalg.inv(cloud.jacobian[nearest])
+    left = along @ _TURN
+    shown_map = knots_map[at] + left_m[:, None] * left
+    off_px = (px_by_map @ (shown_map - cloud.points_map[nearest])[..., None])[..., 0]
+    line = (px_by_map @ along[..., None])[..., 0]
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    normal = line @ _TURN
+    own_px = OWN_SIGMA_M * (normal * (px_by_map @ left[..., None])[..., 0]).sum(axis=1)
+    variance = loss * (CENTRE_SIGMA_PX**2 + own_px**2)
+    covariance_px = variance[:, None, None] * normal[:, :, None] * normal[:, None]
+    covariance_px += _OPEN_END_PX**2 * line[:, :, None] * line[:, None]
+    return image, at, cloud.points_px[nearest] + off_px, covariance_px, cloud.row_share[nearest]
+
+
+def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane, ...]:
+    """The lanes as splines through the adjusted knots, vertices about ``spacing_m`` apart with their sigmas.
+
+    The first corner of ``solution`` that is a knot follows those of the markings. Where no image shows the
+    line, as between dashes, it keeps its course beside the knots around.
+    """
+    return tuple(
+        _drawn(lane, knots, np.flatnonzero(knots.lane == number), solution, spacing_m)
+        for number, lane in enumerate(knots.lanes)
+    )
+
+
+def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing_m: float) -> Lane:
+    """One lane, whose knots are those at ``rows``; as it is where none of them is an unknown."""
+    seen = np.flatnonzero(knots.unknown[rows] >= 0)
+    if not len(seen):
+        return lane
+    corner = len(solution.corners_map) - knots.count + knots.unknown[rows[seen]]
+    at_m, points_map, left = knots.at_m[rows], knots.points_map[rows], knots.along[rows] @ _TURN
+    vertex_m = np.linspace(0.0, at_m[-1], max(round(float(at_m[-1]) / spacing_m), 1) + 1)
+    by_knot, by_seen = _catmull_rom(at_m, vertex_m), _between(at_m[seen], at_m)
+    moved_m = ((solution.corners_map[corner] - points_map[seen]) * left[seen]).sum(axis=1)
+    drawn_map = by_knot @ (points_map + (by_seen @ moved_m)[:, None] * left)
+    along = np.gradient(drawn_map, axis=0)
+    left = along / np.linalg.norm(along, axis=1, keepdims=True) @ _TURN
+    # No vertex hangs on more than four neighbouring knots: their joint covariances give those of all.
+    weight = (by_knot @ by_seen).tocsr()
+    weight.sort_indices()
+    begin = np.minimum(weight.indices[weight.indptr[:-1]], max(len(seen) - 4, 0))
+    begins, group = np.unique(begin, return_inverse=True)
+    window = np.minimum(begins[:, None] + np.arange(4), len(seen) - 1)
+    share = weight[np.arange(len(vertex_m))[:, None], window[group]].toarray()
+    share[:, len(seen) :] = 0.0
+    by_corner = (share[:, :, None] * left[:, None]).reshape(-1, 8)
+    joint = solution.corner_covariance(corner[window])[group] * max(1.0, solution.chi2_per_dof)
+    return replace(
+        lane, points_map=drawn_map, sigma_m=np.sqrt(np.einsum("vi,vij,vj->v", by_corner, joint, by_corner))
+    )
+
+
+def _between(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
+    """Weights (M, N) of N rising places at M wanted ones: linear between them, the end's beyond."""
+    number = np.interp(wanted_m, at_m, np.arange(len(at_m)))
+    low = np.minimum(number.astype(np.int64), max(len(at_m) - 2, 0))
+    high = np.minimum(low + 1, len(at_m) - 1)
+    row = np.tile(np.arange(len(wanted_m)), 2)
+    value = np.concatenate([1 - (number - low), number - low])
+    return csr_array((value, (row, np.concatenate([low, high]))), shape=(len(wanted_m), len(at_m)))
+
+
+def _catmull_rom(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
+    """Weights (M, N) of N knots, evenly spaced, at M places along a Catmull-Rom spline through them."""
+    last = len(at_m) - 1
+    number = wanted_m / (at_m[1] - at_m[0])
+    low = np.clip(number.astype(np.int64), 0, last - 1)
+    t = number - low
+    value = 0.5 * np.array(
+        [-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2]
+    )
+    knot = low + np.arange(-1, 3)[:, None]
+    # Beyond an end it goes on as bent as there, P_-1 = 3 P_0 - 3 P_1 + P_2; straight where there are but two.
+    beyond = np.array([3.0, -3.0, 1.0] if last > 1 else [2.0, -1.0, 0.0])
+    before, after = knot[0] < 0, knot[3] > last
+    value[1:, before] += beyond[:, None] * value[0, before]
+    value[2::-1, after] += beyond[:, None] * value[3, after]
+    value[0, before], value[3, after] = 0.0, 0.0
+    row = np.broadcast_to(np.arange(len(wanted_m)), knot.shape)
+    column = np.clip(knot, 0, last)
+    return csr_array((value.ravel(), (row.ravel(), column.ravel())), shape=(len(wanted_m), len(at_m)))
