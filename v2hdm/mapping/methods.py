@@ -312,17 +312,21 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
             len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
     known = observability(bundle.problem, solution)
-    section = inputs.optimiser.cross_section
-    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, section))
+    surface = inputs.optimiser.surface
+    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
     odds = options.acceptance.min_probability
     seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
     symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
+    if surface is not None:
+        # A spline has the recorded heights within it.
+        hd_map = with_heights(hd_map, None if surface.knots else drive.road, surface.height_m)
+        hd_map = replace(hd_map, ground=surface.strips() if surface.knots else ())
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=hd_map if section is None else with_heights(hd_map, drive.road, section.height_m),
+        hd_map=hd_map,
         calibrations=optimised.calibrations,
         excluded=(*optimised.excluded, *no_symbols),
         reprojection_rmse_px=optimised.reprojection_rmse_px,

@@ -26,7 +26,7 @@ from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.foreign import foreign_stretch
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import AUTO, CROSS_SECTION, INCREMENTAL, MappingOptions, SurveyOptions
+from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.stated import name_of
 from v2hdm.records import Drive, FloatArray, ImageDetections
@@ -106,7 +106,7 @@ _MOST_CORRECTIONS = 4
 
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
-"""Faults that bend what a plane looks like: one that a cross-section leaves is the likelier cause."""
+"""Faults that bend what a plane looks like: one that a surface leaves is the likelier cause."""
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
@@ -132,7 +132,9 @@ class Inputs:
         """Of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, self.executor)
+        return Optimiser(
+            self.sightings, views, drive.cameras, drive.noises, options, self.executor, drive.road
+        )
 
     @cached_property
     def tracks(self) -> Association:
@@ -163,15 +165,15 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     while True:
         # 1. Associate and solve, all at once or marking by marking; test the inputs against all else.
         settled, found, worst = _settled(inputs, progress)
-        # 2. Where the drive contradicts the plane, and a cross-section explains all of it, take that.
-        if inputs.options.ground == AUTO and any(_is_bent(one) for one in found):
-            curved = replace(inputs, options=replace(inputs.options, ground=CROSS_SECTION))
+        # 2. Where the drive contradicts the plane, and a surface explains all of it, take that.
+        if inputs.options.ground == AUTO and _is_bent(inputs, settled, found):
+            curved = replace(inputs, options=replace(inputs.options, ground=SURFACE))
             over, tests, rival = _settled(curved, progress)
             explained = rival is None or rival.fault not in _LIKE_GROUND
             is_curved = explained and curved.optimiser.is_curved(over)
             if is_curved:
                 inputs, settled, found, worst = curved, over, tests, rival
-            taken = "a cross-section" if is_curved else "a plane: no cross-section explains the drive"
+            taken = "a surface" if is_curved else "a plane: no surface explains the drive"
             _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the input that is contradicted most, if the drive can do without.
@@ -212,9 +214,11 @@ def _settled(
     return settled, found, next((one for one in found if is_contradicted(one)), None)
 
 
-def _is_bent(one: ScoreTest) -> bool:
-    """Whether the ground surely falls or rises beside the route, if only by as little as outliers leave."""
-    return one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS
+def _is_bent(inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest]) -> bool:
+    """Whether the ground surely falls or rises, if only by as little as outliers leave."""
+    if any(one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS for one in found):
+        return True
+    return inputs.optimiser.ground_gain(settled) > CONTRADICTED_SIGMAS**2 / 2
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
