@@ -50,7 +50,7 @@ from v2hdm.verdict.inputs.drive import causes, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
-from v2hdm.verdict.results.solution import check_solution
+from v2hdm.verdict.results.solution import check_solution, over_surface
 from v2hdm.workers import share_out
 
 CLEAN = "nothing"
@@ -150,7 +150,8 @@ def map_one(job: Job) -> Row:
     try:
         options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
         methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
-        findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
+        before = over_surface(findings_of_inputs(drive), list(methods.values())[-1][BEST])
+        findings = [*before, *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
         return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)

@@ -61,6 +61,7 @@ _REACH_M = 40.0  # ground farther from the camera stays as it is: H is known bes
 _STEPS = 12  # of the secant method, where four to six are enough
 _SURE_M = 1e-7  # of its end
 _STEP_PX = 0.5  # of the differences by pixel
+_MOST_RECORDED = 500  # places of the path whose records are taken, evenly
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
 
 
@@ -68,22 +69,27 @@ _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a driv
 class Recorded:
     """The heights and slopes that were recorded on the path: the ``road``, None where it is level.
 
-    ``height_sigma_m`` and ``slope_sigma`` are of their means over ``over_m``, ``drift_m`` what of a height's
-    error they all share.
+    Errors of heights, m, and of slopes are sums of processes: standard deviation, and the way in m over which
+    they fade.
     """
 
     road: Road | None
-    height_sigma_m: float
-    slope_sigma: float
-    drift_m: float = 0.0
-    over_m: float = 5.0
+    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)
+    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)
 
     @classmethod
     def of(cls, road: Road | None, noise: PoseNoise) -> Recorded:
-        """Of a drive: satellite heights are half again as uncertain as positions; level ground is a guess."""
+        """Of a drive: satellite heights are half again as uncertain as positions; level ground is a guess.
+
+        The road's heights and slopes are means over ten metres: of what scatters from pose to pose, a third
+        is left.
+        """
         if road is None:
-            return cls(None, 0.1, 0.01)
-        return cls(road, 1.5 * noise.position_m, 0.004, 1.5 * noise.position_drift_m)
+            return cls(None)
+        drift_m = noise.position_drift_m
+        white_m = np.sqrt(max(noise.position_m**2 - drift_m**2, 0.0)) / 3
+        heights = ((1.5 * drift_m, noise.position_drift_over_m), (1.5 * float(white_m), 10.0))
+        return cls(road, heights, ((0.004, 10.0),))
 
     def at(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Heights (N,) and slopes (N, 2) by map x and y at points (N, 2) of the path."""
@@ -107,7 +113,6 @@ class Paths:
         bounds_m: (F, 2) stations between which a frame's ground is looked for.
         position_map: (F, 2) m, of the vehicle.
         heading: (F, 2) unit vectors.
-        spacing_m: (F,) of the way, as far as it is this frame's.
         visit_ends: (V, 2) stations at which each visit begins and ends.
     """
 
@@ -119,7 +124,6 @@ class Paths:
     bounds_m: FloatArray
     position_map: FloatArray
     heading: FloatArray
-    spacing_m: FloatArray
     visit_ends: FloatArray
 
     @classmethod
@@ -144,7 +148,6 @@ class Paths:
         span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
         here = station[place][:, None] + np.array([-_AHEAD_M, _AHEAD_M])
         bounds = np.clip(here, *np.array([span[v] for v in visit.tolist()]).T[:, :, None])
-        spacing = (np.where(begins, 0.0, np.append(0.0, way_m)) / np.bincount(place))[place]
         heading = map_from_vehicle[:, :2, 0] / np.linalg.norm(
             map_from_vehicle[:, :2, 0], axis=1, keepdims=True
         )
@@ -157,7 +160,6 @@ class Paths:
             bounds,
             points,
             heading,
-            spacing,
             np.array(list(span.values())),
         )
 
@@ -215,14 +217,14 @@ class Surface:
         covariance: (B, B) of them.
         knots: the spline's first along the way, m, the way between two, m, and how many functions they
             make; None where there is the cross-section alone.
-        datum_m: what is added to all heights, and the standard deviation of that.
+        datum_m: what is added to all heights.
     """
 
     paths: Paths
     parameters: FloatArray
     covariance: FloatArray
     knots: tuple[float, float, int] | None = None
-    datum_m: tuple[float, float] = (0.0, 0.0)
+    datum_m: float = 0.0
     _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -292,8 +294,7 @@ class Surface:
     def _at(self, station_m: FloatArray, left_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         columns = self._columns(station_m, left_m)
         variance = np.asarray((columns @ self.covariance * columns.toarray()).sum(axis=1))
-        height_m, sigma_m = columns @ self.parameters + self.datum_m[0], np.sqrt(np.maximum(variance, 0.0))
-        return height_m, np.hypot(sigma_m, self.datum_m[1])
+        return columns @ self.parameters + self.datum_m, np.sqrt(np.maximum(variance, 0.0))
 
     def strips(self) -> tuple[GroundStrip, ...]:
         """The ground by session, half a metre to half a metre."""
@@ -330,12 +331,14 @@ class Surface:
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded
     ) -> tuple[Surface, float]:
-        """The surface that a drive makes likeliest, and how much likelier than the recorded plane, log odds.
+        """The surface that a drive makes likeliest, and its gain: how far the images' cost falls.
 
         Args:
             information: (B, B) on the parameters, all else being estimated with them.
             score: (B,) the gradient of the cost by them, where they are now.
             recorded: on the path.
+
+        Of the gain, what noise alone would do is taken off: one for each parameter that they determine.
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score
@@ -356,8 +359,8 @@ class Surface:
         parameters = covariance @ towards
         moved = parameters - self.parameters
         gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
-        datum = (datum_m, recorded.drift_m)
-        return replace(self, parameters=parameters, covariance=covariance, datum_m=datum), float(gain)
+        found = replace(self, parameters=parameters, covariance=covariance, datum_m=datum_m)
+        return found, float(gain)
 
     def _smoothness(self, sizes: FloatArray) -> FloatArray:
         """The prior's information (B, B), by the logarithms of the sizes (3,) of second differences."""
@@ -381,17 +384,22 @@ class Surface:
         size = len(self.parameters)
         if self.knots is None:
             return np.zeros((size, size)), np.zeros(size), 0.0
-        height, slope = recorded.at(self.paths.position_map)
-        ahead, weight = self.paths.heading, self.paths.spacing_m / recorded.over_m
+        frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
+        height, slope = recorded.at(self.paths.position_map[frame])
+        ahead, station = self.paths.heading[frame], self.paths.station_m[self.paths.place[frame]]
         forwards = np.einsum("fi,fi->f", slope, ahead)
         sideways = slope[:, 1] * ahead[:, 0] - slope[:, 0] * ahead[:, 1]
-        datum_m = float(height.mean())
+        datum_m, apart_m = float(height.mean()), np.abs(station[:, None] - station)
         known, towards = np.zeros((size, size)), np.zeros(size)
         values = (height - datum_m, forwards, sideways)
-        sigmas = (recorded.height_sigma_m, recorded.slope_sigma, recorded.slope_sigma)
-        for columns, value, sigma in zip(self._footprints(), values, sigmas, strict=True):
-            weighted = columns.T @ diags_array(weight / sigma**2)
-            known += (weighted @ columns).toarray()
+        noises = (recorded.heights, recorded.slopes, recorded.slopes)
+        for columns, value, noise in zip(self._footprints(), values, noises, strict=True):
+            covariance = 1e-6 * np.eye(len(frame))
+            for sigma, over_m in noise:
+                covariance += sigma**2 * np.exp(-apart_m / over_m)
+            own = columns[frame].toarray()
+            weighted = np.linalg.solve(covariance, own).T
+            known += weighted @ own
             towards += weighted @ value
         return known, towards, datum_m
 
