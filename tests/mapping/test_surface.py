@@ -234,13 +234,14 @@ def plane():
     return map_one(Job(SEED))
 
 
-@pytest.mark.parametrize("spoil", ["crown", "crown beside"])
-def test_a_road_with_a_crown_is_mapped_as_well_as_a_plane(plane, spoil):
-    crowned = map_one(Job(SEED, spoil=spoil, ground="auto"))
-    assert crowned.status == plane.status == "PASS"
-    assert crowned.rmse_m <= 1.2 * plane.rmse_m
-    assert crowned.markings >= plane.markings
-    assert crowned.height_rmse_m <= 0.02
+@pytest.mark.parametrize(("relief", "height_m"), [("crown beside", 0.01), ("crest", 0.04)])
+def test_a_road_with_a_crown_or_crests_is_mapped_as_well_as_a_plane(plane, relief, height_m):
+    # A roll of the recording sensor by 2 mrad, which a straight road does not show, leans recorded ground.
+    curved = map_one(Job(SEED, spoil=relief, ground="auto"))
+    assert curved.status == plane.status == "PASS"
+    assert curved.rmse_m <= 1.2 * plane.rmse_m
+    assert curved.markings >= plane.markings
+    assert curved.height_rmse_m <= height_m
 
 
 def test_a_plane_stays_one_to_the_last_bit(plane):

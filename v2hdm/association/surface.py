@@ -61,6 +61,7 @@ _REACH_M = 40.0  # ground farther from the camera stays as it is: H is known bes
 _STEPS = 12  # of the secant method, where four to six are enough
 _SURE_M = 1e-7  # of its end
 _STEP_PX = 0.5  # of the differences by pixel
+_LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell from the road's, all the way
 _MOST_RECORDED = 500  # places of the path whose records are taken, evenly
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
 
@@ -252,9 +253,8 @@ class Surface:
         index = (i[:, :, None] * _ACROSS + j[:, None, :]).reshape(-1)
         value = (by_way[:, :, None] * by_side[:, None, :]).reshape(-1)
         bounds = 16 * np.arange(len(station_m) + 1)
-        return csr_array(
-            hstack([hinges, csr_array((value, index, bounds), (len(station_m), self.knots[2] * _ACROSS))])
-        )
+        spline = csr_array((value, index, bounds), (len(station_m), self.knots[2] * _ACROSS))
+        return csr_array(hstack([hinges, spline]))
 
     def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
         """Height, slope along the heading and to the left (F, B each) under each frame by the parameters."""
@@ -314,19 +314,16 @@ class Surface:
     @property
     def sentence(self) -> str:
         """One sentence on the heights of the ground."""
-        left_m = np.array([-8.0, -4.0, 4.0, 8.0])
         at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
-        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        heights = np.array([self.seen_height_m(at + d * left, frame).mean() for d in left_m.tolist()])
-        before = self.seen_height_m(at + 10.0 * ahead, frame)
-        told = ", ".join(
-            f"{100 * height:+.0f} cm {abs(d):.0f} m to the {'left' if d > 0 else 'right'}"
-            for d, height in zip(left_m.tolist(), heights.tolist(), strict=True)
-        )
-        return (
-            f"the ground beside the vehicle's path is no plane: on average {told}; "
-            f"{100 * before.min():+.0f} to {100 * before.max():+.0f} cm 10 m ahead"
-        )
+        left, told = np.column_stack([-ahead[:, 1], ahead[:, 0]]), []
+        for away, where in (
+            (10.0 * ahead, "10 m ahead"),
+            (4.0 * left, "4 m to the left"),
+            (-4.0 * left, "right"),
+        ):
+            height_cm = 100 * self.seen_height_m(at + away, frame)
+            told.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
+        return f"the ground around the vehicle is no plane: {', '.join(told)}"
 
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded
@@ -355,7 +352,7 @@ class Surface:
         if self.knots is not None:
             search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
             best = minimize(cost, usual, method="Nelder-Mead", options=search).x
-        covariance = np.linalg.inv(whole + self._smoothness(best))
+        covariance: FloatArray = np.linalg.inv(whole + self._smoothness(best))
         parameters = covariance @ towards
         moved = parameters - self.parameters
         gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
@@ -392,7 +389,7 @@ class Surface:
         datum_m, apart_m = float(height.mean()), np.abs(station[:, None] - station)
         known, towards = np.zeros((size, size)), np.zeros(size)
         values = (height - datum_m, forwards, sideways)
-        noises = (recorded.heights, recorded.slopes, recorded.slopes)
+        noises = (recorded.heights, recorded.slopes, (*recorded.slopes, _LEAN))
         for columns, value, noise in zip(self._footprints(), values, noises, strict=True):
             covariance = 1e-6 * np.eye(len(frame))
             for sigma, over_m in noise:
