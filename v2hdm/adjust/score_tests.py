@@ -658,7 +658,7 @@ def _raised(bench: _Bench, height: Tensor) -> Rows:
 
 
 def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
-    """What a drive says of parameters that raise the ground, all else being estimated anew with them.
+    """The information of a drive on parameters that raise the ground, all else being estimated with them.
 
     Args:
         solution: at the parameters' present values.
@@ -674,8 +674,10 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
     seen = np.flatnonzero(information.diagonal() > 0)
     coupled = bench.root.new_zeros(len(seen), bench.whitening.size)
-    for row, column in zip(coupled, columns[:, seen].T.toarray(), strict=True):
-        row[:] = bench._coupling({"observations": unit * torch.as_tensor(column).to(unit)})
+    by_column = columns[:, seen].tocsc()
+    for k, row in enumerate(coupled):
+        raised = torch.as_tensor(by_column[:, [k]].toarray()[:, 0]).to(unit)
+        row[:] = bench._coupling({"observations": unit * raised})
     information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
     gradient = columns.T @ (unit * bench.residuals["observations"]).sum(0).cpu().numpy()
     gradient[seen] -= (coupled @ bench.whitening.gradient).cpu().numpy()

@@ -244,7 +244,7 @@ class Surface:
         return cls(paths, np.zeros(size), np.zeros((size, size)), knots)
 
     def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
-        """What a unit of each parameter adds (K, B) to the height at stations (K,), beside the path (K,)."""
+        """The derivative (K, B) of heights at stations (K,), to the left (K,) of the path, by the parameters."""
         hinges = csr_array(_hinges(left_m))
         if self.knots is None:
             return hinges
@@ -274,7 +274,7 @@ class Surface:
         return np.column_stack([forwards, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]])
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
-        """What a unit of each parameter adds (K, B) to :meth:`seen_height_m`."""
+        """The derivative (K, B) of :meth:`seen_height_m` by the parameters."""
         stands, away = self._footprints(), self._from(points_map, frame)
         plane = stands[0][frame]
         for axis in (0, 1):
