@@ -244,7 +244,7 @@ class Surface:
         return cls(paths, np.zeros(size), np.zeros((size, size)), knots)
 
     def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
-        """The derivative (K, B) of heights at stations (K,), to the left (K,) of the path, by the parameters."""
+        """The derivative (K, B) by the parameters of heights at stations (K,), to the left (K,)."""
         hinges = csr_array(_hinges(left_m))
         if self.knots is None:
             return hinges

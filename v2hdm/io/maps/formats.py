@@ -124,20 +124,24 @@ FORMATS: Mapping[str, Format] = {
     "gpkg": Format("{name}.gpkg", write_geopackage, "pyogrio"),
     "lanelet2": Format("{name}_lanelet2/lanelet2_map.osm", write_lanelet2),
     "dxf": Format("{name}.dxf", write_dxf, "ezdxf"),
-    "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio"),
-    "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg"),
 }
 
 
-_OF_GROUND = ("geotiff", "opencrg")
+GROUND_FORMATS: Mapping[str, Format] = {
+    "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio"),
+    "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg"),
+}
+"""Of the ground's surface, which a map has as the run's result, but not from its files."""
+
+_ALL = {**FORMATS, **GROUND_FORMATS}
 
 
 def check_formats(names: Sequence[str], key: str) -> None:
     """Refuse unknown formats, given by ``key``, and those whose packages are not installed."""
     for name in names:
-        if name not in FORMATS:
-            raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(FORMATS)}")
-        if (package := FORMATS[name].needs) is not None:
+        if name not in _ALL:
+            raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(_ALL)}")
+        if (package := _ALL[name].needs) is not None:
             need(package, "gis", f"the format {name}", ConfigError)
 
 
@@ -158,14 +162,14 @@ def write_map(
     check_formats(formats, "formats")
     written = []
     for chosen in dict.fromkeys(formats):
-        path = folder / FORMATS[chosen].file.format(name=name)
-        if chosen in _OF_GROUND and not hd_map.ground:
+        path = folder / _ALL[chosen].file.format(name=name)
+        if chosen in GROUND_FORMATS and not hd_map.ground:
             _log.warning(
                 "%s is not written: the map holds no surface of the ground; map the drive with "
                 "mapping.ground=surface, or auto where it is no plane", path.name,
             )  # fmt: skip
             continue
-        write = FORMATS[chosen].write
+        write = _ALL[chosen].write
         if chosen == "lanelet2":
             write = partial(write_lanelet2, projector=projector)
         write(hd_map, path, verdict)
