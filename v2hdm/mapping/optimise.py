@@ -204,17 +204,16 @@ class Optimiser:
         if self._options.ground not in (CROSS_SECTION, SURFACE):
             return bundle
         progress("surface of the ground")
-        surface = None
+        surface = self._ground(bundle, None)
         for _ in range(_GROUND_ROUNDS):
-            before = self._ground(bundle, surface)
-            surface, _, step_m = self._better_ground(bundle, before)
+            surface, _, step_m = self._better_ground(bundle, self._ground(bundle, surface))
             self.surface, self.sightings = surface, surface.flattened(self._seen, bundle.rig)
             association = self._associate(bundle.rig)
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
             if step_m < _SETTLED_M:
                 break
-        _log.info("%s: %s", ", ".join(self.camera_names), self.surface.sentence)
+        _log.info("%s: %s", ", ".join(self.camera_names), surface.sentence)
         return bundle
 
     def _ground(self, bundle: Bundle, surface: Surface | None) -> Surface:

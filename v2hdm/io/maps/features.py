@@ -117,8 +117,8 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
         if one.symbol:
             symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m))
         elif one.closed:
-            known = (one.covariance_m2, one.relative_sigma_m, one.heights_m)
-            markings.append(Marking(*own, *known, number, one.heights_sigma_m))
+            marking = Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number)
+            markings.append(replace(marking, heights_sigma_m=one.heights_sigma_m))
         else:
             lanes.append(Lane(*own, one.heights_m, number, one.heights_sigma_m))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
