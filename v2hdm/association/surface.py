@@ -352,7 +352,7 @@ class Surface:
         if self.knots is not None:
             search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
             best = minimize(cost, usual, method="Nelder-Mead", options=search).x
-        covariance: FloatArray = np.linalg.inv(whole + self._smoothness(best))
+        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(best)), dtype=np.float64)
         parameters = covariance @ towards
         moved = parameters - self.parameters
         gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
