@@ -318,9 +318,9 @@ class Marking:
 
     ``covariance_m2`` (8, 8) is that of the stacked corners, None if unknown. ``relative_sigma_m`` is what the
     marking contributes to the error of a distance to one about 10 m away, one standard deviation a
-    coordinate: without the drift and the survey that both share. ``heights_m`` (4,) are the recorded heights
-    of the ground, None where it was recorded as z = 0. ``id`` is positive and no other feature's of its map;
-    None until the map is written.
+    coordinate: without the drift and the survey that both share. ``heights_m`` (4,) are the heights of the
+    ground, None where it was recorded as z = 0, ``heights_sigma_m`` (4,) their standard deviations where it
+    was estimated. ``id`` is positive and no other feature's of its map; None until the map is written.
     """
 
     kind: str
@@ -330,6 +330,7 @@ class Marking:
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None
     id: int | None = None
+    heights_sigma_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -337,7 +338,7 @@ class Symbol:
     """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
 
     ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter; ``heights_m``
-    (N,) and ``id`` are as a :class:`Marking` has them.
+    (N,), their sigmas and ``id`` are as a :class:`Marking` has them.
     """
 
     kind: str
@@ -346,6 +347,7 @@ class Symbol:
     sigma_m: float | None = None
     heights_m: FloatArray | None = None
     id: int | None = None
+    heights_sigma_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -353,8 +355,8 @@ class Lane:
     """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
 
     ``sigma_m`` (N,) is the standard deviation of each vertex across the line, of extrinsics and poses too,
-    None where lanes take no part in the adjustment. ``heights_m`` (N,) and ``id`` are as a :class:`Marking`
-    has them.
+    None where lanes take no part in the adjustment. ``heights_m`` (N,), their sigmas and ``id`` are as a
+    :class:`Marking` has them.
     """
 
     kind: str
@@ -363,6 +365,31 @@ class Lane:
     heights_m: FloatArray | None = None
     id: int | None = None
     sigma_m: FloatArray | None = None
+    heights_sigma_m: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class GroundStrip:
+    """The estimated ground along a path, a grid of heights.
+
+    Attributes:
+        points_map: (N, 2) m of the path, ``step_m`` apart.
+        ahead: (N, 2) unit vectors along it.
+        left_m: (M,) to its left, evenly rising.
+        heights_m: (N, M) of the ground.
+        sigma_m: (N, M) their standard deviations.
+    """
+
+    points_map: FloatArray
+    ahead: FloatArray
+    step_m: float
+    left_m: FloatArray
+    heights_m: FloatArray
+    sigma_m: FloatArray
+
+    def points(self, left_m: float) -> FloatArray:
+        """Points (N, 2) so far to the left of the path."""
+        return self.points_map + left_m * np.column_stack([-self.ahead[:, 1], self.ahead[:, 0]])
 
 
 @dataclass(frozen=True)
@@ -371,6 +398,7 @@ class HdMap:
 
     ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None if
     unknown; ``largest_id`` the largest id ever given, also to what is gone, 0 where it is a feature's.
+    ``ground`` is the surface by session, where it was estimated.
 
     >>> marking = result.map.markings[0]
     >>> marking.corners_map.shape, marking.covariance_m2.shape
@@ -383,6 +411,7 @@ class HdMap:
     symbols: tuple[Symbol, ...] = ()
     drift_over_m: float | None = None
     largest_id: int = 0
+    ground: tuple[GroundStrip, ...] = ()
 
     def to_geodataframe(self) -> Any:
         """The features as a ``geopandas.GeoDataFrame``, a row each: id, layer, kind, sightings, geometry.

@@ -34,16 +34,15 @@ from scipy.stats import chi2, kstest
 
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import ROUTES, Recipe, draw
-from tests.benchmarks.made.faults import SPOILS, Spoil
+from tests.benchmarks.made.faults import RELIEFS, SPOILS, Spoil
 from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
-from v2hdm.io.maps.features import ground_height_m
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import GROUNDS, PLANE, MappingOptions
 from v2hdm.pipeline.camera_sets import BEST, camera_sets
-from v2hdm.records import Drive, HdMap
+from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
 from v2hdm.verdict.inputs.cameras import check_camera
@@ -51,7 +50,7 @@ from v2hdm.verdict.inputs.drive import causes, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
-from v2hdm.verdict.results.solution import check_solution
+from v2hdm.verdict.results.solution import check_solution, over_surface
 from v2hdm.workers import share_out
 
 CLEAN = "nothing"
@@ -67,7 +66,8 @@ class Row:
     """What became of one drive.
 
     ``tests`` are the score tests: kind, p-value, value, sigma. ``errors`` are squared, in sigmas, by
-    quantity. ``seconds`` are of the CPU.
+    quantity. ``height_rmse_m`` is of the corners' heights, ``height_scatter_m`` the same about their mean.
+    ``seconds`` are of the CPU.
     """
 
     seed: int
@@ -81,6 +81,7 @@ class Row:
     untold: list[dict[str, Any]] = field(default_factory=list)
     rmse_m: float = float("nan")
     height_rmse_m: float = float("nan")
+    height_scatter_m: float = float("nan")
     recall: float = float("nan")
     false: int = 0
     markings: int = 0
@@ -131,7 +132,7 @@ def map_one(job: Job) -> Row:
     recipe = job.recipe
     world = make(recipe)
     if job.spoil != CLEAN:
-        world = SPOILS[job.spoil].change(world)
+        world = (SPOILS | RELIEFS)[job.spoil].change(world)
     if job.read_out_s:
         world = world.rolling(job.read_out_s, stated=not job.estimate)
     drive = drive_of(world)
@@ -149,7 +150,8 @@ def map_one(job: Job) -> Row:
     try:
         options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
         methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
-        findings = [*findings_of_inputs(drive), *check_solution(drive, methods)]
+        before = over_surface(findings_of_inputs(drive), list(methods.values())[-1][BEST])
+        findings = [*before, *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
         return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)
@@ -162,6 +164,8 @@ def map_one(job: Job) -> Row:
     expected = driven_past(drive, truth, tuple(drive.cameras))
     figures = marking_metrics(best.hd_map, truth, expected)
     errors = squared_errors(best, truth) if figures.markings > figures.false_markings else {}
+    height_off_m, height_sigma_m = height_errors_m(world, best.hd_map)
+    errors["heights"] = np.square(height_off_m / height_sigma_m)
     assert best.evidence is not None
     about["drawn"] |= {f"read_out_s {name}": found for name, found in best.evidence.read_out_s.items()}
     return Row(
@@ -170,7 +174,8 @@ def map_one(job: Job) -> Row:
         findings=[finding.as_json() for finding in verdict.raised],
         untold=[finding.as_json() for finding in verdict.unobservable],
         rmse_m=figures.corner_rmse_m,
-        height_rmse_m=height_rmse_m(world, drive, best.hd_map),
+        height_rmse_m=float(np.sqrt(np.mean(height_off_m**2))) if len(height_off_m) else float("nan"),
+        height_scatter_m=float(np.std(height_off_m)) if len(height_off_m) else float("nan"),
         recall=figures.recall,
         false=figures.false_markings,
         markings=figures.markings,
@@ -180,18 +185,22 @@ def map_one(job: Job) -> Row:
     )
 
 
-def height_rmse_m(world: World, drive: Drive, hd_map: HdMap) -> float:
-    """Of the corners' heights above the recorded road, by the nearest true corner; nan where none is told."""
-    true, told = world.corners_map.reshape(-1, 3), [m for m in hd_map.markings if m.heights_m is not None]
+def height_errors_m(world: World, hd_map: HdMap) -> tuple[FloatArray, FloatArray]:
+    """The errors of the corners' heights, by the nearest true corner, and their sigmas; none are not told."""
+    true, told = (
+        world.corners_map.reshape(-1, 3),
+        [m for m in hd_map.markings if m.heights_sigma_m is not None],
+    )
     if not told:
-        return float("nan")
+        return np.zeros(0), np.zeros(0)
     corners = np.concatenate([marking.corners_map for marking in told])
-    heights = np.concatenate([marking.heights_m for marking in told])
-    off_m, nearest = cKDTree(true[:, :2]).query(corners)
-    flat = make(world.recipe).corners_map.reshape(-1, 3)[nearest, 2]
-    road_m = 0.0 if drive.road is None else ground_height_m(drive.road, corners)
-    off = (heights - road_m) - (true[nearest, 2] - flat)
-    return float(np.sqrt(np.mean(off[off_m < _PAIRED_M] ** 2)))
+    heights, sigmas = (
+        np.concatenate([getattr(marking, name) for marking in told])
+        for name in ("heights_m", "heights_sigma_m")
+    )
+    away_m, nearest = cKDTree(true[:, :2]).query(corners)
+    near = away_m < _PAIRED_M
+    return (heights - true[nearest, 2])[near], sigmas[near]
 
 
 def findings_of_inputs(drive: Drive) -> list[Finding]:
@@ -236,7 +245,8 @@ def _clause(finding: dict[str, Any]) -> str:
 def line(row: Row, clean: Row | None) -> str:
     """A drive as it is printed, against itself without the fault."""
     shares = _shares([row])
-    inside = " ".join(f"{shares[name]:.2f}" for name in ("corners", "sides", "distances", "mountings"))
+    quantities = ("corners", "sides", "distances", "mountings", "heights")
+    inside = " ".join(f"{shares[name]:.2f}" for name in quantities)
     mark = ""
     if clean is not None:
         wrong, told, named = judge(row, clean)
@@ -246,7 +256,8 @@ def line(row: Row, clean: Row | None) -> str:
     noise = ("default" if row.default_noise else "stated") + (", road" if row.road else "")
     return (
         f"{row.seed:5d} {row.name} {row.route:8}| {noise:13} | {row.spoil:16}| {row.status:7}| {mark}"
-        f"{100 * row.rmse_m:6.2f} cm, heights {100 * row.height_rmse_m:3.1f} | "
+        f"{100 * row.rmse_m:6.2f} cm, heights {100 * row.height_rmse_m:3.1f} "
+        f"({100 * row.height_scatter_m:3.1f}) | "
         f"recall {row.recall:.2f}, {row.false} false of {row.markings:3d} | "
         f"inside {inside} | {row.seconds:4.1f} s | {row.first[:110]}{_read_outs(row)}"
     )
@@ -260,7 +271,7 @@ def _read_outs(row: Row) -> str:
 
 def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
     """Whether a spoilt map is wrong, whether the user is told, and when the cause is named."""
-    spoil = SPOILS[row.spoil]
+    spoil = (SPOILS | RELIEFS)[row.spoil]
     wrong = not row.rmse_m <= RIGHT_FACTOR * clean.rmse_m
     said, pattern = [_clause(finding) for finding in row.findings], spoil.cause
     if row.route == "straight" and spoil.hidden is not None and not said:
@@ -273,7 +284,8 @@ def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
 
 def _shares(rows: Iterable[Row]) -> dict[str, float]:
     """By quantity, the share of errors inside the 95 % region."""
-    quantities, out = {**{name: (name,) for name in QUANTITIES}, "mountings": _MOUNTING}, {}
+    quantities = {name: (name,) for name in (*QUANTITIES, "heights")} | {"mountings": _MOUNTING}
+    out = {}
     for name, parts in quantities.items():
         errors = np.concatenate([[], *(row.errors.get(part, []) for row in rows for part in parts)])
         out[name] = float(np.mean(errors <= _INSIDE)) if len(errors) else float("nan")
@@ -305,7 +317,9 @@ def summary_of_right(rows: Sequence[Row]) -> list[str]:
         lines.append(
             f"{kind:22s}{len(p):6d}{uniform:10.2g}{min(p):10.1g}{np.mean(np.array(p) < 0.05):9.2f}{mark}"
         )
-    lines.append(f"{'inside 95 %':22s}" + " ".join(f"{name:>9s}" for name in (*QUANTITIES, "mountings")))
+    lines.append(
+        f"{'inside 95 %':22s}" + " ".join(f"{name:>9s}" for name in (*QUANTITIES, "heights", "mountings"))
+    )
     for name, own in (
         ("noise stated", [row for row in rows if not row.default_noise]),
         ("noise by default", [row for row in rows if row.default_noise]),
@@ -371,7 +385,7 @@ def measure(jobs: Sequence[Job], workers: int, verbose: bool) -> list[Row]:
 
 def wanted_spoils(names: Sequence[str]) -> list[Spoil]:
     """The faults of these names, all for ``all``."""
-    return list(SPOILS.values()) if "all" in names else [SPOILS[name] for name in names]
+    return list(SPOILS.values()) if "all" in names else [(SPOILS | RELIEFS)[name] for name in names]
 
 
 def main() -> None:
@@ -381,7 +395,7 @@ def main() -> None:
         "--seeds", nargs=2, type=int, default=[0, 200], help="the first, and the one after the last"
     )
     parser.add_argument("--route", choices=ROUTES, help="instead of a drawn one")
-    parser.add_argument("--spoil", nargs="+", default=[], choices=["all", *SPOILS], metavar="KIND")
+    parser.add_argument("--spoil", nargs="+", default=[], choices=["all", *SPOILS, *RELIEFS], metavar="KIND")
     parser.add_argument("--only", default="", help="pattern of 'port route seed' of the drives to map")
     parser.add_argument(
         "--alone", action="store_true", help="map each camera by itself, too, as the product does"

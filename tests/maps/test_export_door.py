@@ -91,6 +91,7 @@ def test_an_export_replaces_what_it_has_written_itself_and_nothing_else(folder, 
     ("arguments", "message"),
     [
         (["map.geojson", "--format", "shp"], "--format: unknown format 'shp'; choose from: geojson, csv"),
+        (["map.geojson", "--format", "opencrg"], "--format opencrg: a map's file does not hold the ground"),
         (["calibration_front.yaml", "--format", "gpkg"], "unknown format 'gpkg' of a calibration"),
         (["map.geojson", "--format", "geojson"], "map.geojson would be written over"),
         (["map.csv", "--format", "gpkg"], "map.csv: no map that can be read"),

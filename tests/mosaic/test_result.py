@@ -12,10 +12,10 @@ import rasterio
 
 from tests.mosaic import scene
 from v2hdm.cli.main import run
-from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.geometry.geodetic import crs_of, geodetic_from_enu
 from v2hdm.io.drive.of_result import METRICS
 from v2hdm.mosaic.blend import Sheet
-from v2hdm.mosaic.result import Picture, crs_of, geotiff
+from v2hdm.mosaic.result import Picture, geotiff
 from v2hdm.mosaic.shots import Canvas
 
 

@@ -15,6 +15,7 @@ from v2hdm.io.drive.writing import write_drive
 from v2hdm.records import Image, Road
 from v2hdm.verdict import Finding, Status, Verdict, input_findings
 from v2hdm.verdict.inputs.drive import HIDES, causes, check_road
+from v2hdm.verdict.results.agreement import check_heights
 
 
 def finding(status, check="clock", value=118.0):
@@ -133,6 +134,21 @@ def test_the_foot_of_a_ramp_is_told_with_its_place(grade, status):
     assert found.value == pytest.approx(np.rad2deg(grade), rel=0.2)
     place_m = float(found.says.split(" m along")[0])
     assert 15 < place_m < 45
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.1, 0.6, 3.0])
+def test_heights_that_two_passes_contradict_are_named_with_their_place_but_not_another_storey(off_m):
+    there = np.column_stack([np.arange(61.0), np.zeros(61)])
+    back = there[::-1] + np.array([0.0, 1.0])
+    climb = np.tile([0.05, 0.0], (122, 1))
+    points = np.concatenate([there, back])
+    height = 46.2 + 0.05 * points[:, 0] + off_m * (points[:, 1] > 0) * (points[:, 0] > 30)
+    (found,) = check_heights(replace(drive(poses()), road=Road(points, height, climb)))
+    assert found.status is (Status.WARN if off_m == 0.6 else Status.PASS)
+    if off_m == 0.6:
+        assert found.value == pytest.approx(0.6)
+        assert "the heights of two passes differ by 0.60 m" in found.says
+        assert int(found.says.split("at x ")[1].split(" m")[0]) > 30
 
 
 def written(folder, recorded):

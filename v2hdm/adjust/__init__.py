@@ -16,7 +16,7 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )  # fmt: skip
-from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_step, score_faults, sigmas_of
+from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, height_information, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
@@ -24,7 +24,8 @@ from v2hdm.adjust.validation import Verdict, line_variance_factor
 
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
-    "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise", "height_step",
-    "line_variance_factor", "observability", "pose_innovations", "predicts_better", "score_faults",
+    "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
+    "height_information", "line_variance_factor", "observability", "pose_innovations", "predicts_better",
+    "score_faults",
     "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

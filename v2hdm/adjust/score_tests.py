@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -648,33 +649,31 @@ def _raised(bench: _Bench, height: Tensor) -> Rows:
     return {"observations": bench.seen(height[:, None] * bench.poses[:, :3, 2])}
 
 
-def height_step(
-    solution: Solution, heights: FloatArray, off: FloatArray, sigma: float
-) -> tuple[FloatArray, FloatArray]:
-    """The Gauss-Newton step (B,) of parameters that raise the ground, all else being estimated anew with it.
+def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
+    """The information of a drive on parameters that raise the ground, all else being estimated with them.
 
     Args:
         solution: at the parameters' present values.
-        heights: (K, B) m by which a unit of each raises what each observation of the problem shows.
-        off: (B,) how far the parameters are from their expectation.
-        sigma: of that.
+        heights: (K, B) sparse, m by which a unit of each raises what each observation of the problem shows.
 
     Returns:
-        The step, and the covariance (B, B) of the parameters.
+        The information (B, B) on them, and the gradient (B,) of the cost.
     """
     bench = _Bench.at(solution.covariance.whitening)
-    by_order = torch.as_tensor(heights)[bench.arrays.order.cpu()].to(bench.root)
-    columns = [bench.efficient(_raised(bench, column)) for column in by_order.T]
-    z = torch.stack([_stacked(column) for column in columns], dim=1)
-    information = (z.T @ z).cpu().numpy() + np.eye(len(off)) / sigma**2
-    score = (z.T @ _stacked(bench.residuals)).cpu().numpy() + off / sigma**2
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    return -covariance @ score, covariance
-
-
-def _stacked(rows: Rows) -> Tensor:
-    """All rows, in the order of their kinds, as one vector."""
-    return torch.cat([rows[name].flatten() for name in sorted(rows)])
+    unit = _raised(bench, torch.ones_like(bench.root))["observations"]
+    columns = heights[bench.arrays.order.cpu().numpy()]
+    squared = unit.square().sum(0).cpu().numpy()
+    information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
+    seen = np.flatnonzero(information.diagonal() > 0)
+    coupled = bench.root.new_zeros(len(seen), bench.whitening.size)
+    by_column = columns[:, seen].tocsc()
+    for k, row in enumerate(coupled):
+        raised = torch.as_tensor(by_column[:, [k]].toarray()[:, 0]).to(unit)
+        row[:] = bench._coupling({"observations": unit * raised})
+    information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
+    gradient = columns.T @ (unit * bench.residuals["observations"]).sum(0).cpu().numpy()
+    gradient[seen] -= (coupled @ bench.whitening.gradient).cpu().numpy()
+    return information, gradient
 
 
 def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:

@@ -54,9 +54,14 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
-    from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
+    from v2hdm.io.maps.formats import FORMATS, GROUND_FORMATS, check_formats, write_map
     from v2hdm.io.maps.reading import read_map
 
+    if ground := [one for one in parsed.format if one in GROUND_FORMATS]:
+        raise ConfigError(
+            f"--format {ground[0]}: a map's file does not hold the ground; have the run write it, with "
+            f"'export=[geojson,{ground[0]}]'"
+        )
     check_formats(parsed.format, "--format")
     name = parsed.source.stem
     files = [folder / FORMATS[one].file.format(name=name) for one in parsed.format]

@@ -170,3 +170,23 @@ def utm_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> tuple[str
     code = f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
     to_grid = pyproj.Transformer.from_crs(pyproj.CRS(code).geodetic_crs, code, always_xy=True)
     return code, np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
+_ENGINEERING = (
+    'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
+    'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
+)
+
+
+def crs_of(origin: GeodeticOrigin | None) -> str:
+    """The coordinate system of the map frame, as PROJ or WKT text.
+
+    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
+    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
+    frame is an engineering system: metres that belong nowhere on the earth.
+    """
+    if origin is None:
+        return _ENGINEERING
+    scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
+    return (
+        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
+        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    )

@@ -19,8 +19,8 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from v2hdm.adjust import ControlPoints, Observations, Solution
-from v2hdm.association.cross_section import CrossSection
 from v2hdm.association.sightings import Rig, frames_of
+from v2hdm.association.surface import Surface
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
@@ -96,11 +96,11 @@ def find_knots(
     detections: Sequence[ImageDetections],
     cameras: Sequence[str],
     rig: Rig,
-    section: CrossSection | None,
+    surface: Surface | None,
     options: LaneOptions,
 ) -> Knots | None:
     """Knots along the lanes that a drive shows under ``rig``, which is over ``cameras``; None without any."""
-    ground, jitter_rad = ground_by_rig(drive, cameras, rig, section), drive.pose_noise.roll_pitch_rad
+    ground, jitter_rad = ground_by_rig(drive, cameras, rig, surface), drive.pose_noise.roll_pitch_rad
     cloud = collect_lane_points(drive, detections, ground, options.max_range_m, jitter_rad)
     lanes = map_lanes(cloud, options)
     if not lanes:

@@ -311,21 +311,25 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
             len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
     known = observability(bundle.problem, solution)
-    section = inputs.optimiser.cross_section
+    surface = inputs.optimiser.surface
     if bundle.knots is not None:
         lanes = draw_lanes(bundle.knots, solution, options.lanes.node_spacing_m)
     else:
-        lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, section))
+        lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
     odds = options.acceptance.min_probability
     seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
     symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
+    if surface is not None:
+        # A spline has the recorded heights within it.
+        hd_map = with_heights(hd_map, None if surface.knots else drive.road, surface.height_m)
+        hd_map = replace(hd_map, ground=surface.strips() if surface.knots else ())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=hd_map if section is None else with_heights(hd_map, drive.road, section.height_m),
+        hd_map=hd_map,
         calibrations=optimised.calibrations,
         excluded=(*optimised.excluded, *no_symbols, *rejected),
         reprojection_rmse_px=optimised.reprojection_rmse_px,
@@ -368,6 +372,7 @@ def _brought_up_to_date(
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
     hd_map, changes, names = update_map(base, made.hd_map, observer, mapped, over_m)
+    hd_map = replace(hd_map, ground=made.hd_map.ground)
     corners, residuals = StatedCorners(hd_map.markings), made.residuals
     if residuals is not None:
         residuals = residuals.renamed(names.id, names.corner)

@@ -20,20 +20,14 @@ from v2hdm.adjust import (
     Problem,
     Status,
     estimate_noise,
-    height_step,
+    height_information,
     predicts_better,
     select_model,
-)
-from v2hdm.association.cross_section import (
-    SLOPE_SIGMA,
-    CrossSection,
-    Paths,
-    hinges,
-    sentence_of,
 )
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.surface import Paths, Recorded, Surface
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.tensors import extrinsic_from_ipm
@@ -51,8 +45,8 @@ from v2hdm.mapping.bundle import (
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.lanes import Knots
-from v2hdm.mapping.options import AUTO, CROSS_SECTION, MappingOptions
-from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, largest_noise
+from v2hdm.mapping.options import AUTO, CROSS_SECTION, SURFACE, MappingOptions
+from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, Road, largest_noise
 
 _log = logging.getLogger(__name__)
 
@@ -67,12 +61,13 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 
 
 _GROUND_ROUNDS = 6
-"""Solves under better and better cross-sections, at most: four are enough for a crown of 4 %."""
+"""Solves over better and better ground, at most: four are enough for a crown of 4 %."""
 
 _LANE_ROUNDS = 3
 """Solves with lanes: the stated variance of their points may be thirty times as large as the true one."""
 
-_SETTLED_SLOPE = 5e-4  # change of a slope from which on a cross-section is settled: 2 mm at 4 m from the path
+_SETTLED_M = 2e-3
+"""Change of the heights that are seen, root mean square, from which on the ground is settled."""
 
 
 def silent(step: str) -> None:
@@ -89,18 +84,19 @@ class Optimiser:
         cameras: Mapping[str, Camera],
         pose_noise: Sequence[PoseNoise],
         options: MappingOptions,
+        road: Road | None = None,
     ) -> None:
         """``pose_noise`` is that of each visit; gates take the largest of each kind."""
         self._seen, self._views = sightings, views
         self.sightings = sightings
         """As if all that they show lay on a plane."""
-        self.cross_section: CrossSection | None = None
+        self.surface: Surface | None = None
         """That of the ground, where it is not a plane."""
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)
         self._pose_sigma = self._own_noise = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
-        self._options = options
+        self._options, self._recorded = options, Recorded.of(road, self._pose_noise)
         self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
@@ -135,7 +131,7 @@ class Optimiser:
         self,
         bundle: Bundle,
         progress: Callable[[str], None] = silent,
-        find_knots: Callable[[Rig, CrossSection | None], Knots | None] = lambda rig, section: None,
+        find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
     ) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude.
 
@@ -148,7 +144,7 @@ class Optimiser:
         inlier, usable = bundle.inliers, np.zeros_like(self.sightings.valid)
         usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         final = self._solve(bundle.association, usable, bundle.rig)
-        knots = find_knots(final.rig, self.cross_section)
+        knots = find_knots(final.rig, self.surface)
         if knots is not None and knots.count:
             progress("lanes")
             # By turns: how well lines are seen, only their residuals say.
@@ -176,13 +172,13 @@ class Optimiser:
         ]
 
     def is_curved(self, bundle: Bundle) -> bool:
-        """Whether ``bundle``, over a cross-section, predicts held-out observations better than the plane."""
+        """Whether ``bundle``, over a surface, predicts held-out observations better than the plane."""
         problem, own = self._as_stated(bundle), bundle.own_corner
         seen = replace(problem.observations, pinhole_px=self._seen.corners_pinhole_px[bundle.row, own])
         try:
             return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the ground stays a plane, since no cross-section could be tried: %s", failure)
+            _log.warning("the ground stays a plane, since no surface could be tried: %s", failure)
             return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
@@ -220,26 +216,39 @@ class Optimiser:
         return self._weigh_poses(self._fit_ground(bundle, progress))
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None]) -> Bundle:
-        """The solve over the cross-section of the ground that the drive shows, if one is asked for."""
-        if self._options.ground != CROSS_SECTION:
+        """The solve over the ground that the drive shows, if it is not to be a plane."""
+        if self._options.ground not in (CROSS_SECTION, SURFACE):
             return bundle
-        progress("cross-section of the ground")
-        falls = np.zeros(hinges(np.zeros(1)).shape[1])
+        progress("surface of the ground")
+        surface = self._ground(bundle, None)
         for _ in range(_GROUND_ROUNDS):
-            paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.visit)
-            points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
-            left_m, _ = paths.beside(points_map, self._seen.frame[bundle.row])
-            step, _ = height_step(bundle.solution, hinges(left_m), falls, SLOPE_SIGMA)
-            falls = falls + step
-            section = self.cross_section = CrossSection(falls, paths)
-            self.sightings = section.flattened(self._seen, bundle.rig)
+            surface, _, step_m = self._better_ground(bundle, self._ground(bundle, surface))
+            self.surface, self.sightings = surface, surface.flattened(self._seen, bundle.rig)
             association = self._associate(bundle.rig)
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
-            if np.abs(step).max() < _SETTLED_SLOPE:
+            if step_m < _SETTLED_M:
                 break
-        _log.info("%s: %s", ", ".join(self.camera_names), sentence_of(falls))
+        _log.info("%s: %s", ", ".join(self.camera_names), surface.sentence)
         return bundle
+
+    def _ground(self, bundle: Bundle, surface: Surface | None) -> Surface:
+        """``surface``, or else the level, along the path that ``bundle`` found."""
+        paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.visit)
+        spline = self._options.ground != CROSS_SECTION
+        return Surface.level(paths, spline) if surface is None else replace(surface, paths=paths)
+
+    def _better_ground(self, bundle: Bundle, surface: Surface) -> tuple[Surface, float, float]:
+        """The likeliest ground from ``surface`` under ``bundle``, its gain, and the step of its heights."""
+        points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
+        columns = surface.seen_columns(points_map, self._seen.frame[bundle.row])
+        better, gain = surface.estimated(*height_information(bundle.solution, columns), self._recorded)
+        step_m = columns @ (better.parameters - surface.parameters)
+        return better, gain, float(np.sqrt(np.mean(step_m**2)))
+
+    def ground_gain(self, bundle: Bundle) -> float:
+        """How much better than its plane a surface would explain ``bundle``, less what noise would (AIC)."""
+        return self._better_ground(bundle, self._ground(bundle, None))[1]
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which sightings make groups."""

@@ -16,10 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faults
-from v2hdm.association.cross_section import CrossSection
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.surface import Surface
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.trajectory import with_clock_offsets
@@ -28,7 +28,7 @@ from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.foreign import foreign_stretch
 from v2hdm.mapping.lanes import Knots, find_knots
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import AUTO, CROSS_SECTION, INCREMENTAL, MappingOptions, SurveyOptions
+from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.stated import name_of
 from v2hdm.records import Drive, FloatArray, ImageDetections
@@ -109,7 +109,7 @@ _MOST_CORRECTIONS = 4
 
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
-"""Faults that bend what a plane looks like: one that a cross-section leaves is the likelier cause."""
+"""Faults that bend what a plane looks like: one that a surface leaves is the likelier cause."""
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
@@ -134,14 +134,14 @@ class Inputs:
         """Of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, drive.road)
 
-    def find_knots(self, rig: Rig, section: CrossSection | None) -> Knots | None:
+    def find_knots(self, rig: Rig, surface: Surface | None) -> Knots | None:
         """The knots of the lanes that take part in the adjustment, found under ``rig``; None if none does."""
         options = self.options.lanes
         if options.model != JOINT:
             return None
-        return find_knots(self.drive, self.detections, self.sightings.cameras, rig, section, options)
+        return find_knots(self.drive, self.detections, self.sightings.cameras, rig, surface, options)
 
     @cached_property
     def tracks(self) -> Association:
@@ -172,15 +172,15 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     while True:
         # 1. Associate and solve, all at once or marking by marking; test the inputs against all else.
         settled, found, worst = _settled(inputs, progress)
-        # 2. Where the drive contradicts the plane, and a cross-section explains all of it, take that.
-        if inputs.options.ground == AUTO and any(_is_bent(one) for one in found):
-            curved = replace(inputs, options=replace(inputs.options, ground=CROSS_SECTION))
+        # 2. Where the drive contradicts the plane, and a surface explains all of it, take that.
+        if inputs.options.ground == AUTO and _is_bent(inputs, settled, found):
+            curved = replace(inputs, options=replace(inputs.options, ground=SURFACE))
             over, tests, rival = _settled(curved, progress)
             explained = rival is None or rival.fault not in _LIKE_GROUND
             is_curved = explained and curved.optimiser.is_curved(over)
             if is_curved:
                 inputs, settled, found, worst = curved, over, tests, rival
-            taken = "a cross-section" if is_curved else "a plane: no cross-section explains the drive"
+            taken = "a surface" if is_curved else "a plane: no surface explains the drive"
             _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
@@ -247,9 +247,11 @@ def _foreign(
     return begin_s, end_s, gain
 
 
-def _is_bent(one: ScoreTest) -> bool:
-    """Whether the ground surely falls or rises beside the route, if only by as little as outliers leave."""
-    return one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS
+def _is_bent(inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest]) -> bool:
+    """Whether the ground surely falls or rises, if only by as little as outliers leave."""
+    if any(one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS for one in found):
+        return True
+    return inputs.optimiser.ground_gain(settled) > CONTRADICTED_SIGMAS**2 / 2
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:

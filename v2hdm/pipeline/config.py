@@ -83,7 +83,8 @@ class RunConfig:
             known at 95 %, else the verdict is WARN (docs/verdict.md).
         mosaic: whether the ground is shown from above, too (docs/report.md).
         viewer: ``rerun`` shows and records the run while it goes on (docs/report.md), ``none`` does not.
-        export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
+        export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``; of the
+            ground: ``geotiff``, ``opencrg`` (docs/exports.md).
     """
 
     name: str | None = None

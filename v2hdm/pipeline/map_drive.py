@@ -34,7 +34,7 @@ from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
-from v2hdm.verdict.results.solution import check_result
+from v2hdm.verdict.results.solution import check_result, over_surface
 from v2hdm.verdict.results.survey import check_corrections, check_known_sizes
 
 _log = logging.getLogger(__name__)
@@ -180,7 +180,8 @@ def _judge(
         unfit += check_corrections(survey.mapping.acceptance.corrections, best)
         reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.control else "poses")
         surveyed = check_survey(survey, best, compared)
-        verdict = Verdict.of([*checked.findings, *found, *unfit, *surveyed, *reached])
+        before = over_surface(checked.findings, best)
+        verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
         judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}

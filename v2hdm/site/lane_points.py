@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from v2hdm.association.cross_section import CrossSection
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shares
+from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
@@ -145,7 +145,7 @@ def ground_by_ipm(
 
 
 def ground_by_rig(
-    drive: Drive, cameras: Sequence[str], rig: Rig, section: CrossSection | None = None
+    drive: Drive, cameras: Sequence[str], rig: Rig, surface: Surface | None = None
 ) -> ImageGround:
     """By optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
     rows, camera = _rows(drive, cameras)
@@ -155,7 +155,7 @@ def ground_by_rig(
     homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
     out = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
     out = out.rolling(rows, camera, frame, poses, rig)
-    if section is None:
+    if surface is None:
         return out
     of_image, frame_of_image = np.full(len(drive.images), -1), frames_of(drive).frame_of_image
     of_image[rows] = camera
@@ -163,7 +163,7 @@ def ground_by_rig(
     def flattened_px(image: IntArray, points_px: FloatArray) -> FloatArray:
         camera, frame = of_image[image], frame_of_image[image]
         cam_from_map = rig.cam_from_map(camera, frame)
-        return section.flattened_px(rig.intrinsic[camera], cam_from_map, frame, points_px)
+        return surface.flattened_px(rig.intrinsic[camera], cam_from_map, frame, points_px)
 
     return replace(out, flattened_px=flattened_px)
 

@@ -102,7 +102,8 @@ class Recipe:
 
     ``default_noise``: the user states no noise of the poses. ``road`` is None for level ground under a
     receiver that records neither height nor roll and pitch; else it records these, with the errors of roll
-    and pitch that ``poses`` has, beside the vehicle's sway.
+    and pitch that ``poses`` has, beside the vehicle's sway. ``relief`` is what the ground does beside:
+    ``grade``, ``ramp`` or ``crest``.
     """
 
     seed: int
@@ -112,12 +113,18 @@ class Recipe:
     detector: DetectorErrors
     default_noise: bool
     road: RoadShape | None
+    relief: str = ""
 
     def as_modelled(self) -> Recipe:
         """The same with all errors stated as they are, and none that the product does not reckon with."""
         poses = replace(self.poses, smooth=False)
         detector = replace(self.detector, sigma_spread=0.0, stated_factor=1.0, missed=0.0, false=0.0, cut=0.0)
         return replace(self, poses=poses, detector=detector, default_noise=False, road=None)
+
+    def recorded(self, relief: str) -> Recipe:
+        """The same under a receiver that records the road, which has this ``relief`` beside its own shape."""
+        road = self.road or RoadShape(5e-4, 40.0, (0.002, -0.002), 1.5 * self.poses.position_drift_m)
+        return replace(self, road=road, relief=relief)
 
     def as_figures(self) -> dict[str, Any]:
         """What was drawn, for the record."""

@@ -141,6 +141,12 @@ def _crown(fall: float, line_m: float, world: World) -> World:
     return replace(world, corners_map=corners)
 
 
+def _relief(relief: str, fall: float, world: World) -> World:
+    """The road as a receiver records it, with relief and a crown."""
+    shaped = make(world.recipe.recorded(relief))
+    return _crown(fall, 0.0, shaped) if fall else shaped
+
+
 def _grade(grade: float, world: World, heights: bool = True) -> World:
     """The world tilted about the map's y axis: recorded as on a real slope, or without the heights."""
     tilt = np.eye(4)
@@ -225,3 +231,14 @@ SPOILS: Mapping[str, Spoil] = {
     )
 }
 """All faults by their names."""
+
+RELIEFS: Mapping[str, Spoil] = {
+    spoil.name: spoil
+    for spoil in (
+        Spoil("level", None, partial(_relief, "", 0.0)),
+        Spoil("grade and crown", None, partial(_relief, "grade", 0.03)),
+        Spoil("ramp", None, partial(_relief, "ramp", 0.0)),
+        Spoil("crest", None, partial(_relief, "crest", 0.0)),
+    )
+}
+"""Ground that is no plane, recorded as it is: nothing is wrong, but that the mapper has to know of it."""

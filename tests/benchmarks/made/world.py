@@ -135,6 +135,17 @@ class Ground:
             return cls(station, level, level, level)
         rng = np.random.default_rng([recipe.seed, _ROAD])
         grade, fall = smooth_noise(station, recipe.road.slope, recipe.road.slope_over_m, rng, 2).T
+        share = (station - station[0]) / (station[-1] - station[0])
+        if recipe.relief == "grade":
+            grade = grade + 0.05
+        elif recipe.relief == "ramp":  # up by 6 % and leaning by 5 %, over 12 m each way, in the middle
+            edge_m = 12.0 / (station[-1] - station[0])
+            up = np.clip(np.minimum(share - 0.3, 0.7 - share) / edge_m, 0.0, 1.0)
+            up = up * up * (3 - 2 * up)
+            grade, fall = grade + 0.06 * up, fall + 0.05 * up
+        elif recipe.relief == "crest":  # of 300 m radius and then a dip, each 20 m long
+            wave = 2 * np.pi * (station - station[0]) / 40.0
+            grade = grade + (20.0 / np.pi / 300.0) * np.sin(wave)
         rise = 0.5 * (grade[1:] + grade[:-1]) * np.diff(station)
         return cls(station, np.concatenate([[0.0], np.cumsum(rise)]), grade, fall)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Mar
 
 CORNERS, POINTS, OUTLINE = "corners_map", "points_map", "outline_map"
 """Properties with the exact local coordinates of a marking's corners, a lane's points, a symbol's outline."""
+
+Heights = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Heights (N,) of points (N, 2), m, and their standard deviations (N,)."""
+
+T = TypeVar("T", Marking, Lane, Symbol)
 
 _ALONG_M = 3.0  # stations within about this of the nearest one share in a point's height: noise averages out
 _AT_ONCE = 1024  # points whose distances to all stations are held in memory together
@@ -27,7 +32,7 @@ class Feature:
     one is a marking of four corners unless it is a ``symbol``, of which ``place_sigma_m`` may be known.
     ``heights_m`` (N,) are those of the ground there in the map frame, None where it is the plane z = 0.
     ``covariance_m2`` (2N, 2N) is that of the stacked points, ``vertex_sigma_m`` (N,) how well a lane's
-    vertices are known across it; None where that is not known.
+    vertices are known across it, ``heights_sigma_m`` (N,) the heights; None where that is not known.
     """
 
     id: int
@@ -38,6 +43,7 @@ class Feature:
     heights_m: FloatArray | None = None
     covariance_m2: FloatArray | None = None
     relative_sigma_m: float | None = None
+    heights_sigma_m: FloatArray | None = None
     symbol: bool = False
     place_sigma_m: float | None = None
     vertex_sigma_m: FloatArray | None = None
@@ -97,6 +103,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
             sigma_m, points = one.relative_sigma_m, one.corners_map
             more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m}
         closed = not isinstance(one, Lane)
+        more["heights_sigma_m"] = one.heights_sigma_m
         features.append(Feature(number, one.kind, points, one.sightings, closed, one.heights_m, **more))
     return features
 
@@ -109,11 +116,12 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
     for one, number in zip(features, ids, strict=True):
         own = (one.kind, one.points_map, one.sightings)
         if one.symbol:
-            symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number))
+            symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m))
         elif one.closed:
-            markings.append(Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number))
+            marking = Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number)
+            markings.append(replace(marking, heights_sigma_m=one.heights_sigma_m))
         else:
-            lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m))
+            lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m, one.heights_sigma_m))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
@@ -136,6 +144,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "sightings": feature.sightings,
         feature.key: feature.points_map,
         "heights_m": feature.heights_m,
+        "heights_sigma_m": feature.heights_sigma_m,
         "sigma_m": feature.sigma_m,
         "covariance_m2": feature.covariance_m2,
         "relative_sigma_m": feature.relative_sigma_m,
@@ -148,27 +157,28 @@ def properties_of(feature: Feature) -> dict[str, Any]:
     }
 
 
-def with_heights(
-    hd_map: HdMap, road: Road | None, above_m: Callable[[FloatArray], FloatArray] | None = None
-) -> HdMap:
-    """``hd_map`` with the recorded height of every corner and vertex; as it is without a ``road``.
+def with_heights(hd_map: HdMap, road: Road | None, surface: Heights | None = None) -> HdMap:
+    """``hd_map`` with the height of every corner and vertex; as it is without a ``road`` or ``surface``.
 
-    What has heights already, of an earlier drive, keeps them. ``above_m`` gives the heights (N,) of the
-    ground at points (N, 2) above the road's planes.
+    What has heights already, of an earlier drive, keeps them. ``surface`` gives the heights (N,) of the
+    ground at points (N, 2) above the road's planes, with their standard deviations.
     """
-    if road is None and above_m is None:
+    if road is None and surface is None:
         return hd_map
 
-    def height_m(known: FloatArray | None, points_map: FloatArray) -> FloatArray:
-        if known is not None:
-            return known
-        recorded = np.zeros(len(points_map)) if road is None else ground_height_m(road, points_map)
-        return recorded if above_m is None else recorded + above_m(points_map)
+    def raised(one: T, points_map: FloatArray) -> T:
+        if one.heights_m is not None:
+            return one
+        heights_m = np.zeros(len(points_map)) if road is None else ground_height_m(road, points_map)
+        above_m, sigma_m = (0.0, None) if surface is None else surface(points_map)
+        return replace(one, heights_m=heights_m + above_m, heights_sigma_m=sigma_m)
 
-    markings = tuple(replace(m, heights_m=height_m(m.heights_m, m.corners_map)) for m in hd_map.markings)
-    lanes = tuple(replace(one, heights_m=height_m(one.heights_m, one.points_map)) for one in hd_map.lanes)
-    symbols = tuple(replace(s, heights_m=height_m(s.heights_m, s.outline_map)) for s in hd_map.symbols)
-    return replace(hd_map, markings=markings, lanes=lanes, symbols=symbols)
+    return replace(
+        hd_map,
+        markings=tuple(raised(one, one.corners_map) for one in hd_map.markings),
+        lanes=tuple(raised(one, one.points_map) for one in hd_map.lanes),
+        symbols=tuple(raised(one, one.outline_map) for one in hd_map.symbols),
+    )
 
 
 def ground_height_m(road: Road, points_map: FloatArray) -> FloatArray:

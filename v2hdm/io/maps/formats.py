@@ -1,8 +1,8 @@
 """The formats that a map is written in: their registry, and DXF for CAD and CSV for surveyors.
 
 In DXF, extended data (XDATA) of the application ``V2HDM`` at each polyline hold what CAD has no word for:
-strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m`` and the rows of
-``covariance_m2``.
+strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``heights_sigma_m`` and
+the rows of ``covariance_m2``.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from v2hdm.extras import need
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.ground import write_ground_geotiff, write_opencrg
 from v2hdm.io.maps.lanelet2 import write_lanelet2
 from v2hdm.io.maps.reading import Verdict
 from v2hdm.records import GeodeticOrigin, HdMap
@@ -55,6 +56,9 @@ def write_dxf(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
         data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
         if feature.relative_sigma_m is not None:
             data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
+        if feature.heights_sigma_m is not None:
+            sigmas_m = feature.heights_sigma_m[feature.ring].tolist()
+            data += [(_TEXT, "heights_sigma_m"), *((_REAL, value) for value in sigmas_m)]
         if (covariance := feature.ring_covariance_m2) is not None:
             data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
         line.set_xdata(APPLICATION, data)
@@ -65,7 +69,7 @@ def write_dxf(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = Non
 COLUMNS: tuple[str, ...] = (
     *("id", "class", "point", "x_map_m", "y_map_m", "height_m"),
     *("longitude_deg", "latitude_deg", "ellipsoidal_height_m"),
-    *("sigma_x_m", "sigma_y_m", "sightings", "relative_sigma_m"),
+    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sightings", "relative_sigma_m"),
     *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, 5) for other in "xy"),
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
@@ -91,14 +95,16 @@ def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:
     relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
-        height = "" if feature.heights_m is None else float(feature.heights_m[k])
+        z, sigma_z = (
+            "" if one is None else float(one[k]) for one in (feature.heights_m, feature.heights_sigma_m)
+        )
         sigmas: list[Any] = ["", ""]
         covariances: list[Any] = [""] * 16
         if feature.covariance_m2 is not None:
             own = feature.covariance_m2[2 * k : 2 * k + 2]
             sigmas = np.sqrt(np.diag(own[:, 2 * k : 2 * k + 2])).tolist()
             covariances = own.ravel().tolist()
-        row = [feature.id, feature.kind, k + 1, x, y, height, *geodetic[k], *sigmas]
+        row = [feature.id, feature.kind, k + 1, x, y, z, *geodetic[k], *sigmas, sigma_z]
         rows.append([*row, feature.sightings, relative, *covariances])
     return rows
 
@@ -121,12 +127,21 @@ FORMATS: Mapping[str, Format] = {
 }
 
 
+GROUND_FORMATS: Mapping[str, Format] = {
+    "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio"),
+    "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg"),
+}
+"""Of the ground's surface, which a map has as the run's result, but not from its files."""
+
+_ALL = {**FORMATS, **GROUND_FORMATS}
+
+
 def check_formats(names: Sequence[str], key: str) -> None:
     """Refuse unknown formats, given by ``key``, and those whose packages are not installed."""
     for name in names:
-        if name not in FORMATS:
-            raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(FORMATS)}")
-        if (package := FORMATS[name].needs) is not None:
+        if name not in _ALL:
+            raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(_ALL)}")
+        if (package := _ALL[name].needs) is not None:
             need(package, "gis", f"the format {name}", ConfigError)
 
 
@@ -147,8 +162,14 @@ def write_map(
     check_formats(formats, "formats")
     written = []
     for chosen in dict.fromkeys(formats):
-        path = folder / FORMATS[chosen].file.format(name=name)
-        write = FORMATS[chosen].write
+        path = folder / _ALL[chosen].file.format(name=name)
+        if chosen in GROUND_FORMATS and not hd_map.ground:
+            _log.warning(
+                "%s is not written: the map holds no surface of the ground; map the drive with "
+                "mapping.ground=surface, or auto where it is no plane", path.name,
+            )  # fmt: skip
+            continue
+        write = _ALL[chosen].write
         if chosen == "lanelet2":
             write = partial(write_lanelet2, projector=projector)
         write(hd_map, path, verdict)

@@ -42,7 +42,11 @@ _TEXT_ROUNDING, _BINARY_ROUNDING, _LOCAL_ROUNDING_M = (1e-9, 1e-9, 1e-4), (1e-11
 RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
 """Members of GeoJSON that state how coordinates are rounded, m or degrees, for GDAL since 3.9."""
 
-EXACT = ("heights_m", "covariance_m2")  # columns of a GeoPackage with JSON, beside the coordinates
+EXACT = (
+    "heights_m",
+    "heights_sigma_m",
+    "covariance_m2",
+)  # columns of a GeoPackage with JSON, beside the coordinates
 LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 """Layers of a GeoPackage by the property that holds the coordinates of their features."""
 
@@ -236,6 +240,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         sightings=optional("sightings", take_whole, 0, _MOST_SIGHTINGS) or 0,
         closed=closed,
         heights_m=optional("heights_m", take_array, (len(points),)),
+        heights_sigma_m=optional("heights_sigma_m", take_array, (len(points),)),
         covariance_m2=optional("covariance_m2", take_covariance, 2 * len(points)),
         relative_sigma_m=optional("relative_sigma_m", take_number),
         symbol=symbol,

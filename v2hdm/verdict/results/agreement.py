@@ -14,7 +14,7 @@ from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking
-from v2hdm.verdict.verdict import Finding, judge
+from v2hdm.verdict.verdict import Finding, Status, judge
 
 SAME_M = 1.0  # centres of one marking in the maps of two cameras lie closer than this
 _LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
@@ -31,6 +31,9 @@ _LEAST_TURN_DEG, _LEAST_HEIGHT_M = 0.2, 0.04
 _OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
 # Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint.
 _DOUBLES_LIMIT = 0.02
+# Passes of one place drive within so much of each other, after so much of the way; on another storey of a
+# car park they are farther above. Heights are twice as noisy as positions.
+_SAME_PLACE_M, _ANOTHER_PASS_M, _STOREY_M, _HEIGHT_NOISE, _SURE_SIGMAS = 2.0, 20.0, 1.8, 2.0, 5.0
 # Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree.
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
 
@@ -200,3 +203,30 @@ def _overlap(first: FloatArray, second: FloatArray) -> float:
     origin = first.mean(axis=0)
     shared, _ = cv2.intersectConvexConvex(first - origin, second - origin)
     return float(shared) / max(area, 1e-6)
+
+
+def check_heights(drive: Drive) -> Iterator[Finding]:
+    """Whether the heights that were recorded agree where a place was passed more than once."""
+    road, sigma_m = drive.road, _HEIGHT_NOISE * drive.pose_noise.position_m
+    if road is None or len(road.points_map) < 2:
+        return
+    step_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
+    way_m = np.concatenate([[0.0], np.cumsum(step_m)])
+    one, other = KDTree(road.points_map).query_pairs(_SAME_PLACE_M, output_type="ndarray").T
+    again = np.abs(way_m[other] - way_m[one]) > _ANOTHER_PASS_M
+    one, other = one[again], other[again]
+    between = road.points_map[other] - road.points_map[one]
+    rise = np.einsum("ni,ni->n", between, road.slope[one] + road.slope[other]) / 2
+    off_m = np.abs(road.height_m[other] - road.height_m[one] - rise)
+    off_m[off_m > _STOREY_M] = 0.0
+    if not len(off_m):
+        return
+    worst = int(off_m.argmax())
+    x, y = road.points_map[one[worst]]
+    yield judge(
+        "heights", "poses", float(off_m[worst]), float(_SURE_SIGMAS * np.sqrt(2.0) * sigma_m), "m",
+        fine="the recorded heights of all passes agree",
+        wrong=f"at x {x:.0f} m, y {y:.0f} m the heights of two passes differ by {off_m[worst]:.2f} m: check "
+        "the receiver's fix on both; heights of the map there are as uncertain, its plan is not",
+        status=Status.WARN,
+    )  # fmt: skip

@@ -9,7 +9,7 @@ and spoilt drives.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,12 @@ from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.markings import TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
-from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
+from v2hdm.verdict.results.agreement import (
+    check_against_ground,
+    check_agreement,
+    check_doubles,
+    check_heights,
+)
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 BEST = "Opt"  # the method whose map is the result
@@ -123,6 +128,17 @@ def check_result(
     return findings
 
 
+def over_surface(findings: Iterable[Finding], best: MethodResult) -> list[Finding]:
+    """The findings on the inputs, without those that ground bends which is mapped as a surface."""
+    if not best.hd_map.ground:
+        return list(findings)
+    fine = "the ground bends, and is mapped as a surface"
+    return [
+        replace(one, status=Status.PASS, says=fine, limit=None) if one.check == "road" else one
+        for one in findings
+    ]
+
+
 def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult]]) -> list[Finding]:
     """All checks after the solve; arguments as for :func:`check_result`."""
     best = list(methods.values())[-1][BEST]
@@ -131,7 +147,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
     if best.evidence is not None:
         causes = check_inputs(best.evidence)
         symptoms = [*check_fit(best.evidence), _excluded(best)]
-    symptoms += check_doubles(best)
+    symptoms += [*check_doubles(best), *check_heights(drive)]
     if len(methods) > 1:
         symptoms += check_agreement({name: by_method[BEST] for name, by_method in methods.items()}, drive)
     named = next((finding for finding in causes if finding.status is Status.FAIL), None)

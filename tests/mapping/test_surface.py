@@ -1,0 +1,250 @@
+"""Ground that is no plane: pixels moved to the plane, the surface found, and maps of roads with relief."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyopencrg
+import pytest
+import rasterio
+from scipy.sparse import csr_array
+
+from tests.adjust.scene import make_scene
+from tests.benchmarks.made.draw import draw
+from tests.benchmarks.right_drives import Job, map_one
+from tests.mapping.scene import SceneOptions
+from tests.mapping.scene import make_scene as make_yard
+from v2hdm.adjust import SolveOptions, height_information, solve
+from v2hdm.association.sightings import Rig, collect_sightings
+from v2hdm.association.surface import KNOTS_M, Paths, Recorded, Surface
+from v2hdm.geometry.rigid import apply, rotation_from_euler
+from v2hdm.io.maps.formats import write_map
+from v2hdm.records import HdMap, PoseNoise, Road
+
+FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
+INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
+SEED = 4
+"""Of a drive on level ground, 43 markings."""
+MOUNT = np.array([[0.0, -1, 0, 0], [-0.35, 0, -0.94, 1.6], [0.94, 0, -0.35, -0.9], [0, 0, 0, 1]])
+
+
+def arc(frames=60, radius_m=40.0, step_m=0.6):
+    """Poses along a bend to the left, level."""
+    yaw = np.arange(frames) * step_m / radius_m
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :3] = rotation_from_euler(0 * yaw, 0 * yaw, yaw)
+    poses[:, :2, 3] = radius_m * np.column_stack([np.sin(yaw), 1 - np.cos(yaw)])
+    return poses
+
+
+def ground_of_arc(points_map, radius_m=40.0):
+    """Heights by the distance from the circle itself, slope by slope."""
+    left = radius_m - np.linalg.norm(points_map - [0.0, radius_m], axis=1)
+    height = -FALLS[0] * np.abs(left)
+    for fall, side, knot in zip(FALLS[1:], np.repeat([1, -1], len(KNOTS_M)), 2 * KNOTS_M, strict=True):
+        height -= fall * np.maximum(side * left - knot, 0)
+    return height
+
+
+def projected(cam_from_map, points_map, height_m):
+    """Pixels (K, 2) of points (K, 2) at heights (K,), each of a camera (K, 4, 4) of its own."""
+    points = np.column_stack([points_map, height_m, np.ones(len(height_m))])
+    cam = np.einsum("kij,kj->ki", cam_from_map, points)[:, :3]
+    return (cam / cam[:, 2:] @ INTRINSIC.T)[:, :2]
+
+
+def seen_from(poses, rng, count=400):
+    """Cameras, frames and points (K, 2) some metres ahead of them, to both sides."""
+    turn = np.linalg.qr(MOUNT[:3, :3])[0]
+    mount = np.eye(4)
+    mount[:3, :3] = turn * np.sign(np.sum(turn * MOUNT[:3, :3], axis=0))
+    mount[:3, 3] = -mount[:3, :3] @ [1.2, 0.1, 1.7]
+    frame = rng.integers(5, len(poses) - 25, count)
+    ahead = np.column_stack([rng.uniform(4, 14, count), rng.uniform(-7, 7, count), 0 * frame])
+    points = np.array([apply(poses[f], p[None])[0, :2] for f, p in zip(frame, ahead, strict=True)])
+    return mount @ np.linalg.inv(poses[frame]), frame, points
+
+
+def test_a_moved_pixel_is_the_plane_s_where_the_ground_s_point_is_projected():
+    poses, rng = arc(), np.random.default_rng(1)
+    cam_from_map, frame, points = seen_from(poses, rng)
+    section = Surface(Paths.of(poses, np.zeros(len(poses), dtype=np.int64)), FALLS, 0 * np.diag(FALLS))
+    height = ground_of_arc(points)
+    assert np.abs(height).max() > 0.2
+    # Between the places of the path a chord is up to 5 mm off the circle.
+    assert np.abs(section.seen_height_m(points, frame) - height).max() < 5e-4
+    plane, intrinsic = projected(cam_from_map, points, 0 * height), np.tile(INTRINSIC, (len(frame), 1, 1))
+    for z, most_px in ((section.seen_height_m(points, frame), 1e-6), (height, 0.1)):
+        moved = section.flattened_px(intrinsic, cam_from_map, frame, projected(cam_from_map, points, z))
+        assert np.abs(moved - plane).max() < most_px
+
+
+def test_ground_without_slopes_changes_no_pixel():
+    scene = make_yard(SceneOptions(length_m=40.0))
+    seen = collect_sightings(scene.drive, scene.detections, ("front",))
+    extrinsic = scene.cam_from_vehicle["front"][None]
+    rig = Rig(scene.drive.cameras["front"].info.intrinsic[None], extrinsic, seen.map_from_vehicle)
+    flat = Surface.level(Paths.of(seen.map_from_vehicle, seen.visit)).flattened(seen, rig)
+    known = seen.informs
+    np.testing.assert_allclose(flat.corners_pinhole_px[known], seen.corners_pinhole_px[known], atol=1e-7)
+    np.testing.assert_allclose(flat.covariance_px[known], seen.covariance_px[known], rtol=1e-6, atol=1e-9)
+
+
+def test_a_vehicle_that_stands_backs_up_or_comes_again_keeps_its_left():
+    there = arc()
+    rng = np.random.default_rng(3)
+    waits = there[[19] * 15]
+    waits[:, :2, 3] += rng.normal(0.0, 0.01, (15, 2))
+    poses = np.concatenate([there[:20], waits, there[19:5:-1], there[5:], there])
+    visit = np.repeat([0, 1], [len(poses) - len(there), len(there)])
+    paths = Paths.of(poses, visit)
+    frame = rng.integers(0, len(poses), 300)
+    off = rng.uniform(-6, 6, 300)
+    beside = poses[frame, :2, 3] + off[:, None] * poses[frame, :2, 1]
+    _, left = paths.beside(beside, frame)
+    np.testing.assert_allclose(left, off, atol=0.1)  # where it backs up the path has a tip
+
+
+def way(poses):
+    return Paths.of(poses, np.zeros(len(poses), dtype=np.int64))
+
+
+def test_a_pixel_of_any_surface_is_moved_to_where_the_plane_would_show_its_place():
+    poses, rng = arc(), np.random.default_rng(5)
+    cam_from_map, frame, points = seen_from(poses, rng)
+    level = Surface.level(way(poses))
+    surface = replace(level, parameters=rng.normal(0.0, 0.05, len(level.parameters)))
+    height, intrinsic = surface.seen_height_m(points, frame), np.tile(INTRINSIC, (len(frame), 1, 1))
+    assert np.std(height) > 0.1
+    seen, plane = (projected(cam_from_map, points, z) for z in (height, 0 * height))
+    moved = surface.flattened_px(intrinsic, cam_from_map, frame, seen)
+    # Behind a ridge a ray meets the ground before it gets there.
+    assert np.quantile(np.abs(moved - plane).max(axis=1), 0.9) < 1e-5
+    columns = surface.seen_columns(points, frame)
+    np.testing.assert_allclose(columns @ surface.parameters, height, atol=1e-12)
+
+
+def test_ground_that_is_a_plane_is_seen_as_one_however_it_leans():
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 0, 3] = 0.6 * np.arange(60)
+    surface = Surface.level(way(poses))
+    along, across = np.meshgrid(np.arange(surface.knots[2]) - 1, np.arange(7) - 3, indexing="ij")
+    spline = 0.05 * surface.knots[1] * along + 0.03 * 5.0 * across  # a cubic spline's own grade and bank
+    surface = replace(surface, parameters=np.concatenate([0 * FALLS, spline.ravel()]))
+    rng = np.random.default_rng(6)
+    frame = rng.integers(0, 60, 200)
+    points = poses[frame, :2, 3] + np.column_stack([rng.uniform(2, 15, 200), rng.uniform(-8, 8, 200)])
+    assert np.abs(surface.seen_height_m(points, frame)).max() < 1e-9
+    height, _ = surface.height_m(points)
+    rise = 0.05 * (points[:, 0] - points[0, 0]) + 0.03 * (points[:, 1] - points[0, 1])
+    np.testing.assert_allclose(height - height[0], rise, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", ["plane", "crest", "bank"])
+def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_for_it(shape):
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, 0, 3] = 0.6 * np.arange(200)
+
+    def ground(points):
+        if shape == "crest":
+            return 0.3 * np.cos(points[:, 0] / 12.0)
+        return np.clip((points[:, 0] - 30.0) / 40.0, 0, 1) * 0.05 * points[:, 1] * (shape == "bank")
+
+    rng, sigma_m = np.random.default_rng(7), 0.01
+    line = np.column_stack([poses[:, 0, 3], np.zeros(200)])
+    slope = np.column_stack(
+        [np.gradient(ground(line), line[:, 0]), ground(line + np.array([0, 1])) - ground(line)]
+    )
+    # Receivers err alike over a while.
+    apart = np.abs(line[:, :1] - line[:, 0])
+    long, short = (
+        np.linalg.cholesky(np.exp(-apart / over_m) + 1e-9 * np.eye(200)) for over_m in (30.0, 10.0)
+    )
+    height = ground(line) + 0.015 * long @ rng.normal(size=200)
+    road = Road(line, height, slope + 0.004 * short @ rng.normal(size=(200, 2)))
+    frame = rng.integers(0, 175, 3000)
+    points = line[frame] + np.column_stack([rng.uniform(2, 15, 3000), rng.uniform(-8, 8, 3000)])
+    level = Surface.level(way(poses))
+    plane = ground(line)[frame] + np.einsum("ki,ki->k", slope[frame], points - line[frame])
+    seen = ground(points) - plane + rng.normal(0.0, sigma_m, 3000)
+    columns = level.seen_columns(points, frame)
+    noise = PoseNoise(position_m=0.01, position_drift_m=0.01, position_drift_over_m=30.0)
+    information, score = (columns.T @ columns).toarray() / sigma_m**2, -columns.T @ seen / sigma_m**2
+    found, gain = level.estimated(information, score, Recorded.of(road, noise))
+    height, stated = found.height_m(points)
+    off = height - ground(points)
+    assert np.sqrt(np.mean(off**2)) < 0.02
+    assert 0.5 < np.sqrt(np.mean((off / stated) ** 2)) < 1.5
+    assert (gain < 8.0) if shape == "plane" else (gain > 100.0)
+
+
+def test_the_ground_of_a_map_is_the_same_in_files(tmp_path):
+    level = Surface.level(way(arc()))
+    along, across = np.meshgrid(np.arange(level.knots[2]), np.arange(7), indexing="ij")
+    smooth = np.concatenate([0 * FALLS, (0.3 * np.sin(along / 2) + 0.1 * np.cos(across / 2)).ravel()])
+    surface = replace(level, parameters=smooth, covariance=1e-4 * np.eye(len(smooth)), datum_m=80.0)
+    strips = surface.strips()
+    paths = write_map(HdMap((), ground=strips), tmp_path, "map", ["geotiff", "opencrg"])
+    spots = np.concatenate([strips[0].points(d)[5:-5:4] for d in (-6.1, 0.2, 5.3)])
+    true, sigma = surface.height_m(spots)
+    assert np.ptp(true) > 0.3
+    with rasterio.open(paths[0]) as raster:
+        height, stated = np.array(list(raster.sample(spots))).T
+    np.testing.assert_allclose(height, true, atol=0.05)  # of the nearest of cells of 25 cm
+    assert np.median(np.abs(height - true)) < 0.01
+    np.testing.assert_allclose(stated, sigma, rtol=0.2)
+    road = pyopencrg.read(str(paths[1]))
+    np.testing.assert_allclose([road.xy_to_z(x, y) for x, y in spots], true, atol=0.01)
+
+
+def test_a_map_over_a_plane_gets_no_file_of_its_ground_and_is_told_so(tmp_path, caplog):
+    assert write_map(HdMap(()), tmp_path, "map", ["opencrg"]) == []
+    assert "map_ground.crg is not written: the map holds no surface" in caplog.text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("engine", ["numba", "torch"])
+def test_a_step_of_heights_is_that_to_the_least_cost_of_everything_anew(engine):
+    scene = make_scene(3, frames=40, start_error_deg=0.1, start_error_m=0.01)
+    options, seen = SolveOptions(loss="none", engine=engine, coarse=False), scene.problem.observations
+    corners = scene.corners_map[seen.corner]
+    away = corners - scene.map_from_vehicle[seen.frame][:, :2, 3]
+    heights = -0.5 * np.abs(np.sum(away * scene.map_from_vehicle[seen.frame][:, :2, 1], axis=1))
+    pose = scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(scene.map_from_vehicle[seen.frame])
+    camera = scene.problem.intrinsic[seen.camera]
+
+    def pixels(z):
+        cam = np.einsum("kij,kj->ki", pose, np.column_stack([corners, z, np.ones(len(z))]))[:, :3]
+        return camera[:, :2] * cam[:, :2] / cam[:, 2:] + camera[:, 2:]
+
+    def cost(share):
+        moved = seen.pinhole_px - pixels(share * heights) + pixels(0 * heights)
+        return solve(replace(scene.problem, observations=replace(seen, pinhole_px=moved)), options)
+
+    low, middle, high = (cost(share) for share in (-0.01, 0.0, 0.01))
+    slope, bend = (high.cost - low.cost) / 0.02, (high.cost - 2 * middle.cost + low.cost) / 1e-4
+    information, gradient = height_information(middle, csr_array(heights[:, None]))
+    sigma = information[0, 0] ** -0.5
+    assert sigma == pytest.approx(bend**-0.5, rel=0.05)
+    assert -gradient[0] / information[0, 0] == pytest.approx(-slope / bend, abs=0.05 * sigma)
+
+
+@pytest.fixture(scope="module")
+def plane():
+    assert draw(SEED).road is None
+    return map_one(Job(SEED))
+
+
+@pytest.mark.parametrize(("relief", "height_m"), [("crown beside", 0.01), ("crest", 0.04)])
+def test_a_road_with_a_crown_or_crests_is_mapped_as_well_as_a_plane(plane, relief, height_m):
+    # A roll of the recording sensor by 2 mrad, which a straight road does not show, leans recorded ground.
+    curved = map_one(Job(SEED, spoil=relief, ground="auto"))
+    assert curved.status == plane.status == "PASS"
+    assert curved.rmse_m <= 1.2 * plane.rmse_m
+    assert curved.markings >= plane.markings
+    assert curved.height_rmse_m <= height_m
+
+
+def test_a_plane_stays_one_to_the_last_bit(plane):
+    auto = map_one(Job(SEED, ground="auto"))
+    assert np.isnan(auto.height_rmse_m)
+    assert (auto.rmse_m, auto.errors) == (plane.rmse_m, plane.errors)

@@ -1,0 +1,480 @@
+r"""The ground where it is no plane: its heights along and beside the path, and pixels as of a plane.
+
+Everything else of the mapping knows the plane z = 0 on which the vehicle stands. The ground's height at the
+way s along the path, d to its left, is
+
+.. math:: H(s, d) = -a_0 |d| - \sum_k a_k \max(0, \pm d - d_k) + \sum_{ij} c_{ij} B_i(s) B_j(d),
+
+a cross-section alike along the route, whose slopes change at the path and at knots beside it (a crown), and a
+bicubic spline: grade, bank, ramps, crests and dips. Of its priors, slopes a are 0 +- 3 %; second
+differences of c along, across and both ways have a standard deviation each, estimated from the drive by its
+marginal likelihood, so that a plane is what is left where nothing speaks against it; on the path heights and
+slopes are the recorded ones (:mod:`v2hdm.io.drive.road`), within their noise.
+
+A frame sees heights above the plane on which the vehicle stands there, which touches H: planes are none of
+it.
+So that no engine, association or lane fit has to know of H, pixels are moved to where the image would show
+the same place of the map on that plane (:meth:`Surface.flattened`), covariances with them. Under the
+poses by which they are moved, a corner then fits its pixels exactly where its point on the ground does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import block_diag, cholesky, solve_triangular
+from scipy.optimize import minimize
+from scipy.sparse import csr_array, diags_array, hstack
+from scipy.spatial import cKDTree
+
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
+
+KNOTS_M = (1.75, 3.5, 5.25)
+"""Where beside the path the slope may change: every half lane of 3.5 m. A crown lies along a lane line, half
+a lane or one and a half from the middle of the vehicle's own; one elsewhere is smoothed by 2 cm at most."""
+
+_SLOPE_SIGMA = 0.03
+"""Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
+Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
+
+_HINGES = 1 + 2 * len(KNOTS_M)
+_ALONG_M, _ACROSS_M = 6.0, 5.0
+"""Between knots of the spline: a third of a camera's reach, and a lane with its margins."""
+
+_GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and how far to either side it goes
+_SIDE_M = 10.0  # ground farther beside the path is as high as there, but for the cross-section
+_ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
+_MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
+_WHEELS_M = (1.4, 0.8)  # half of wheelbase and track, over which the slope is the vehicle's
+
+_CURVATURE = 1e-3
+"""Usual size of the second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m."""
+_SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
+
+_STATION_M = 1.0  # nearer frames are one place of the path: a vehicle that stands drives none in its noise
+_AHEAD_M = 30.0  # beyond this way, ahead or behind, the path is another time's
+_REACH_M = 40.0  # ground farther from the camera stays as it is: H is known beside the path alone
+_STEPS = 12  # of the secant method, where four to six are enough
+_SURE_M = 1e-7  # of its end
+_STEP_PX = 0.5  # of the differences by pixel
+_LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell from the road's, all the way
+_MOST_RECORDED = 500  # places of the path whose records are taken, evenly
+_RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The heights and slopes that were recorded on the path: the ``road``, None where it is level.
+
+    Errors of heights, m, and of slopes are sums of processes: standard deviation, and the way in m over which
+    they fade.
+    """
+
+    road: Road | None
+    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)
+    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)
+
+    @classmethod
+    def of(cls, road: Road | None, noise: PoseNoise) -> Recorded:
+        """Of a drive: satellite heights are half again as uncertain as positions; level ground is a guess.
+
+        The road's heights and slopes are means over ten metres: of what scatters from pose to pose, a third
+        is left.
+        """
+        if road is None:
+            return cls(None)
+        drift_m = noise.position_drift_m
+        white_m = np.sqrt(max(noise.position_m**2 - drift_m**2, 0.0)) / 3
+        heights = ((1.5 * drift_m, noise.position_drift_over_m), (1.5 * float(white_m), 10.0))
+        return cls(road, heights, ((0.004, 10.0),))
+
+    def at(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Heights (N,) and slopes (N, 2) by map x and y at points (N, 2) of the path."""
+        if self.road is None:
+            return np.zeros(len(points_map)), np.zeros((len(points_map), 2))
+        _, near = cKDTree(self.road.points_map).query(points_map)
+        slope, off = self.road.slope[near], points_map - self.road.points_map[near]
+        return self.road.height_m[near] + np.einsum("ni,ni->n", slope, off), slope
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The paths of a drive's visits through F frames.
+
+    Attributes:
+        place: (F,) the place, of N, that each frame is at.
+        points_map: (N, 2) m.
+        ahead: (N, 2) unit vectors of the vehicle's heading.
+        sense: (N,) 1 where it drives that way, -1 backwards.
+        station_m: (N,) the way, rising with it, through one visit after the other.
+        bounds_m: (F, 2) stations between which a frame's ground is looked for.
+        position_map: (F, 2) m, of the vehicle.
+        heading: (F, 2) unit vectors.
+        visit_ends: (V, 2) stations at which each visit begins and ends.
+    """
+
+    place: IntArray
+    points_map: FloatArray
+    ahead: FloatArray
+    sense: FloatArray
+    station_m: FloatArray
+    bounds_m: FloatArray
+    position_map: FloatArray
+    heading: FloatArray
+    visit_ends: FloatArray
+
+    @classmethod
+    def of(cls, map_from_vehicle: FloatArray, visit: IntArray) -> Paths:
+        """Of poses (F, 4, 4) of the frames of visits (F,), each in driving order."""
+        points, first = map_from_vehicle[:, :2, 3], [0]
+        for frame in range(1, len(points)):
+            last = first[-1]
+            if visit[frame] != visit[last] or np.hypot(*(points[frame] - points[last])) >= _STATION_M:
+                first.append(frame)
+        place = np.zeros(len(points), dtype=np.int64)
+        place[first[1:]] = 1
+        place = np.cumsum(place)
+        at, ahead = points[first], map_from_vehicle[first][:, :2, 0]
+        step, begins = np.diff(at, axis=0), np.append(True, np.diff(visit[first]) != 0)
+        # Visits lie apart, so that none reaches into the ground of the next.
+        way_m = np.where(begins[1:], 2 * _AHEAD_M, np.linalg.norm(step, axis=1))
+        station = np.concatenate([[0.0], np.cumsum(way_m)])
+        # The step that a place ends has its sense, or where a visit begins the one that follows.
+        forwards = np.where(np.einsum("ni,ni->n", step, ahead[1:]) < 0, -1.0, 1.0)
+        sense = np.where(begins, np.append(forwards, 1.0), np.append(1.0, forwards))
+        span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
+        here = station[place][:, None] + np.array([-_AHEAD_M, _AHEAD_M])
+        bounds = np.clip(here, *np.array([span[v] for v in visit.tolist()]).T[:, :, None])
+        heading = map_from_vehicle[:, :2, 0] / np.linalg.norm(
+            map_from_vehicle[:, :2, 0], axis=1, keepdims=True
+        )
+        return cls(
+            place,
+            at,
+            heading[first],
+            sense,
+            station,
+            bounds,
+            points,
+            heading,
+            np.array(list(span.values())),
+        )
+
+    def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
+        """The stations of points (K, 2) on the path near frames (K,), and how far (K,) they lie to the left.
+
+        Beyond the path's ends it goes on straight.
+        """
+        station, bounds = self.station_m[self.place[frame]], self.bounds_m[frame].T
+        for _ in range(4):
+            at, ahead, sense = self.at(station)
+            along = np.einsum("ki,ki->k", points_map - at, ahead) * sense
+            station = np.clip(station + along, *bounds)
+        at, ahead, sense = self.at(station)
+        off = points_map - at
+        beyond = np.einsum("ki,ki->k", off, ahead) * sense
+        return station + beyond, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]
+
+    def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Points (K, 2) of the path at stations (K,), unit vectors of the heading there, and its sense."""
+        columns = np.column_stack([self.points_map, self.ahead])
+        at = np.column_stack([np.interp(station_m, self.station_m, one) for one in columns.T])
+        ahead = at[:, 2:] / np.maximum(np.linalg.norm(at[:, 2:], axis=1, keepdims=True), 1e-9)
+        near = np.searchsorted(self.station_m, station_m).clip(max=len(self.station_m) - 1)
+        return at[:, :2], ahead, self.sense[near]
+
+    def nearest_frame(self, points_map: FloatArray) -> IntArray:
+        """The frame (K,) at the place nearest to each point (K, 2)."""
+        _, place = cKDTree(self.points_map).query(points_map)
+        return np.asarray(np.searchsorted(self.place, place), dtype=np.int64)
+
+
+def _hinges(left_m: FloatArray) -> FloatArray:
+    """The heights (K, B) that a unit of each slope of a cross-section gives to points (K,) to the left."""
+    sides = [np.maximum(side * left_m - knot, 0.0) for side in (1.0, -1.0) for knot in KNOTS_M]
+    return -np.column_stack([np.abs(left_m), *sides])
+
+
+def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntArray, FloatArray]:
+    """The four of ``count`` uniform cubic B-splines (K, 4) that places (K,) lie in, with their values."""
+    place = np.clip((at - first) / step, 0.0, count - 3 - 1e-9)
+    begin = np.floor(place).astype(np.int64)
+    u = place - begin
+    own = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
+    return begin[:, None] + np.arange(4), np.column_stack(own) / 6
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The ground along the ``paths``.
+
+    Attributes:
+        paths: of the visits.
+        parameters: (B,) slopes a of the cross-section, left ones first, then c, across within along.
+        covariance: (B, B) of them.
+        knots: the spline's first along the way, m, the way between two, m, and how many functions they
+            make; None where there is the cross-section alone.
+        datum_m: what is added to all heights.
+    """
+
+    paths: Paths
+    parameters: FloatArray
+    covariance: FloatArray
+    knots: tuple[float, float, int] | None = None
+    datum_m: float = 0.0
+    _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Lay the plane on which the vehicle stands at each frame."""
+        object.__setattr__(self, "_stands", tuple(one @ self.parameters for one in self._footprints()))
+
+    @classmethod
+    def level(cls, paths: Paths, spline: bool = True) -> Surface:
+        """A plane, to begin with; without a ``spline`` it can only become a cross-section."""
+        knots, size = None, _HINGES
+        if spline:
+            begin_m, end_m = (paths.station_m[[0, -1]] + [-_AHEAD_M, _AHEAD_M]).tolist()
+            step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
+            knots = begin_m, step_m, int(np.ceil((end_m - begin_m) / step_m)) + 3
+            size += knots[2] * _ACROSS
+        return cls(paths, np.zeros(size), np.zeros((size, size)), knots)
+
+    def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
+        """The derivative (K, B) by the parameters of heights at stations (K,), to the left (K,)."""
+        hinges = csr_array(_hinges(left_m))
+        if self.knots is None:
+            return hinges
+        i, by_way = _cubic(station_m, *self.knots)
+        j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
+        index = (i[:, :, None] * _ACROSS + j[:, None, :]).reshape(-1)
+        value = (by_way[:, :, None] * by_side[:, None, :]).reshape(-1)
+        bounds = 16 * np.arange(len(station_m) + 1)
+        spline = csr_array((value, index, bounds), (len(station_m), self.knots[2] * _ACROSS))
+        return csr_array(hstack([hinges, spline]))
+
+    def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
+        """Height, slope along the heading and to the left (F, B each) under each frame by the parameters."""
+        paths, (long, wide) = self.paths, _WHEELS_M
+        # Between two places the path is a chord, up to 5 mm off a bend, but the vehicle was on it.
+        station, _ = paths.beside(paths.position_map, np.arange(len(paths.place)))
+        left = np.zeros(len(station))
+        sense = diags_array(paths.sense[paths.place] / (2 * long))
+        forwards = sense @ (self._columns(station + long, left) - self._columns(station - long, left))
+        sideways = (self._columns(station, left + wide) - self._columns(station, left - wide)) / (2 * wide)
+        return self._columns(station, left), csr_array(forwards), sideways
+
+    def _from(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
+        """Points (K, 2) ahead and to the left of the vehicle at frames (K,), m."""
+        off, ahead = points_map - self.paths.position_map[frame], self.paths.heading[frame]
+        forwards = np.einsum("ki,ki->k", off, ahead)
+        return np.column_stack([forwards, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]])
+
+    def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
+        """The derivative (K, B) of :meth:`seen_height_m` by the parameters."""
+        stands, away = self._footprints(), self._from(points_map, frame)
+        plane = stands[0][frame]
+        for axis in (0, 1):
+            plane = plane + diags_array(away[:, axis]) @ stands[1 + axis][frame]
+        return csr_array(self._columns(*self.paths.beside(points_map, frame)) - plane)
+
+    def seen_height_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
+        """Heights (K,) of the ground at points (K, 2) above the planes that frames (K,) stand on."""
+        away, (height, forwards, sideways) = self._from(points_map, frame), self._stands
+        plane = height[frame] + away[:, 0] * forwards[frame] + away[:, 1] * sideways[frame]
+        return np.asarray(self._columns(*self.paths.beside(points_map, frame)) @ self.parameters - plane)
+
+    def height_m(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Heights (K,) of the ground at points (K, 2) of the map, and their standard deviations (K,)."""
+        return self._at(*self.paths.beside(points_map, self.paths.nearest_frame(points_map)))
+
+    def _at(self, station_m: FloatArray, left_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        columns = self._columns(station_m, left_m)
+        variance = np.asarray((columns @ self.covariance * columns.toarray()).sum(axis=1))
+        return columns @ self.parameters + self.datum_m, np.sqrt(np.maximum(variance, 0.0))
+
+    def strips(self) -> tuple[GroundStrip, ...]:
+        """The ground by session, half a metre to half a metre."""
+        paths, out = self.paths, []
+        left_m = np.arange(-_STRIP_M, _STRIP_M + _GRID_M / 2, _GRID_M)
+        for begin_m, end_m in paths.visit_ends.tolist():
+            station = np.arange(begin_m, end_m, _GRID_M)
+            if len(station) < 2:
+                continue
+            points, ahead, sense = paths.at(station)
+            ahead = ahead * sense[:, None]
+            grid = np.broadcast_arrays(station[:, None], (sense[:, None] * left_m))
+            height, sigma = (one.reshape(grid[0].shape) for one in self._at(*(g.ravel() for g in grid)))
+            out.append(GroundStrip(points, ahead, _GRID_M, left_m, height, sigma))
+        return tuple(out)
+
+    @property
+    def sentence(self) -> str:
+        """One sentence on the heights of the ground."""
+        at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
+        left, told = np.column_stack([-ahead[:, 1], ahead[:, 0]]), []
+        for away, where in (
+            (10.0 * ahead, "10 m ahead"),
+            (4.0 * left, "4 m to the left"),
+            (-4.0 * left, "right"),
+        ):
+            height_cm = 100 * self.seen_height_m(at + away, frame)
+            told.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
+        return f"the ground around the vehicle is no plane: {', '.join(told)}"
+
+    def estimated(
+        self, information: FloatArray, score: FloatArray, recorded: Recorded
+    ) -> tuple[Surface, float]:
+        """The surface that a drive makes likeliest, and its gain: how far the images' cost falls.
+
+        Args:
+            information: (B, B) on the parameters, all else being estimated with them.
+            score: (B,) the gradient of the cost by them, where they are now.
+            recorded: on the path.
+
+        Of the gain, what noise alone would do is taken off: one for each parameter that they determine.
+        """
+        known, towards, datum_m = self._recorded(recorded)
+        towards = towards + information @ self.parameters - score
+        usual, whole = np.full(3, np.log(_CURVATURE)), information + known
+
+        def cost(sizes: FloatArray) -> float:
+            prior = self._smoothness(sizes)
+            lower, own = (cholesky(one, lower=True) for one in (whole + prior, prior))
+            fit = solve_triangular(lower, towards, lower=True)
+            odds = np.log(own.diagonal()).sum() - np.log(lower.diagonal()).sum() + fit @ fit / 2
+            return float(np.sum((sizes - usual) ** 2) / (2 * _SIZES**2) - odds)
+
+        best = usual
+        if self.knots is not None:
+            search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
+            best = minimize(cost, usual, method="Nelder-Mead", options=search).x
+        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(best)), dtype=np.float64)
+        parameters = covariance @ towards
+        moved = parameters - self.parameters
+        gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
+        found = replace(self, parameters=parameters, covariance=covariance, datum_m=datum_m)
+        return found, float(gain)
+
+    def _smoothness(self, sizes: FloatArray) -> FloatArray:
+        """The prior's information (B, B), by the logarithms of the sizes (3,) of second differences."""
+        slopes = np.full(_HINGES, _SLOPE_SIGMA**-2)
+        if self.knots is None:
+            return np.diag(slopes)
+        _, step_m, along = self.knots
+        ways = [[np.eye(n), np.diff(np.eye(n), axis=0) / h, np.diff(np.eye(n), 2, axis=0) / h**2]
+                for n, h in ((along, step_m), (_ACROSS, _ACROSS_M))]  # fmt: skip
+        grams = [[one.T @ one for one in way] for way in ways]
+        spline = np.eye(along * _ACROSS) / _RIDGE_M**2
+        for size, order in zip(np.exp(-2 * sizes).tolist(), (2, 1, 0), strict=True):
+            spline += size * np.kron(grams[0][order], grams[1][2 - order])
+        return np.asarray(block_diag(np.diag(slopes), spline))
+
+    def _recorded(self, recorded: Recorded) -> tuple[FloatArray, FloatArray, float]:
+        """Information (B, B) of what was recorded on the path, that times its values (B,), the mean height.
+
+        A cross-section says nothing of the path, nor the path of it.
+        """
+        size = len(self.parameters)
+        if self.knots is None:
+            return np.zeros((size, size)), np.zeros(size), 0.0
+        frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
+        height, slope = recorded.at(self.paths.position_map[frame])
+        ahead, station = self.paths.heading[frame], self.paths.station_m[self.paths.place[frame]]
+        forwards = np.einsum("fi,fi->f", slope, ahead)
+        sideways = slope[:, 1] * ahead[:, 0] - slope[:, 0] * ahead[:, 1]
+        datum_m, apart_m = float(height.mean()), np.abs(station[:, None] - station)
+        known, towards = np.zeros((size, size)), np.zeros(size)
+        values = (height - datum_m, forwards, sideways)
+        noises = (recorded.heights, recorded.slopes, (*recorded.slopes, _LEAN))
+        for columns, value, noise in zip(self._footprints(), values, noises, strict=True):
+            covariance = 1e-6 * np.eye(len(frame))
+            for sigma, over_m in noise:
+                covariance += sigma**2 * np.exp(-apart_m / over_m)
+            own = columns[frame].toarray()
+            weighted = np.linalg.solve(covariance, own).T
+            known += weighted @ own
+            towards += weighted @ value
+        return known, towards, datum_m
+
+    def points(
+        self, rays: FloatArray, centre_map: FloatArray, frame: IntArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Where rays (K, 3) from cameras (K, 3) at frames (K,) meet the ground (K, 2), and which (K,) do.
+
+        Those that meet it nowhere, or far away, stay on the plane.
+        """
+        with np.errstate(all="ignore"):
+            plane = centre_map[:, :2] - (centre_map[:, 2:] / rays[:, 2:]) * rays[:, :2]
+            found = (rays[:, 2] < 0) & (np.linalg.norm(plane - centre_map[:, :2], axis=1) < _REACH_M)
+        down, out = np.where(found, rays[:, 2], -1.0), np.zeros_like(plane)
+        last = np.where(found, -centre_map[:, 2] / down, 0.0)
+
+        def above(far: FloatArray) -> FloatArray:
+            points = centre_map + far[:, None] * rays
+            return np.asarray(points[:, 2] - self.seen_height_m(points[:, :2], frame))
+
+        before = above(last)
+        far = last - before / down
+        for _ in range(_STEPS):
+            off = above(far)
+            with np.errstate(all="ignore"):
+                fall = np.where(np.abs(far - last) > 1e-12, (off - before) / (far - last), down)
+            last, before, far = far, off, far - off / np.where(fall < 0, fall, down)
+        found &= (np.abs(above(far)) < _SURE_M) & (far > 0)
+        out[found] = (centre_map[:, :2] + far[:, None] * rays[:, :2])[found]
+        return np.where(found[:, None], out, plane), found
+
+    def flattened_px(
+        self, intrinsic: FloatArray, cam_from_map: FloatArray, frame: IntArray, pixels: FloatArray
+    ) -> FloatArray:
+        """Where images would show on the plane what they show at pinhole pixels (K, 2) of the ground.
+
+        Args:
+            intrinsic: (K, 3, 3).
+            cam_from_map: (K, 4, 4).
+            frame: (K,).
+            pixels: (K, 2).
+        """
+        turn = cam_from_map[:, :3, :3]
+        cam = np.linalg.solve(intrinsic, np.column_stack([pixels, np.ones(len(pixels))])[..., None])
+        rays = (np.swapaxes(turn, 1, 2) @ cam)[..., 0]
+        points, found = self.points(rays, camera_centre(cam_from_map), frame)
+        plan = pinhole_px_from_ground(intrinsic, cam_from_map)
+        moved = apply_homography(plan, np.where(found[:, None], points, 0.0)[:, None])[:, 0]
+        return np.where(found[:, None], moved, pixels)
+
+    def flattened(self, sightings: Sightings, rig: Rig) -> Sightings:
+        """``sightings`` as if all that they show lay on the plane z = 0, under the cameras of ``rig``."""
+
+        def moved(camera: IntArray, frame: IntArray, pixels: FloatArray) -> FloatArray:
+            known = np.isfinite(pixels).all(axis=1)
+            camera, frame, out = camera[known], frame[known], pixels.copy()
+            cam_from_map = rig.cam_from_map(camera, frame)
+            out[known] = self.flattened_px(rig.intrinsic[camera], cam_from_map, frame, pixels[known])
+            return out
+
+        camera, frame = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4)
+        pixels = sightings.corners_pinhole_px.reshape(-1, 2)
+        columns = [
+            moved(camera, frame, pixels + step) - moved(camera, frame, pixels - step)
+            for step in _STEP_PX * np.eye(2)
+        ]
+        jacobian = np.stack(columns, axis=2).reshape(-1, 4, 2, 2) / (2 * _STEP_PX)
+        symbols = sightings.symbols
+        if len(symbols.camera):
+            length = [len(outline) for outline in symbols.outlines_pinhole_px]
+            of_point = np.repeat(np.arange(len(length)), length)
+            outlines = np.concatenate(symbols.outlines_pinhole_px)
+            outlines = moved(symbols.camera[of_point], symbols.frame[of_point], outlines)
+            parts = np.split(outlines, np.cumsum(length)[:-1])
+            symbols = replace(symbols, outlines_pinhole_px=tuple(parts))
+        return replace(
+            sightings,
+            corners_pinhole_px=moved(camera, frame, pixels).reshape(-1, 4, 2),
+            covariance_px=jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2),
+            symbols=symbols,
+        )

@@ -1,0 +1,98 @@
+"""The ground's surface as files: GeoTIFF for a GIS and OpenCRG for a simulator of vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from v2hdm.errors import ConfigError
+from v2hdm.extras import need
+from v2hdm.geometry.geodetic import crs_of
+from v2hdm.records import FloatArray, GroundStrip, HdMap
+from v2hdm.store.files import whole_file
+
+_CELL_M = 0.25
+_MOST_CELLS = 4e6  # of the rectangle about a map; beyond, cells are larger
+_NOTHING = -9999.0
+
+
+def write_ground_geotiff(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+    """Write the ground as a GeoTIFF of two bands, heights above the map's origin and their sigmas, m.
+
+    Cells that no strip covers hold no data; of two strips, the surer one counts. A GeoTIFF has no place for
+    the ``verdict``. Raises ConfigError when ``rasterio`` is not installed.
+    """
+    rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
+    edges = np.concatenate(
+        [one.points(side) for one in hd_map.ground for side in one.left_m[[0, -1]].tolist()]
+    )
+    low, high = edges.min(axis=0), edges.max(axis=0)
+    cell_m = max(_CELL_M, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
+    columns, rows = (int(n) for n in np.ceil((high - low) / cell_m))
+    x, y = low[0] + cell_m * (np.arange(columns) + 0.5), high[1] - cell_m * (np.arange(rows) + 0.5)
+    cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    found = np.full((2, len(cells)), np.inf)
+    for strip in hd_map.ground:
+        own = _sampled(strip, cells)
+        surer = own[1] < found[1]
+        found[:, surer] = own[:, surer]
+    bands = np.where(np.isfinite(found), found, _NOTHING).reshape(2, rows, columns).astype(np.float32)
+    profile = {
+        "driver": "GTiff", "width": columns, "height": rows, "count": 2, "dtype": "float32",
+        "nodata": _NOTHING, "crs": rasterio.crs.CRS.from_user_input(crs_of(hd_map.origin)),
+        "transform": rasterio.Affine(cell_m, 0, low[0], 0, -cell_m, high[1]), "compress": "deflate",
+    }  # fmt: skip
+    with rasterio.MemoryFile(ext=".tif") as memory:
+        with memory.open(**profile) as dataset:
+            dataset.write(bands)
+            dataset.descriptions = ("height above the map's origin, m", "standard deviation, m")
+        with whole_file(path) as partial:
+            partial.write_bytes(memory.getbuffer())
+
+
+def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
+    """Heights and sigmas (2, K) of a strip at points (K, 2), infinite beyond it."""
+    out, (right_m, left_m) = np.full((2, len(cells)), np.inf), strip.left_m[[0, -1]].tolist()
+    reach_m = max(-right_m, left_m)
+    distance_m, near = cKDTree(strip.points_map).query(
+        cells, distance_upper_bound=np.hypot(reach_m, strip.step_m)
+    )
+    seen = np.flatnonzero(np.isfinite(distance_m))
+    off, ahead = cells[seen] - strip.points_map[near[seen]], strip.ahead[near[seen]]
+    along = near[seen] + np.einsum("ki,ki->k", off, ahead) / strip.step_m
+    side = off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]
+    inside = (side >= right_m) & (side <= left_m) & (along >= 0) & (along <= len(strip.points_map) - 1)
+    at = np.stack([along, (side - right_m) / (strip.left_m[1] - right_m)])[:, inside]
+    for band, values in zip(out, (strip.heights_m, strip.sigma_m), strict=True):
+        band[seen[inside]] = map_coordinates(values, at, order=1)
+    return out
+
+
+def write_opencrg(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+    """Write the ground as OpenCRG, a file for each session: heights (m) on a grid along the driven path.
+
+    OpenCRG has no place for sigmas and the ``verdict``. Raises ConfigError when ``pyopencrg`` is not
+    installed.
+    """
+    crg = need("pyopencrg", "gis", "the format opencrg", ConfigError)
+    for number, strip in enumerate(hd_map.ground, start=1):
+        base_m = float(strip.heights_m.mean())
+        x, y = np.diff(strip.points_map, axis=0).T
+        road = crg.CrgRoad(
+            strip.heights_m - base_m,
+            u_inc=strip.step_m,
+            v=strip.left_m,
+            heading=np.arctan2(y, x),  # along which a reader goes on by u_inc
+            x_start=strip.points_map[0, 0],
+            y_start=strip.points_map[0, 1],
+            z_start=base_m,
+        )
+        road.comments = ["ground by v2hdm; x, y and z are metres of the map's frame"]
+        own = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        with whole_file(own) as partial:
+            road.save(partial, fmt="KDBI")
