@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
 
@@ -185,9 +186,8 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
         foreign, left = _foreign(inputs, settled, worst, progress), None
-        is_likeliest = worst is not None and log_odds(worst) > foreign[2]
-        if is_likeliest and len(corrected) < _MOST_CORRECTIONS and not _is_ambiguous(worst, found):
-            left = _recovered(inputs, worst, settled)
+        if worst is not None and log_odds(worst) > foreign[2] and len(corrected) < _MOST_CORRECTIONS:
+            left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
         corrected += _contradictions(settled, (worst,), inputs.sightings, visit_names(drive))
@@ -235,8 +235,8 @@ def _foreign(
     if worst is None or gain <= 0:
         return begin_s, end_s, gain
     stamp_s = np.array([drive.images[one.image].stamp_s for one in inputs.detections])
-    beyond = np.flatnonzero((stamp_s < begin_s) | (stamp_s > end_s))
-    rest = replace(inputs, detections=[inputs.detections[n] for n in beyond])
+    beyond = ((stamp_s < begin_s) | (stamp_s > end_s)).tolist()
+    rest = replace(inputs, detections=list(compress(inputs.detections, beyond)))
     try:
         without, found, _ = _settled(rest, progress)
     except (AdjustError, MappingError) as failure:
