@@ -189,8 +189,8 @@ def _believed(
             xyz = xyz[::-1]
         raised = np.abs(xyz[:, 2]).max(initial=0.0) > rounding[2]
         heights_m = xyz[:, 2] if raised else None
-        drawn = replace(stored, points_map=xyz[:, :2], heights_m=heights_m, vertex_sigma_m=None)
-        return replace(drawn, covariance_m2=None, relative_sigma_m=None)
+        moved = replace(stored, points_map=xyz[:, :2], heights_m=heights_m, vertex_sigma_m=None)
+        return replace(moved, covariance_m2=None, relative_sigma_m=None)
     drawn = stored.positions(origin)
     expected = np.zeros((len(positions), 3))
     expected[stored.ring, : drawn.shape[1]] = drawn
