@@ -49,6 +49,7 @@ _FAINT_SHARE, _HIDDEN_SIGMA = 0.1, 0.5
 _ALIKE = 0.5
 """Power of the likelihood of one side: the four of one image err alike."""
 
+_PAIRS_OF_BIN = 100  # detected sides by which contrasts of one size in the image are learned
 _LEAST_PAIRS = 8  # detected sides below which nothing is said of images without a detection
 _LEAST_SIGMA = 0.03
 _NEAREST_M = 0.3  # ground nearer to the camera's plane is cut off
@@ -90,13 +91,17 @@ class _Outline:
 
 @dataclass(frozen=True)
 class _View:
-    """One outline in one image: its polygon (N, 2), recorded px, the contrast of each side, nan if unseen."""
+    """One outline in one image: its polygon (N, 2), recorded px, the contrast of each side, nan if unseen.
+
+    ``px_per_m`` is the size of the image of a metre there.
+    """
 
     outline: int
     image: int
     polygon_px: FloatArray
     whole: bool
     contrast: FloatArray  # (4,)
+    px_per_m: float
     detected: bool
 
 
@@ -239,8 +244,9 @@ def _views(
         polygon, whole = eye.polygon(outline.outline_map)
         area_px2 = abs(float(signed_area(polygon))) if len(polygon) > 2 else 0.0
         if area_px2 >= _LEAST_PX2:
+            size = np.sqrt(area_px2 / abs(float(signed_area(outline.outline_map))))
             contrast = eye.contrast(grey, outline)
-            out.append(_View(number, image, polygon, whole, contrast, outline.id in detected))
+            out.append(_View(number, image, polygon, whole, contrast, size, outline.id in detected))
     return out
 
 
@@ -266,12 +272,10 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
     detected = np.array([one.detected for one in views])
     outline = np.array([one.outline for one in views])
     own = _own_contrasts(contrast, outline, detected, outlines)[outline]
+    size = np.array([one.px_per_m for one in views])
+    expected, sigma = _expected(contrast, own, size, detected)
     known = np.isfinite(contrast) & np.isfinite(own)
-    off = np.where(known, contrast - own, 0.0)
-    # Of too few detected sides nothing is known: the sigma is that of anything.
-    used, sigma = np.abs(off[known & detected[:, None]]), _HIDDEN_SIGMA
-    if len(used) >= _LEAST_PAIRS:
-        sigma = max(1.4826 * float(np.median(used)), _LEAST_SIGMA)
+    off = np.where(known, contrast - expected, 0.0)
     faint = norm.logpdf(np.where(known, contrast - own / 2, 0.0), 0.0, np.abs(own) / 3 + sigma)
     clear = np.log1p(-_FAINT_SHARE) + norm.logpdf(off, 0.0, sigma)
     shown = logsumexp([clear, np.log(_FAINT_SHARE) + faint], axis=0)
@@ -306,6 +310,31 @@ def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray,
             known = values[np.isfinite(values[:, side]), side]
             out[number, side] = np.median(known) if len(known) else np.nan
     return out
+
+
+def _expected(
+    contrast: FloatArray, own: FloatArray, size: FloatArray, detected: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image.
+
+    Detected sides say it: a far one is blurred. Of too few nothing is known: the sigma is that of anything.
+    """
+    used = np.isfinite(contrast) & np.isfinite(own) & detected[:, None]
+    if used.sum() < _LEAST_PAIRS:
+        return own, np.full_like(own, _HIDDEN_SIGMA)
+    order = np.sort(np.broadcast_to(size[:, None], used.shape)[used])
+    bins = max(1, min(8, len(order) // _PAIRS_OF_BIN))
+    place = np.searchsorted(order[:: -(-len(order) // bins)][1:], size)
+    factor, sigma = np.ones(len(size)), np.full(len(size), _HIDDEN_SIGMA)
+    for one in np.unique(place):
+        here = place == one
+        rows = used & here[:, None]
+        if rows.sum() < _LEAST_PAIRS:
+            continue
+        a, b = contrast[rows], own[rows]
+        factor[here] = ratio = float((a * b).sum() / max((b * b).sum(), 1e-9))
+        sigma[here] = max(1.4826 * float(np.median(np.abs(a - ratio * b))), _LEAST_SIGMA)
+    return factor[:, None] * own, np.broadcast_to(sigma[:, None], own.shape)
 
 
 def _coco(
