@@ -25,14 +25,19 @@ def run(arguments: Sequence[str]) -> None:
         action="append",
         required=True,
         metavar="NAME",
-        help="of a map: geojson, csv, gpkg, lanelet2, dxf; of a calibration: camera_info, static_transform, "
-        "urdf, kalibr, opencv; may be repeated",
+        help="of a map: geojson, csv, gpkg, lanelet2, dxf, landxml; of a calibration: camera_info, "
+        "static_transform, urdf, kalibr, opencv; may be repeated",
     )
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder of files (default: that of MAP)")
     parser.add_argument(
         "--projector",
         metavar="NAME",
         help="of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)",
+    )
+    parser.add_argument(
+        "--crs",
+        metavar="NAME",
+        help="system of a map's coordinates, such as EPSG:25832, or local for the drive's own frame",
     )
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
@@ -54,7 +59,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
-    from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
+    from v2hdm.io.maps.formats import FORMATS, check_crs, check_formats, write_map
     from v2hdm.io.maps.reading import read_map
 
     check_formats(parsed.format, "--format")
@@ -63,13 +68,16 @@ def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be written over: set another --output or --format")
     hd_map, verdict = read_map(parsed.source)
-    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector)
+    check_crs(parsed.crs, parsed.format, hd_map.origin, "--crs")
+    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs)
 
 
 def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.io.calibration.reading import read_calibration, read_provenance
     from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration_as
 
+    if parsed.crs is not None:
+        raise ConfigError("--crs: a calibration has no place on the earth; leave it out")
     unknown = [name for name in parsed.format if name not in CALIBRATION_FORMATS]
     if unknown:
         known = ", ".join(CALIBRATION_FORMATS)

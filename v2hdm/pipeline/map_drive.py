@@ -106,6 +106,7 @@ def map_drive(
     sources = [drive] if isinstance(drive, Source) else list(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
+    context.accept(read.whole)
     earlier = None if base is None else read_base(Path(base))
     if earlier is not None:
         check_together(earlier, read.whole, str(base))

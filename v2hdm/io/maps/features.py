@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.geometry.planar import signed_area
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, Road, Symbol
 
@@ -70,12 +70,14 @@ class Feature:
         heights = np.zeros(len(self.points_map)) if self.heights_m is None else self.heights_m
         return np.column_stack([self.points_map, heights])
 
-    def positions(self, origin: GeodeticOrigin | None) -> FloatArray:
+    def positions(self, origin: GeodeticOrigin | Grid | None) -> FloatArray:
         """The points in order of :attr:`ring`.
 
         (N, 3) longitude and latitude in degrees and ellipsoidal height in m; without an ``origin`` local
-        metres, (N, 2) where no height is known.
+        metres, (N, 2) where no height is known; in a :class:`Grid` its coordinates (N, 3).
         """
+        if isinstance(origin, Grid):
+            return origin.positions(self.xyz_map)[self.ring]
         if origin is None:
             return (self.points_map if self.heights_m is None else self.xyz_map)[self.ring]
         return geodetic_from_enu(origin, self.xyz_map)[self.ring][:, [1, 0, 2]]
