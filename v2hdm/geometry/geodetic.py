@@ -158,6 +158,18 @@ class Grid:
         return geodetic_from_grid(self.crs, positions, where, error)[:, [1, 0, 2]]
 
 
+def map_projection(origin: GeodeticOrigin) -> str:
+    """The map frame as PROJ text: a transverse Mercator projection about its origin, scaled to its height.
+
+    It agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it.
+    """
+    scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
+    return (
+        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
+        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    )
+
+
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
     """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
 

@@ -16,6 +16,7 @@ from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.extras import need
+from v2hdm.geometry.geodetic import map_projection
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
@@ -42,10 +43,7 @@ _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
 _SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
 _BLOCK_PX = 512
-_OVERVIEWS = (2, 4, 8, 16)
 _AT_ONCE_BYTES = 1 << 24
-_SEMI_MAJOR_M = 6378137.0
-
 _ENGINEERING = (
     'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
     'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
@@ -55,22 +53,16 @@ _ENGINEERING = (
 def crs_of(origin: GeodeticOrigin | None) -> str:
     """The coordinate system of the map frame, as PROJ or WKT text.
 
-    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
-    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
-    frame is an engineering system: metres that belong nowhere on the earth.
+    Without an origin the frame is an engineering system: metres that belong nowhere on the earth.
     """
     if origin is None:
         return _ENGINEERING
-    scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
-    return (
-        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
-        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
-    )
+    return map_projection(origin)
 
 
 @contextmanager
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
-    """Put sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
+    """Put sheets into a cloud-optimised GeoTIFF: JPEG within, overviews and a mask; whole or not at all.
 
     Raises ConfigError where rasterio is not installed.
     """
@@ -97,12 +89,15 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
                 dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
 
             yield put
-        with rasterio.open(memory.name, "r+") as dataset:
-            dataset.build_overviews(_OVERVIEWS, rasterio.enums.Resampling.average)
-        memory.seek(0)
-        with whole_file(path) as partial, partial.open("wb") as file:
-            while data := memory.read(_AT_ONCE_BYTES):
-                file.write(data)
+        with rasterio.MemoryFile(ext=".tif") as ordered:
+            need("rasterio.shutil", "gis", path.name, ConfigError).copy(
+                memory.name, ordered.name, driver="COG", compress="JPEG", quality=_JPEG_QUALITY,
+                blocksize=_BLOCK_PX, overview_resampling="average", bigtiff="IF_SAFER",
+            )  # fmt: skip
+            ordered.seek(0)
+            with whole_file(path) as partial, partial.open("wb") as file:
+                while data := ordered.read(_AT_ONCE_BYTES):
+                    file.write(data)
 
 
 class Picture:

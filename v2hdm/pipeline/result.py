@@ -24,8 +24,9 @@ from v2hdm.io.drive.of_result import told_of
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions, write_residuals
 from v2hdm.io.maps.features import with_heights
-from v2hdm.io.maps.formats import write_map
+from v2hdm.io.maps.formats import check_crs, with_data, write_map
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.qgis import write_qgis
 from v2hdm.io.trajectory import write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
@@ -214,6 +215,9 @@ class Result:
         if mosaic and self.methods:
             with context.timed("mosaic"):
                 write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
+        if "qgis" in formats and self.methods:  # it opens the mosaic, too
+            grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
+            write_qgis(self.map, folder / "map.qgs", grid=grid)
         with context.timed("report"):
             write_page(folder, self.drive)
 
@@ -224,7 +228,8 @@ def _write_map(
     drive, best, verdict = result.drive, result.best, result.verdict.as_json()
     geojson = [one for one in formats if one == "geojson"]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
-    write_map(result.map, folder, "map", [one for one in formats if one not in geojson], verdict, crs=crs)
+    others = [one for one in with_data(formats) if one not in ("geojson", "qgis")]
+    write_map(result.map, folder, "map", others, verdict, crs=crs)
     about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.geometry.planar import signed_area
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, Road, Symbol
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, PaintLeft, Road, Symbol
 
 CORNERS, POINTS, OUTLINE = "corners_map", "points_map", "outline_map"
 """Properties with the exact local coordinates of a marking's corners, a lane's points, a symbol's outline."""
+
+PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
+"""Properties of the paint that a marking has left: its share, what that was off an earlier map's, sigmas."""
 
 _ALONG_M = 3.0  # stations within about this of the nearest one share in a point's height: noise averages out
 _AT_ONCE = 1024  # points whose distances to all stations are held in memory together
@@ -39,6 +42,7 @@ class Feature:
     relative_sigma_m: float | None = None
     symbol: bool = False
     place_sigma_m: float | None = None
+    paint: PaintLeft | None = None
 
     @property
     def key(self) -> str:
@@ -95,7 +99,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
             points, more = one.points_map, {}
         else:
             sigma_m, points = one.relative_sigma_m, one.corners_map
-            more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m}
+            more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m, "paint": one.paint}
         closed = not isinstance(one, Lane)
         features.append(Feature(number, one.kind, points, one.sightings, closed, one.heights_m, **more))
     return features
@@ -111,7 +115,8 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
         if one.symbol:
             symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number))
         elif one.closed:
-            markings.append(Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number))
+            more = one.covariance_m2, one.relative_sigma_m, one.heights_m, number, one.paint
+            markings.append(Marking(*own, *more))
         else:
             lanes.append(Lane(*own, one.heights_m, number))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
@@ -139,6 +144,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "sigma_m": feature.sigma_m,
         "covariance_m2": feature.covariance_m2,
         "relative_sigma_m": feature.relative_sigma_m,
+        **({} if feature.paint is None else dict(zip(PAINT, astuple(feature.paint), strict=True))),
     }
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value

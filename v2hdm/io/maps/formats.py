@@ -20,11 +20,13 @@ import numpy as np
 from v2hdm.errors import ConfigError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import Grid
-from v2hdm.io.maps.features import Feature, features_of
+from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.landxml import write_landxml
 from v2hdm.io.maps.lanelet2 import write_lanelet2
+from v2hdm.io.maps.opendrive import write_opendrive
+from v2hdm.io.maps.qgis import write_qgis
 from v2hdm.io.maps.reading import Verdict
 from v2hdm.records import GeodeticOrigin, HdMap
 from v2hdm.store.files import replace_csv, whole_file
@@ -75,6 +77,7 @@ COLUMNS: tuple[str, ...] = (
     *("longitude_deg", "latitude_deg", "ellipsoidal_height_m"),
     *("sigma_x_m", "sigma_y_m", "sightings", "relative_sigma_m"),
     *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, 5) for other in "xy"),
+    *PAINT,
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
 of point 3 of the same feature. Empty where it is not known."""
@@ -104,6 +107,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
         positions[feature.ring] = feature.positions(origin)
         geodetic = positions.tolist()
     relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
+    paint = [properties_of(feature).get(name, "") for name in PAINT]
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
         height = "" if feature.heights_m is None else float(feature.heights_m[k])
@@ -114,7 +118,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
             sigmas = np.sqrt(np.diag(own[:, 2 * k : 2 * k + 2])).tolist()
             covariances = own.ravel().tolist()
         row = [feature.id, feature.kind, k + 1, x, y, height, *geodetic[k], *sigmas]
-        rows.append([*row, feature.sightings, relative, *covariances])
+        rows.append([*row, feature.sightings, relative, *covariances, *paint])
     return rows
 
 
@@ -136,6 +140,8 @@ FORMATS: Mapping[str, Format] = {
     "gpkg": Format("{name}.gpkg", write_geopackage, "pyogrio"),
     "lanelet2": Format("{name}_lanelet2/lanelet2_map.osm", write_lanelet2, takes_crs=False),
     "dxf": Format("{name}.dxf", write_dxf, "ezdxf", metres="DXF"),
+    "qgis": Format("{name}.qgs", write_qgis, "pyogrio"),
+    "opendrive": Format("{name}.xodr", write_opendrive, takes_crs=False),
     "landxml": Format("{name}.xml", write_landxml, metres="LandXML"),
 }
 
@@ -147,6 +153,11 @@ def check_formats(names: Sequence[str], key: str) -> None:
             raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(FORMATS)}")
         if (package := FORMATS[name].needs) is not None:
             need(package, "gis", f"the format {name}", ConfigError)
+
+
+def with_data(formats: Sequence[str]) -> list[str]:
+    """``formats``, each once, with the GeoPackage that a project of QGIS opens."""
+    return list(dict.fromkeys(["gpkg", *formats] if "qgis" in formats else formats))
 
 
 def check_crs(
@@ -177,9 +188,9 @@ def write_map(
     projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
-    grids = check_crs(crs, formats, hd_map.origin, "crs")
+    grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
     written = []
-    for chosen in dict.fromkeys(formats):
+    for chosen in with_data(formats):
         path = folder / FORMATS[chosen].file.format(name=name)
         write = FORMATS[chosen].write
         if chosen == "lanelet2":

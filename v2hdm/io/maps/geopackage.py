@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import Grid
-from v2hdm.io.maps.features import POINTS, Feature, features_of, properties_of
+from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HdMap
 from v2hdm.store.files import whole_file
 
-_LOCAL = (
+LOCAL_CRS = (
     'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",'
     'EDATUM["origin of the drive"],CS[Cartesian,2],AXIS["easting (E)",east,ORDER[1]],'
     'AXIS["northing (N)",north,ORDER[2]],LENGTHUNIT["metre",1]]'
@@ -69,10 +69,10 @@ def write_geopackage(
         about["origin"] = asdict(hd_map.origin)
     if verdict is not None:
         about["verdict"] = dict(verdict)
-    crs = _LOCAL if hd_map.origin is None else "EPSG:4326"
+    crs = LOCAL_CRS if hd_map.origin is None else "EPSG:4326"
     if grid is not None:
         about["crs"] = grid.crs
-        crs = _LOCAL if grid.is_local else grid.crs
+        crs = LOCAL_CRS if grid.is_local else grid.crs
     styles = []
     with whole_file(path) as partial:
         # GDAL recognises the format of a file by its ending.
@@ -124,6 +124,7 @@ def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
         "sightings": numbers("sightings", np.int64),
         "sigma_m": numbers("sigma_m"),
         "relative_sigma_m": numbers("relative_sigma_m"),
+        **{name: numbers(name) for name in PAINT if key == CORNERS},
     } | {name: [json.dumps(one[name]) if name in one else None for one in rows] for name in (key, *EXACT)}
 
 
@@ -139,8 +140,8 @@ def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -
     return np.asarray(shapely.to_wkb(shapes, flavor="iso"))
 
 
-def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]:
-    """A layer's row of styles; classes of later edits fall into the last category, of an empty value."""
+def layer_style(kinds: Sequence[str], closed: bool) -> str:
+    """QGIS's style of a layer; classes of later edits fall into the last category, of an empty value."""
     categories, symbols = "", ""
     shape, drawing, options = ("fill", "SimpleFill", _FILL) if closed else ("line", "SimpleLine", _LINE)
     for number, kind in enumerate([*kinds, ""]):
@@ -148,11 +149,16 @@ def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]
         colour = _COLOURS.get(kind, _OTHER_COLOUR)
         drawn = "".join(_OPTION.format(name, value.format(colour)) for name, value in options.items())
         symbols += _SYMBOL.format(number, shape, drawing, drawn)
+    return _STYLE.format(categories, symbols)
+
+
+def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]:
+    """A layer's row in the table of styles."""
     empty = dict.fromkeys(("f_table_catalog", "f_table_schema", "styleSLD", "owner", "ui"), "")
     return empty | {
         "f_table_name": layer,
         "f_geometry_column": GEOMETRY,
         "styleName": f"v2hdm {layer}",
-        "styleQML": _STYLE.format(categories, symbols),
+        "styleQML": layer_style(kinds, closed),
         "description": "colours by class",
     }

@@ -20,10 +20,10 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
-from v2hdm.io.maps.features import CORNERS, OUTLINE, POINTS, Feature, map_of, unique_ids
+from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
 from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.io.safe.texts import parse_json, take_name
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, PaintLeft
 from v2hdm.store.files import load_json, take_array, take_mapping, take_number, take_text
 from v2hdm.store.inputs import note_input
 
@@ -245,6 +245,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         known = properties.get(key) if key not in EXACT or len(points) else None
         return None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
 
+    left = [optional(name, take_number) for name in PAINT]
     return Feature(
         id=optional("id", take_whole, -_LARGEST_ID, _LARGEST_ID) or 0,
         kind=take_name(properties.get("class"), f"{where}, class", MapFileError),
@@ -256,6 +257,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         relative_sigma_m=optional("relative_sigma_m", take_number),
         symbol=symbol,
         place_sigma_m=optional("sigma_m", take_number) if symbol else None,
+        paint=None if left[0] is None or left[1] is None else PaintLeft(*left),
     )
 
 
