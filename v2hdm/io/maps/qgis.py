@@ -32,20 +32,15 @@ def write_qgis(
     GeoPackage.
     """
     pyproj = need("pyproj", "map", "the format qgis", ConfigError)
-    crs = LOCAL_CRS if hd_map.origin is None else map_projection(hd_map.origin)
-    features = features_of(hd_map)
-    where = Grid("local", hd_map.origin)
-    if grid is not None and not grid.is_local:
-        crs, where = grid.crs, grid
-    elif grid is not None:
-        crs = LOCAL_CRS
-    system = pyproj.CRS.from_user_input(crs)
+    features, where = features_of(hd_map), grid or Grid("local", hd_map.origin)
+    placed = hd_map.origin is not None and (grid is None or not grid.is_local)
+    ground = map_projection(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
+    layers_crs = LOCAL_CRS if not placed else "EPSG:4326" if grid is None else grid.crs
+    canvas_crs = ground if grid is None else layers_crs
+    system = pyproj.CRS.from_user_input(canvas_crs)
     root = ET.Element("qgis", {"version": "3.22.0", "projectname": path.stem})
     ET.SubElement(root, "title").text = path.stem
-    reference = ET.SubElement(ET.SubElement(root, "projectCrs"), "spatialrefsys", {"nativeFormat": "Wkt"})
-    ET.SubElement(reference, "wkt").text = system.to_wkt()
-    if (code := system.to_authority()) is not None:
-        ET.SubElement(reference, "authid").text = ":".join(code)
+    _refer(ET.SubElement(root, "projectCrs"), system)
     enabled = ET.SubElement(ET.SubElement(root, "properties"), "SpatialRefSys")
     ET.SubElement(enabled, "ProjectionsEnabled", {"type": "int"}).text = "1"
     tree = ET.SubElement(root, "layer-tree-group")
@@ -62,13 +57,23 @@ def write_qgis(
         shape = "Line" if key == POINTS else "Polygon"
         source = f"./{path.stem}.gpkg|layername={layer}"
         element = _layer(tree, layers, layer, source, "ogr", {"type": "vector", "geometry": shape})
+        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(layers_crs))
         kinds = sorted({one.kind for one in features if one.key == key})
         element.extend(ET.fromstring(layer_style(kinds, key != POINTS).split("\n", 1)[1]))
     if (path.parent / MOSAIC).is_file():
-        _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
+        element = _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
+        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground))
     ET.indent(root, " ")
     doctype = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
     replace_text(path, f"{doctype}\n{ET.tostring(root, encoding='unicode')}\n")
+
+
+def _refer(parent: ET.Element, system: Any) -> None:
+    """State a coordinate system, without which QGIS takes a layer as it lies."""
+    reference = ET.SubElement(parent, "spatialrefsys", {"nativeFormat": "Wkt"})
+    ET.SubElement(reference, "wkt").text = system.to_wkt()
+    if (code := system.to_authority()) is not None:
+        ET.SubElement(reference, "authid").text = ":".join(code)
 
 
 def _layer(
