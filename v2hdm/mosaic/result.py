@@ -92,7 +92,7 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
         with rasterio.MemoryFile(ext=".tif") as ordered:
             need("rasterio.shutil", "gis", path.name, ConfigError).copy(
                 memory.name, ordered.name, driver="COG", compress="JPEG", quality=_JPEG_QUALITY,
-                blocksize=_BLOCK_PX, overview_resampling="average", bigtiff="IF_SAFER",
+                blocksize=_BLOCK_PX, overview_resampling="average", overview_count=4, bigtiff="IF_SAFER",
             )  # fmt: skip
             ordered.seek(0)
             with whole_file(path) as partial, partial.open("wb") as file:
