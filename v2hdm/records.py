@@ -313,6 +313,27 @@ class ImageDetections:
 
 
 @dataclass(frozen=True)
+class PaintLeft:
+    """The ``share`` of a marking's paint that is left, 0 to 1, with its ``sigma``.
+
+    ``change`` and ``change_sigma`` compare it to the earlier map's, None where there was none.
+    """
+
+    share: float
+    sigma: float
+    change: float | None = None
+    change_sigma: float | None = None
+
+    def since(self, before: PaintLeft | None) -> PaintLeft:
+        """The same, with the change since an earlier measurement."""
+        if before is None:
+            return self
+        return PaintLeft(
+            self.share, self.sigma, self.share - before.share, float(np.hypot(self.sigma, before.sigma))
+        )
+
+
+@dataclass(frozen=True)
 class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
@@ -321,6 +342,7 @@ class Marking:
     coordinate: without the drift and the survey that both share. ``heights_m`` (4,) are the heights of the
     ground, None where it was recorded as z = 0, ``heights_sigma_m`` (4,) their standard deviations where it
     was estimated. ``id`` is positive and no other feature's of its map; None until the map is written.
+    ``paint`` is what is left of it, None where no image shows that.
     """
 
     kind: str
@@ -330,6 +352,7 @@ class Marking:
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None
     id: int | None = None
+    paint: PaintLeft | None = None
     heights_sigma_m: FloatArray | None = None
 
 

@@ -70,7 +70,7 @@ def cartesian(origin):
 
 
 def exported(folder, file_format, hd_map, projector=None):
-    (path,) = write_map(hd_map, folder, "map", [file_format], VERDICT, projector)
+    *_, path = write_map(hd_map, folder, "map", [file_format], VERDICT, projector)
     return path
 
 

@@ -12,8 +12,13 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from v2hdm.cli.main import parser_of
 from v2hdm.errors import ConfigError, MapFileError
+from v2hdm.records import FloatArray
+
+_POSITION_SIGMA_M = 0.02  # of the written poses' heights, by which their road is laid flat
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -25,8 +30,8 @@ def run(arguments: Sequence[str]) -> None:
         action="append",
         required=True,
         metavar="NAME",
-        help="of a map: geojson, csv, gpkg, lanelet2, dxf; of a calibration: camera_info, static_transform, "
-        "urdf, kalibr, opencv; may be repeated",
+        help="of a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; of mosaic.tif: pcd; "
+        "of a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated",
     )
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder of files (default: that of MAP)")
     parser.add_argument(
@@ -34,13 +39,19 @@ def run(arguments: Sequence[str]) -> None:
         metavar="NAME",
         help="of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)",
     )
+    parser.add_argument(
+        "--crs",
+        metavar="NAME",
+        help="system of a map's coordinates, such as EPSG:25832, or local for the drive's own frame",
+    )
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
     from v2hdm.store.results import listed_files
 
     handler, folder = logging.StreamHandler(), parsed.output or parsed.source.parent
     handler.setLevel(logging.INFO)
-    export = _export_calibration if parsed.source.suffix.lower() in (".yaml", ".yml") else _export_map
+    kinds = {".yaml": _export_calibration, ".yml": _export_calibration, ".tif": _export_mosaic}
+    export = kinds.get(parsed.source.suffix.lower(), _export_map)
     try:
         with logging_to(handler):
             source = os.path.relpath(parsed.source.resolve(), folder.resolve())  # both may be moved together
@@ -54,7 +65,14 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
-    from v2hdm.io.maps.formats import FORMATS, GROUND_FORMATS, check_formats, write_map
+    from v2hdm.io.maps.formats import (
+        FORMATS,
+        GROUND_FORMATS,
+        check_crs,
+        check_formats,
+        with_data,
+        write_map,
+    )
     from v2hdm.io.maps.reading import read_map
 
     if ground := [one for one in parsed.format if one in GROUND_FORMATS]:
@@ -64,17 +82,43 @@ def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
         )
     check_formats(parsed.format, "--format")
     name = parsed.source.stem
-    files = [folder / FORMATS[one].file.format(name=name) for one in parsed.format]
+    files = [folder / FORMATS[one].file.format(name=name) for one in with_data(parsed.format)]
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be written over: set another --output or --format")
     hd_map, verdict = read_map(parsed.source)
-    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector)
+    check_crs(parsed.crs, parsed.format, hd_map.origin, "--crs")
+    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs)
+
+
+def _export_mosaic(parsed: argparse.Namespace, folder: Path) -> list[Path]:
+    from v2hdm.io.drive.road import lay_flat
+    from v2hdm.io.maps.cloud import write_cloud
+    from v2hdm.io.maps.features import ground_height_m
+    from v2hdm.io.trajectory import read_tum
+
+    _refuse_crs(parsed, "a point cloud is in the map's own frame")
+    if parsed.format != ["pcd"]:
+        raise ConfigError("--format: a mosaic is a GeoTIFF already; its other format is pcd")
+    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")), _POSITION_SIGMA_M)
+
+    def height_m(places: FloatArray) -> FloatArray:
+        return np.zeros(len(places)) if driven.road is None else ground_height_m(driven.road, places)
+
+    path = folder / f"{parsed.source.stem}.pcd"
+    write_cloud(parsed.source, path, height_m)
+    return [path]
+
+
+def _refuse_crs(parsed: argparse.Namespace, reason: str) -> None:
+    if parsed.crs is not None:
+        raise ConfigError(f"--crs: {reason}; leave it out")
 
 
 def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.io.calibration.reading import read_calibration, read_provenance
     from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration_as
 
+    _refuse_crs(parsed, "a calibration has no place on the earth")
     unknown = [name for name in parsed.format if name not in CALIBRATION_FORMATS]
     if unknown:
         known = ", ".join(CALIBRATION_FORMATS)

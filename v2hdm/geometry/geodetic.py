@@ -8,6 +8,7 @@ metres.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -61,6 +62,112 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     if not np.isfinite(geodetic).all():
         raise error(f"{where}: some points lie outside of {crs}; check it and the order easting, northing")
     return geodetic
+
+
+LOCAL = "local"
+"""The name of the map's own frame where a coordinate system is asked for."""
+
+_GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # .1 mm on the ground
+_BESIDE_DEG = 1.0  # surveyors use a zone's grid a little beyond its edges
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The coordinate system ``crs`` that a user asks for, :data:`LOCAL` or one that PROJ knows, of one map.
+
+    Its coordinates are east before north, rounded to 0.1 mm, the third the height in m above the ellipsoid,
+    or above the local z = 0. The datum stays that of the ``origin``.
+    """
+
+    crs: str
+    origin: GeodeticOrigin | None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is the map's own frame."""
+        return self.crs == LOCAL
+
+    @classmethod
+    def of(
+        cls, crs: str, origin: GeodeticOrigin | None, where: str, error: type[V2hdmError], metres: str = ""
+    ) -> Grid:
+        """The system for a map with this ``origin``; ``metres`` names a format that knows nothing else.
+
+        Raises ``error`` where the system is unknown, of another datum, or cannot hold the site.
+        """
+        if crs == LOCAL:
+            return cls(crs, origin)
+        system, datum = _system(crs, where, error), datum_of(crs, where, error)
+        if origin is None:
+            raise error(f"{where}: {crs} needs a place on the earth, and the map has none; give {LOCAL}")
+        zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
+        etrs = origin.datum.upper().startswith("ETRS")
+        fit = f"EPSG:{(25800 if etrs else 32600 if origin.latitude_deg >= 0 else 32700) + zone}"
+        if (code := system.to_authority(min_confidence=100)) is None:
+            raise error(f"{where}: '{crs}' has no code by which other programs know it; give {fit}")
+        if system.is_compound or not (system.is_projected or system.is_geographic):
+            raise error(f"{where}: {crs} has heights or axes of its own; give its horizontal part")
+        if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+            raise error(
+                f"{where}: {crs} is of {datum}, the map of {origin.datum}, which differ by decimetres; give "
+                f"{fit}, or state the datum of the drive's poses (drive.yaml, origin, datum)"
+            )
+        bare = system.is_geographic or system.axis_info[0].unit_conversion_factor != 1.0
+        if metres and bare:
+            raise error(f"{where}: {metres} holds metres, which {crs} does not have; give {fit}")
+        west, south, east, north = system.area_of_use.bounds if system.area_of_use else (-180, -90, 180, 90)
+        width_deg = (east - west) % 360 or 360
+        inside = (origin.longitude_deg - west + _BESIDE_DEG) % 360 <= width_deg + 2 * _BESIDE_DEG
+        if not inside or not south - _BESIDE_DEG <= origin.latitude_deg <= north + _BESIDE_DEG:
+            at = f"latitude {origin.latitude_deg:.2f}, longitude {origin.longitude_deg:.2f}"
+            raise error(f"{where}: the site, at {at}, lies outside of {crs} ({system.name}); give {fit}")
+        return cls(":".join(code), origin)
+
+    @property
+    def stated(self) -> dict[str, str]:
+        """The system, its datum and the epoch, as texts."""
+        about = {"crs": self.crs}
+        if self.origin is not None:
+            about["datum"] = self.origin.datum
+            if self.origin.epoch is not None:
+                about["epoch"] = repr(self.origin.epoch)
+        return about
+
+    def positions(self, xyz_map: FloatArray) -> FloatArray:
+        """Points (N, 3) of the map in this system, rounded."""
+        if self.is_local or self.origin is None:
+            return np.round(xyz_map, _GRID_DECIMALS)
+        geodetic = geodetic_from_enu(self.origin, xyz_map)
+        if is_geographic(self.crs, self.crs, MapFileError):
+            across = np.round(geodetic[:, [1, 0]], _DEGREE_DECIMALS)
+        else:
+            transformer = _inverse_of(self.crs)
+            across = np.column_stack(
+                transformer.transform(geodetic[:, 1], geodetic[:, 0], direction="INVERSE")
+            )
+            across = np.round(across, _GRID_DECIMALS)
+        return np.column_stack([across, np.round(geodetic[:, 2], _GRID_DECIMALS)])
+
+    def geodetic(self, positions: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
+        """Longitude, latitude, height (N, 3) of positions on the earth: :meth:`positions` undone."""
+        assert self.origin is not None
+        if self.is_local:
+            return geodetic_from_enu(self.origin, positions)[:, [1, 0, 2]]
+        if is_geographic(self.crs, where, error):
+            return positions
+        return geodetic_from_grid(self.crs, positions, where, error)[:, [1, 0, 2]]
+
+
+def map_projection(origin: GeodeticOrigin) -> str:
+    """The map frame as PROJ text: a transverse Mercator projection about its origin, scaled to its height.
+
+    It agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it.
+    """
+    scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
+    return (
+        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
+        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    )
 
 
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
@@ -170,6 +277,8 @@ def utm_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> tuple[str
     code = f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
     to_grid = pyproj.Transformer.from_crs(pyproj.CRS(code).geodetic_crs, code, always_xy=True)
     return code, np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
+
+
 _ENGINEERING = (
     'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
     'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
@@ -185,8 +294,4 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
     """
     if origin is None:
         return _ENGINEERING
-    scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
-    return (
-        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
-        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
-    )
+    return map_projection(origin)

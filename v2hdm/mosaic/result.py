@@ -43,13 +43,12 @@ _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
 _SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
 _BLOCK_PX = 512
-_OVERVIEWS = (2, 4, 8, 16)
 _AT_ONCE_BYTES = 1 << 24
 
 
 @contextmanager
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
-    """Put sheets into a GeoTIFF: tiled, JPEG within, with overviews and a mask; whole or not at all.
+    """Put sheets into a cloud-optimised GeoTIFF: JPEG within, overviews and a mask; whole or not at all.
 
     Raises ConfigError where rasterio is not installed.
     """
@@ -76,12 +75,15 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
                 dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
 
             yield put
-        with rasterio.open(memory.name, "r+") as dataset:
-            dataset.build_overviews(_OVERVIEWS, rasterio.enums.Resampling.average)
-        memory.seek(0)
-        with whole_file(path) as partial, partial.open("wb") as file:
-            while data := memory.read(_AT_ONCE_BYTES):
-                file.write(data)
+        with rasterio.MemoryFile(ext=".tif") as ordered:
+            need("rasterio.shutil", "gis", path.name, ConfigError).copy(
+                memory.name, ordered.name, driver="COG", compress="JPEG", quality=_JPEG_QUALITY,
+                blocksize=_BLOCK_PX, overview_resampling="average", overview_count=4, bigtiff="IF_SAFER",
+            )  # fmt: skip
+            ordered.seek(0)
+            with whole_file(path) as partial, partial.open("wb") as file:
+                while data := ordered.read(_AT_ONCE_BYTES):
+                    file.write(data)
 
 
 class Picture:

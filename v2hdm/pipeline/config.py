@@ -83,8 +83,10 @@ class RunConfig:
             known at 95 %, else the verdict is WARN (docs/verdict.md).
         mosaic: whether the ground is shown from above, too (docs/report.md).
         viewer: ``rerun`` shows and records the run while it goes on (docs/report.md), ``none`` does not.
-        export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``; of the
-            ground: ``geotiff``, ``opencrg`` (docs/exports.md).
+        export: formats of the map: ``geojson``, ``gpkg``, ``lanelet2``, ...; of the ground: ``geotiff``,
+            ``opencrg`` (docs/exports.md).
+        crs: the system of their coordinates, such as ``EPSG:25832``, or ``local``; ``map.geojson`` keeps its
+            longitude and latitude.
     """
 
     name: str | None = None
@@ -105,6 +107,7 @@ class RunConfig:
     mosaic: bool = False
     viewer: str = "none"
     export: list[str] = field(default_factory=lambda: ["geojson"])
+    crs: str | None = None
 
 
 def run_name(config: RunConfig) -> str:

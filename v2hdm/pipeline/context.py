@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -53,13 +53,15 @@ class Context:
     """Surroundings of a run.
 
     By itself the ``cache`` keeps nothing, and detection (``detect``) is by processes of this machine, one per
-    core where ``workers`` is 0. ``folder`` takes what the viewer keeps, ``seconds`` how long each step took.
+    core where ``workers`` is 0. ``accept`` refuses a drive that was read and does not suit what is to be
+    written. ``folder`` takes what the viewer keeps, ``seconds`` how long each step took.
     """
 
     cache: StageCache = field(default_factory=lambda: StageCache(None))
     progress: Progress = silent
     viewer: Viewer = field(default_factory=Unwatched)
     detect: Detect | None = None
+    accept: Callable[[Drive], None] = lambda drive: None
     workers: int = 0
     folder: Path = Path()
     seconds: dict[str, float] = field(default_factory=dict)

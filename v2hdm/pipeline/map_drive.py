@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from v2hdm.errors import AdjustError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline.base import changes_json, check_together, read_base
+from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, check_choice
 from v2hdm.pipeline.context import Context
@@ -31,6 +31,8 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
+from v2hdm.site.changes import Base
+from v2hdm.site.wear import with_wear
 from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
@@ -112,6 +114,7 @@ def map_drive(
     sources = [drive] if isinstance(drive, Source) else list(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
+    context.accept(read.whole)
     earlier = None if base is None else read_base(Path(base))
     if earlier is not None:
         check_together(earlier, read.whole, str(base))
@@ -129,6 +132,8 @@ def map_drive(
             with context.timed("map"):
                 key = read.contents.key(checked.drive)
                 sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
+            with context.timed("wear"):
+                sets = _with_wear(sets, checked.drive, earlier, context)
     except (MappingError, AdjustError) as failure:
         if not checked.has_failed:
             raise
@@ -161,6 +166,22 @@ def _detect(
     lanes = sum(len(found.lanes) for found in detections)
     _log.info("detected %d markings, %d pieces of lane paint in %d images", markings, lanes, len(detections))
     return detections
+
+
+def _with_wear(
+    sets: Mapping[str, MappedSet], drive: Drive, earlier: Base | None, context: Context
+) -> dict[str, MappedSet]:
+    """The same with the paint that is left of each marking of the best map."""
+    name, last = list(sets.items())[-1]
+    best = last.methods[BEST]
+    if best.poses is None:
+        return dict(sets)
+    poses = [best.poses.of_image(image) for image in drive.images]
+    before = None if earlier is None else earlier.hd_map
+    grey, threads = grey_reader(drive), context.processes
+    worn = with_wear(best.hd_map, drive.images, poses, best.calibrations, grey, before, threads)
+    methods = {**last.methods, BEST: replace(best, hd_map=worn)}
+    return {**sets, name: replace(last, methods=methods)}
 
 
 def _judge(

@@ -24,8 +24,9 @@ from v2hdm.io.drive.of_result import told_of
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions, write_residuals
 from v2hdm.io.maps.features import with_heights
-from v2hdm.io.maps.formats import write_map
+from v2hdm.io.maps.formats import check_crs, with_data, write_map
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.qgis import write_qgis
 from v2hdm.io.trajectory import write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
@@ -173,31 +174,39 @@ class Result:
         formats: Sequence[str] = ("geojson",),
         all_maps: bool = False,
         mosaic: bool = False,
+        crs: str | None = None,
     ) -> Path:
         """Write all that ``v2hdm map`` writes into ``folder``, whole or not at all; returns the folder.
 
         Args:
             folder: is made, or has an earlier result, which is replaced; nobody else's file is.
-            formats: of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``.
+            formats: of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``, ...
             all_maps: whether the map of every method and camera set is written, into ``maps/``.
             mosaic: whether the ground is shown from above, too.
+            crs: the system of coordinates of the formats but ``geojson``, as ``EPSG:25832`` or ``local``.
 
         Raises:
             ConfigError: there is something else in the folder, or a format cannot be written.
         """
         with result_folder(Path(folder), "folder", made_of_drives(self.about["drive"]["paths"])) as partial:
-            self.write(partial, formats, all_maps, mosaic, Context(seconds=self.seconds))
+            self.write(partial, formats, all_maps, mosaic, Context(seconds=self.seconds), crs)
         return Path(folder)
 
     def write(
-        self, folder: Path, formats: Sequence[str], all_maps: bool, mosaic: bool, context: Context
+        self,
+        folder: Path,
+        formats: Sequence[str],
+        all_maps: bool,
+        mosaic: bool,
+        context: Context,
+        crs: str | None = None,
     ) -> None:
         """Write what :meth:`save` does into a folder that is still unfinished."""
         from v2hdm.mosaic.result import write_mosaic
         from v2hdm.report.page.document import write_page
 
         if self.judgement is not None:
-            _write_map(folder, self, formats, self.judgement)
+            _write_map(folder, self, formats, self.judgement, crs)
             for name, methods in self.methods.items() if all_maps else ():
                 for method, made in methods.items():
                     path = folder / "maps" / f"{name}_{method}.geojson"
@@ -206,13 +215,21 @@ class Result:
         if mosaic and self.methods:
             with context.timed("mosaic"):
                 write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
+        if "qgis" in formats and self.methods:  # it opens the mosaic, too
+            grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
+            write_qgis(self.map, folder / "map.qgs", grid=grid)
         with context.timed("report"):
             write_page(folder, self.drive)
 
 
-def _write_map(folder: Path, result: Result, formats: Sequence[str], judgement: Judgement) -> None:
+def _write_map(
+    folder: Path, result: Result, formats: Sequence[str], judgement: Judgement, crs: str | None
+) -> None:
     drive, best, verdict = result.drive, result.best, result.verdict.as_json()
-    write_map(result.map, folder, "map", formats, verdict)
+    geojson = [one for one in formats if one == "geojson"]  # longitude and latitude, whatever the others have
+    write_map(result.map, folder, "map", geojson, verdict)
+    others = [one for one in with_data(formats) if one not in ("geojson", "qgis")]
+    write_map(result.map, folder, "map", others, verdict, crs=crs)
     about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)

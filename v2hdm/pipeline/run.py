@@ -19,11 +19,13 @@ from typing import Any
 from v2hdm import __version__
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.drive import read_drive
+from v2hdm.io.maps.formats import check_crs
 from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit, run_name
 from v2hdm.pipeline.context import Context, Unwatched, Viewer, log_file, logging_to
 from v2hdm.pipeline.keys import Contents, base_files, made_of_drives, result_key
 from v2hdm.progress import Progress, silent
+from v2hdm.records import Drive
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of
@@ -247,7 +249,11 @@ def map_and_save(
         with result_folder(place, made=made) as folder, logging_to(log_file(folder / "run.log")):
             _log.info("v2hdm %s, run %s", __version__, name)
             (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-            context = replace(context, cache=cache, workers=config.workers, folder=folder)
+
+            def accept(drive: Drive) -> None:
+                check_crs(config.crs, [one for one in config.export if one != "geojson"], drive.origin, "crs")
+
+            context = replace(context, cache=cache, workers=config.workers, folder=folder, accept=accept)
             found = map_drive(
                 _drive_folders(config, context),
                 name=name,
@@ -260,7 +266,7 @@ def map_and_save(
                 context=context,
             )
             key = result_key(config, found.drives, found.contents, context.cache.key())
-            found.write(folder, config.export, config.all_maps, config.mosaic, context)
+            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs)
             for line in found.verdict.lines:
                 _log.info("%s", line)
         result = RunResult(place, found.metrics, found.headlines, found.verdict)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
-from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.geometry.planar import signed_area
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, Road, Symbol
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, PaintLeft, Road, Symbol
 
 CORNERS, POINTS, OUTLINE = "corners_map", "points_map", "outline_map"
 """Properties with the exact local coordinates of a marking's corners, a lane's points, a symbol's outline."""
@@ -19,6 +19,8 @@ Heights = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Heights (N,) of points (N, 2), m, and their standard deviations (N,)."""
 
 T = TypeVar("T", Marking, Lane, Symbol)
+PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
+"""Properties of the paint that a marking has left: its share, what that was off an earlier map's, sigmas."""
 
 _ALONG_M = 3.0  # stations within about this of the nearest one share in a point's height: noise averages out
 _AT_ONCE = 1024  # points whose distances to all stations are held in memory together
@@ -47,6 +49,7 @@ class Feature:
     symbol: bool = False
     place_sigma_m: float | None = None
     vertex_sigma_m: FloatArray | None = None
+    paint: PaintLeft | None = None
 
     @property
     def key(self) -> str:
@@ -78,12 +81,14 @@ class Feature:
         heights = np.zeros(len(self.points_map)) if self.heights_m is None else self.heights_m
         return np.column_stack([self.points_map, heights])
 
-    def positions(self, origin: GeodeticOrigin | None) -> FloatArray:
+    def positions(self, origin: GeodeticOrigin | Grid | None) -> FloatArray:
         """The points in order of :attr:`ring`.
 
         (N, 3) longitude and latitude in degrees and ellipsoidal height in m; without an ``origin`` local
-        metres, (N, 2) where no height is known.
+        metres, (N, 2) where no height is known; in a :class:`Grid` its coordinates (N, 3).
         """
+        if isinstance(origin, Grid):
+            return origin.positions(self.xyz_map)[self.ring]
         if origin is None:
             return (self.points_map if self.heights_m is None else self.xyz_map)[self.ring]
         return geodetic_from_enu(origin, self.xyz_map)[self.ring][:, [1, 0, 2]]
@@ -101,7 +106,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
             points, more = one.points_map, {"vertex_sigma_m": one.sigma_m}
         else:
             sigma_m, points = one.relative_sigma_m, one.corners_map
-            more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m}
+            more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m, "paint": one.paint}
         closed = not isinstance(one, Lane)
         more["heights_sigma_m"] = one.heights_sigma_m
         features.append(Feature(number, one.kind, points, one.sightings, closed, one.heights_m, **more))
@@ -118,8 +123,8 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
         if one.symbol:
             symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m))
         elif one.closed:
-            marking = Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number)
-            markings.append(replace(marking, heights_sigma_m=one.heights_sigma_m))
+            more = one.covariance_m2, one.relative_sigma_m, one.heights_m, number, one.paint
+            markings.append(replace(Marking(*own, *more), heights_sigma_m=one.heights_sigma_m))
         else:
             lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m, one.heights_sigma_m))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
@@ -149,6 +154,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "covariance_m2": feature.covariance_m2,
         "relative_sigma_m": feature.relative_sigma_m,
         "vertex_sigma_m": feature.vertex_sigma_m,
+        **({} if feature.paint is None else dict(zip(PAINT, astuple(feature.paint), strict=True))),
     }
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value

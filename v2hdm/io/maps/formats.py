@@ -19,11 +19,15 @@ import numpy as np
 
 from v2hdm.errors import ConfigError
 from v2hdm.extras import need
-from v2hdm.io.maps.features import Feature, features_of
+from v2hdm.geometry.geodetic import Grid
+from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.ground import write_ground_geotiff, write_opencrg
+from v2hdm.io.maps.landxml import write_landxml
 from v2hdm.io.maps.lanelet2 import write_lanelet2
+from v2hdm.io.maps.opendrive import write_opendrive
+from v2hdm.io.maps.qgis import write_qgis
 from v2hdm.io.maps.reading import Verdict
 from v2hdm.records import GeodeticOrigin, HdMap
 from v2hdm.store.files import replace_csv, whole_file
@@ -37,20 +41,26 @@ _TEXT, _REAL, _WHOLE = 1000, 1040, 1071
 _COLOURS = 6  # AutoCAD's first colours, red to magenta, take turns
 
 
-def write_dxf(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
-    """Write ``hd_map`` as DXF, atomically: local metres, a layer per class, closed 3D polylines for markings.
+def write_dxf(
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+) -> None:
+    """Write ``hd_map`` as DXF, atomically: metres, a layer per class, closed 3D polylines for markings.
 
-    A DXF has no place for the ``verdict``. Raises ConfigError when ``ezdxf`` is not installed.
+    They are local, or of the ``grid``, which the drawing's custom properties name with datum and epoch. A DXF
+    has no place for the ``verdict``. Raises ConfigError when ``ezdxf`` is not installed.
     """
     ezdxf = need("ezdxf", "gis", "the format dxf", ConfigError)
     document = ezdxf.new("R2010", units=ezdxf.units.M)
     document.appids.add(APPLICATION)
+    if grid is not None:
+        for key, value in grid.stated.items():
+            document.header.custom_vars.append(key, value)
     space = document.modelspace()
     for feature in features_of(hd_map):
         layer = re.sub(r'[<>/\\":;?*|=`]', "_", feature.kind)
         if layer not in document.layers:
             document.layers.add(layer, color=1 + len(document.layers) % _COLOURS)
-        points = feature.xyz_map[feature.ring].tolist()
+        points = (feature.xyz_map[feature.ring] if grid is None else feature.positions(grid)).tolist()
         line = space.add_polyline3d(points, close=feature.closed, dxfattribs={"layer": layer})
         data: list[tuple[int, Any]] = [(_TEXT, "id"), (_WHOLE, feature.id)]
         data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
@@ -71,21 +81,29 @@ COLUMNS: tuple[str, ...] = (
     *("longitude_deg", "latitude_deg", "ellipsoidal_height_m"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sightings", "relative_sigma_m"),
     *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, 5) for other in "xy"),
+    *PAINT,
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
 of point 3 of the same feature. Empty where it is not known."""
 
 
-def write_csv(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+def write_csv(
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+) -> None:
     """Write ``hd_map`` as CSV, atomically: a row per corner or vertex, every number at full precision.
 
-    A CSV has no place for the ``verdict``.
+    Coordinates in a ``grid``, rounded to 0.1 mm, take the place of longitude and latitude, which its last
+    columns name. A CSV has no place for the ``verdict``.
     """
-    rows = (row for feature in features_of(hd_map) for row in _rows(feature, hd_map.origin))
-    replace_csv(path, [COLUMNS, *rows])
+    columns, about = [*COLUMNS], {} if grid is None else grid.stated
+    if grid is not None:
+        columns[6:9] = ["easting", "northing", "up_m" if grid.is_local else COLUMNS[8]]
+    place = grid or hd_map.origin
+    rows = ([*row, *about.values()] for feature in features_of(hd_map) for row in _rows(feature, place))
+    replace_csv(path, [[*columns, *about], *rows])
 
 
-def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:
+def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[Any]]:
     count = len(feature.points_map)
     geodetic: list[list[Any]] = [["", "", ""]] * count
     if origin is not None:
@@ -93,6 +111,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:
         positions[feature.ring] = feature.positions(origin)
         geodetic = positions.tolist()
     relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
+    paint = [properties_of(feature).get(name, "") for name in PAINT]
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
         z, sigma_z = (
@@ -105,7 +124,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | None) -> list[list[Any]]:
             sigmas = np.sqrt(np.diag(own[:, 2 * k : 2 * k + 2])).tolist()
             covariances = own.ravel().tolist()
         row = [feature.id, feature.kind, k + 1, x, y, z, *geodetic[k], *sigmas, sigma_z]
-        rows.append([*row, feature.sightings, relative, *covariances])
+        rows.append([*row, feature.sightings, relative, *covariances, *paint])
     return rows
 
 
@@ -114,22 +133,28 @@ class Format:
     """One format: its file by the map's name, the function that writes it, the package that it needs."""
 
     file: str
-    write: Callable[[HdMap, Path, Verdict], None]
+    write: Callable[..., None]
     needs: str | None = None
+    takes_crs: bool = True
+    metres: str = ""
+    """The format's name where it holds nothing but metres."""
 
 
 FORMATS: Mapping[str, Format] = {
     "geojson": Format("{name}.geojson", write_geojson),
     "csv": Format("{name}.csv", write_csv),
     "gpkg": Format("{name}.gpkg", write_geopackage, "pyogrio"),
-    "lanelet2": Format("{name}_lanelet2/lanelet2_map.osm", write_lanelet2),
-    "dxf": Format("{name}.dxf", write_dxf, "ezdxf"),
+    "lanelet2": Format("{name}_lanelet2/lanelet2_map.osm", write_lanelet2, takes_crs=False),
+    "dxf": Format("{name}.dxf", write_dxf, "ezdxf", metres="DXF"),
+    "qgis": Format("{name}.qgs", write_qgis, "pyogrio"),
+    "opendrive": Format("{name}.xodr", write_opendrive, takes_crs=False),
+    "landxml": Format("{name}.xml", write_landxml, metres="LandXML"),
 }
 
 
 GROUND_FORMATS: Mapping[str, Format] = {
-    "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio"),
-    "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg"),
+    "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio", takes_crs=False),
+    "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg", takes_crs=False),
 }
 """Of the ground's surface, which a map has as the run's result, but not from its files."""
 
@@ -145,6 +170,22 @@ def check_formats(names: Sequence[str], key: str) -> None:
             need(package, "gis", f"the format {name}", ConfigError)
 
 
+def with_data(formats: Sequence[str]) -> list[str]:
+    """``formats``, each once, with the GeoPackage that a project of QGIS opens."""
+    return list(dict.fromkeys(["gpkg", *formats] if "qgis" in formats else formats))
+
+
+def check_crs(
+    crs: str | None, formats: Sequence[str], origin: GeodeticOrigin | None, key: str
+) -> Mapping[str, Grid]:
+    """The grid of each format that takes the ``crs``; raises ConfigError where it cannot hold the site."""
+    chosen = [name for name in formats if crs is not None and _ALL[name].takes_crs]
+    if crs is not None and not chosen:
+        takers = ", ".join(name for name, one in FORMATS.items() if one.takes_crs)
+        raise ConfigError(f"{key}: no format that is to be written takes one ({takers} do); leave it out")
+    return {name: Grid.of(str(crs), origin, key, ConfigError, FORMATS[name].metres) for name in chosen}
+
+
 def write_map(
     hd_map: HdMap,
     folder: Path,
@@ -152,16 +193,19 @@ def write_map(
     formats: Sequence[str],
     verdict: Verdict = None,
     projector: str | None = None,
+    crs: str | None = None,
 ) -> list[Path]:
     """Write a map in several of :data:`FORMATS` to ``folder``; returns the files, each written atomically.
 
-    ``name`` is that of the files, ``verdict`` that on the run which made the map, as JSON, and ``projector``
-    that of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`. Raises ConfigError when a format is not known,
-    lacks its package, or the projector does not suit the map.
+    ``name`` is that of the files, ``verdict`` that on the run which made the map, as JSON, ``projector`` that
+    of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`, and ``crs`` the system of the other formats' coordinates
+    in place of their own. Raises ConfigError when a format is not known or lacks its package, or when the
+    projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
+    grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
     written = []
-    for chosen in dict.fromkeys(formats):
+    for chosen in with_data(formats):
         path = folder / _ALL[chosen].file.format(name=name)
         if chosen in GROUND_FORMATS and not hd_map.ground:
             _log.warning(
@@ -172,9 +216,11 @@ def write_map(
         write = _ALL[chosen].write
         if chosen == "lanelet2":
             write = partial(write_lanelet2, projector=projector)
+        elif chosen in grids:
+            write = partial(write, grid=grids[chosen])
         write(hd_map, path, verdict)
         written.append(path)
-        if chosen == "geojson" and hd_map.origin is None:
+        if chosen == "geojson" and hd_map.origin is None and crs is None:
             _log.warning(
                 "%s: the drive has no origin on the earth, so its coordinates are metres, which a GIS opens "
                 "as degrees; the format gpkg says what they are",

@@ -4,7 +4,8 @@ With a geodetic origin the geometry is WGS84 longitude and latitude, as the RFC 
 map in its place. Without one it is local metres, as the foreign member ``v2hdm`` states under
 ``coordinates``. The properties ``corners_map`` and ``points_map`` hold the local coordinates at full
 precision, ``heights_m`` the ground's heights in the map frame. With heights or an origin, positions have a
-third coordinate, in m: above the ellipsoid, or above the local z = 0.
+third coordinate, in m: above the ellipsoid, or above the local z = 0. In another system it has the member
+``crs`` of GeoJSON 2008, by which GDAL goes, and ``v2hdm`` names it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import Feature, features_of, properties_of
 from v2hdm.io.maps.reading import RESOLUTION
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
@@ -27,15 +29,17 @@ _LOCAL = "local map frame, metres east and north, up where known; NOT longitude 
 _DEGREE_DECIMALS, _HEIGHT_DECIMALS = 11, 5  # 0.001 mm on the ground
 
 
-def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
-    """Write ``hd_map`` to ``path`` as a FeatureCollection, atomically.
+def write_geojson(
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+) -> None:
+    """Write ``hd_map`` to ``path`` as a FeatureCollection, atomically, in a ``grid`` if there is one.
 
     Markings become Polygons (closed, counter-clockwise), lanes LineStrings. The ``verdict`` on the run that
     made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
     features = []
     for one in features_of(hd_map):
-        positions = _rounded(one.positions(hd_map.origin), hd_map.origin)
+        positions = _rounded(one.positions(grid or hd_map.origin), grid or hd_map.origin)
         shape, coordinates = (
             ("Polygon", [[*positions, positions[0]]]) if one.closed else ("LineString", positions)
         )
@@ -46,19 +50,29 @@ def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None =
         about["drift_over_m"] = hd_map.drift_over_m
     if verdict is not None:
         about["verdict"] = dict(verdict)
-    write_features(path, features, hd_map.origin, about)
+    write_features(path, features, hd_map.origin, about, grid)
 
 
 def write_features(
-    path: Path, features: Sequence[Mapping[str, Any]], origin: GeodeticOrigin | None, about: Mapping[str, Any]
+    path: Path,
+    features: Sequence[Mapping[str, Any]],
+    origin: GeodeticOrigin | None,
+    about: Mapping[str, Any],
+    grid: Grid | None = None,
 ) -> None:
     """Write GeoJSON ``features`` a line each, atomically, with the frame and ``about`` under ``v2hdm``."""
     frame: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
     if origin is not None:
         frame["origin"] = asdict(origin)
     decimals = (_DEGREE_DECIMALS, _HEIGHT_DECIMALS)
-    resolution = {} if origin is None else {k: 10.0**-n for k, n in zip(RESOLUTION, decimals, strict=True)}
-    members = {"type": "FeatureCollection", **resolution, "v2hdm": frame | dict(about)}
+    known: dict[str, Any] = {}
+    if grid is not None:
+        frame |= {"crs": grid.crs} | ({"coordinates": _LOCAL} if grid.is_local else {"coordinates": grid.crs})
+        name = f"urn:ogc:def:crs:{grid.crs.upper().replace(':', '::')}"
+        known = {} if grid.is_local else {"crs": {"type": "name", "properties": {"name": name}}}
+    elif origin is not None:
+        known = {k: 10.0**-n for k, n in zip(RESOLUTION, decimals, strict=True)}
+    members = {"type": "FeatureCollection", **known, "v2hdm": frame | dict(about)}
     head = json.dumps(members, allow_nan=False)
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
     replace_text(path, f'{head[:-1]}, "features": [\n{lines}\n]}}\n')
@@ -83,8 +97,8 @@ def geojson_positions(
     return _rounded(Feature(0, "", points_map, 0, False, heights_m).positions(origin), origin)
 
 
-def _rounded(positions: FloatArray, origin: GeodeticOrigin | None) -> list[list[float]]:
-    if origin is not None:
+def _rounded(positions: FloatArray, origin: GeodeticOrigin | Grid | None) -> list[list[float]]:
+    if isinstance(origin, GeodeticOrigin):
         heights_m = np.round(positions[:, 2], _HEIGHT_DECIMALS)
         positions = np.column_stack([np.round(positions[:, :2], _DEGREE_DECIMALS), heights_m])
     rounded: list[list[float]] = positions.tolist()

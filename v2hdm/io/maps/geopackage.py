@@ -2,7 +2,8 @@
 
 Layers ``markings`` and ``symbols`` hold polygons, ``lanes`` lines, all with heights; the table ``v2hdm``
 describes the map. With a geodetic origin coordinates are longitude, latitude and ellipsoidal height
-(EPSG:4326). Without one they are local metres in an engineering CRS, which no GIS takes for degrees.
+(EPSG:4326), or those of the grid that was asked for. Without one, or where the local frame was asked for,
+they are local metres in an engineering CRS, which no GIS takes for degrees.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.extras import need
-from v2hdm.io.maps.features import POINTS, Feature, features_of, properties_of
+from v2hdm.geometry.geodetic import Grid
+from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HdMap
 from v2hdm.store.files import whole_file
 
-_LOCAL = (
+LOCAL_CRS = (
     'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",'
     'EDATUM["origin of the drive"],CS[Cartesian,2],AXIS["easting (E)",east,ORDER[1]],'
     'AXIS["northing (N)",north,ORDER[2]],LENGTHUNIT["metre",1]]'
@@ -53,7 +55,9 @@ _OPTION = '<Option type="QString" name="{}" value="{}"/>'
 AnyArray = NDArray[Any]
 
 
-def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+def write_geopackage(
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+) -> None:
     """Write ``hd_map`` to ``path``, atomically, with the ``verdict`` on the run that made it.
 
     Raises ConfigError when ``pyogrio`` is not installed, MapFileError when GDAL cannot write there.
@@ -65,7 +69,10 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
         about["origin"] = asdict(hd_map.origin)
     if verdict is not None:
         about["verdict"] = dict(verdict)
-    crs = _LOCAL if hd_map.origin is None else "EPSG:4326"
+    crs = LOCAL_CRS if hd_map.origin is None else "EPSG:4326"
+    if grid is not None:
+        about["crs"] = grid.crs
+        crs = LOCAL_CRS if grid.is_local else grid.crs
     styles = []
     with whole_file(path) as partial:
         # GDAL recognises the format of a file by its ending.
@@ -82,7 +89,7 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
                 for key, layer in LAYERS.items():
                     mine = [feature for feature in features if feature.key == key]
                     kind = "LineString Z" if key == POINTS else "Polygon Z"
-                    shapes = _shapes(mine, hd_map.origin)
+                    shapes = _shapes(mine, grid or hd_map.origin)
                     write(layer, _columns(key, mine), shapes, geometry_type=kind, crs=crs)
                     styles.append(_style_row(layer, sorted({one.kind for one in mine}), key != POINTS))
                 write("v2hdm", {key: [json.dumps(value)] for key, value in about.items()})
@@ -117,10 +124,11 @@ def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
         "sightings": numbers("sightings", np.int64),
         "sigma_m": numbers("sigma_m"),
         "relative_sigma_m": numbers("relative_sigma_m"),
+        **{name: numbers(name) for name in PAINT if key == CORNERS},
     } | {name: [json.dumps(one[name]) if name in one else None for one in rows] for name in (key, *EXACT)}
 
 
-def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | None) -> AnyArray:
+def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -> AnyArray:
     """Well-known binary of features, with heights."""
     shapely = need("shapely", "gis", "the format gpkg", ConfigError)
     shapes = np.empty(len(features), dtype=object)
@@ -132,8 +140,8 @@ def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | None) -> AnyAr
     return np.asarray(shapely.to_wkb(shapes, flavor="iso"))
 
 
-def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]:
-    """A layer's row of styles; classes of later edits fall into the last category, of an empty value."""
+def layer_style(kinds: Sequence[str], closed: bool) -> str:
+    """QGIS's style of a layer; classes of later edits fall into the last category, of an empty value."""
     categories, symbols = "", ""
     shape, drawing, options = ("fill", "SimpleFill", _FILL) if closed else ("line", "SimpleLine", _LINE)
     for number, kind in enumerate([*kinds, ""]):
@@ -141,11 +149,16 @@ def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]
         colour = _COLOURS.get(kind, _OTHER_COLOUR)
         drawn = "".join(_OPTION.format(name, value.format(colour)) for name, value in options.items())
         symbols += _SYMBOL.format(number, shape, drawing, drawn)
+    return _STYLE.format(categories, symbols)
+
+
+def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]:
+    """A layer's row in the table of styles."""
     empty = dict.fromkeys(("f_table_catalog", "f_table_schema", "styleSLD", "owner", "ui"), "")
     return empty | {
         "f_table_name": layer,
         "f_geometry_column": GEOMETRY,
         "styleName": f"v2hdm {layer}",
-        "styleQML": _STYLE.format(categories, symbols),
+        "styleQML": layer_style(kinds, closed),
         "description": "colours by class",
     }

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.geodetic import enu_from_geodetic
+from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
-from v2hdm.io.maps.features import CORNERS, OUTLINE, POINTS, Feature, map_of, unique_ids
+from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
 from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.io.safe.texts import parse_json, take_name
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
-from v2hdm.store.files import load_json, take_array, take_mapping, take_number
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, PaintLeft
+from v2hdm.store.files import load_json, take_array, take_mapping, take_number, take_text
 from v2hdm.store.inputs import note_input
 
 _log = logging.getLogger(__name__)
@@ -38,6 +38,7 @@ _NAMED = 9  # edited features that the log names
 # several zeros for noise and drops it, and files of version 0.1 have nine and four decimals: 0.1 mm on the
 # ground. Local metres are written at full precision; a GIS that rewrites them keeps 15 digits.
 _TEXT_ROUNDING, _BINARY_ROUNDING, _LOCAL_ROUNDING_M = (1e-9, 1e-9, 1e-4), (1e-11, 1e-11, 1e-6), 1e-6
+_GRID_ROUNDING = (3e-9, 3e-9, 1.2e-4)  # of a grid's 0.1 mm, as far as 70 degrees north
 
 RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
 """Members of GeoJSON that state how coordinates are rounded, m or degrees, for GDAL since 3.9."""
@@ -84,7 +85,7 @@ def read_geojson(path: Path) -> HdMap:
         if key in content:
             stated = take_number(content[key], f"{path}: {key}", MapFileError)
             rounding[axes] = np.maximum(rounding[axes], stated)
-    reader = _Reader(path, origin, rounding)
+    reader = _Reader(path, origin, rounding, about.get("crs"))
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         entry = take_mapping(feature, where, MapFileError)
@@ -111,7 +112,7 @@ def read_geopackage(path: Path) -> HdMap:
     """Read our own GeoPackage, which others may have edited, as :func:`read_geojson` does."""
     origin = take_origin(_about(path, "origin"), f"{path}: origin", MapFileError)
     rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else np.array(_BINARY_ROUNDING)
-    reader = _Reader(path, origin, rounding)
+    reader = _Reader(path, origin, rounding, _about(path, "crs"))
     for key, layer in LAYERS.items():
         for number, properties in enumerate(_layer(path, layer)):
             where = f"{path}: {layer}, row {number + 1}"
@@ -137,8 +138,16 @@ class _Reader:
     ``rounding`` (3,) is how far positions may be off for having been rounded, in the file's own units.
     """
 
-    def __init__(self, path: Path, origin: GeodeticOrigin | None, rounding: FloatArray) -> None:
+    def __init__(
+        self, path: Path, origin: GeodeticOrigin | None, rounding: FloatArray, crs: object = None
+    ) -> None:
         self._path, self._origin, self._rounding = path, origin, rounding
+        self._grid: Grid | None = None
+        if crs is not None:
+            self._grid = Grid.of(
+                take_text(crs, f"{path}: crs", MapFileError), origin, str(path), MapFileError
+            )
+            self._rounding = np.array(_GRID_ROUNDING if origin else (1.2e-4,) * 3)
         self._features: list[Feature] = []
         self._edited: list[int] = []
 
@@ -148,6 +157,12 @@ class _Reader:
         if geometry is not None and geometry.closed and len(geometry.positions) < 3:
             raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
         geodetic = geometry is not None and self._origin is not None
+        if geometry is not None and geodetic and self._grid is not None:
+            if geometry.positions.shape[1] < 3:
+                raise MapFileError(f"{where}: its geometry has lost its heights; keep them when you edit")
+            geometry = replace(
+                geometry, positions=self._grid.geodetic(geometry.positions, where, MapFileError)
+            )
         if geometry is not None and geodetic and (np.abs(geometry.positions[:, 1]) > 90).any():
             raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; mend it")
         closed = POINTS not in properties if geometry is None else geometry.closed
@@ -233,6 +248,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         known = properties.get(key) if key not in EXACT or len(points) else None
         return None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
 
+    left = [optional(name, take_number) for name in PAINT]
     return Feature(
         id=optional("id", take_whole, -_LARGEST_ID, _LARGEST_ID) or 0,
         kind=take_name(properties.get("class"), f"{where}, class", MapFileError),
@@ -248,6 +264,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         vertex_sigma_m=None
         if closed or not len(points)
         else optional("vertex_sigma_m", take_array, (len(points),)),
+        paint=None if left[0] is None or left[1] is None else PaintLeft(*left),
     )
 
 

@@ -1,0 +1,80 @@
+"""The share of paint that a marking has left, against what the renderer has painted."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+
+from tests.ports import short_port, small_port
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
+from v2hdm.pipeline.base import grey_reader
+from v2hdm.records import Calibration, HdMap, PaintLeft
+from v2hdm.simulate.port.build import build_port
+from v2hdm.simulate.port.config import PaintConfig
+from v2hdm.simulate.render import ground
+from v2hdm.site.wear import with_wear
+
+FOOTPRINT_M = 0.012  # of a pixel of the nearest images, at which the renderer draws the flakes
+
+
+def share_rendered(paint):
+    """The mean opacity of a marking's clean paint, by the renderer itself."""
+    low, high = paint.polygon_map.min(axis=0), paint.polygon_map.max(axis=0)
+    x, y = np.meshgrid(*(np.arange(a, b, 0.01, dtype=np.float32) for a, b in zip(low, high, strict=True)))
+    field = SimpleNamespace(x_m=x, y_m=y, footprint_m=np.full_like(x, FOOTPRINT_M))
+    everything = (slice(None), slice(None))
+    opacity, _ = ground._opacity(replace(paint, dirt=0.0), np.ones_like(x), field, everything)
+    pixels = np.round((paint.polygon_map - low) / 0.01).astype(np.int32)
+    inside = cv2.fillConvexPoly(np.zeros(x.shape, np.uint8), pixels, 1) > 0
+    return float(opacity[inside].mean())
+
+
+def measured(folder, port, earlier=None):
+    """(map, rendered shares by marking) under the true geometry: markings that half the images show whole."""
+    drive = read_drive(folder)
+    truth = read_truth(drive)
+    calibrations = {k: Calibration(one.info, truth.cam_from_vehicle[k]) for k, one in drive.cameras.items()}
+    shown = (truth.visibility > 0.95).sum(axis=0) >= 2
+    markings = [replace(m, id=k) for k, m in enumerate(truth.map.markings, start=1) if shown[k - 1]]
+    paints = build_port(port).renderer.scene.paints
+    centres = np.array([one.polygon_map.mean(axis=0) for one in paints])
+    nearest = [np.argmin(((centres - m.corners_map.mean(axis=0)) ** 2).sum(axis=1)) for m in markings]
+    poses, grey = truth.map_from_vehicle, grey_reader(drive)
+    hd_map = with_wear(HdMap(tuple(markings)), drive.images, poses, calibrations, grey, earlier)
+    return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
+
+
+def test_the_share_of_paint_left_is_within_five_hundredths_of_what_was_rendered(short_drive):
+    hd_map, rendered = measured(short_drive, short_port())
+    found = [(one.paint.share, one.paint.sigma, rendered[one.id]) for one in hd_map.markings if one.paint]
+    share, sigma, true = np.array(found).T
+    assert len(found) > 20
+    assert true.min() < 0.4  # some are nearly gone
+    assert np.abs(share - true).mean() <= 0.05
+    assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.85
+    assert np.corrcoef(share, true)[0, 1] > 0.9
+
+
+def test_two_visits_keep_the_order_and_the_second_states_the_change(rendered):
+    worn = small_port(paint=replace(PaintConfig(), wear=0.3))
+    first, before = measured(rendered(small_port()), small_port())
+    second, after = measured(rendered(worn), worn, first)
+    compared = [one for one in second.markings if one.paint and one.paint.change is not None]
+    true = np.array([after[one.id] - before[one.id] for one in compared])
+    change = np.array([one.paint.change for one in compared])
+    clearly = true < -0.1
+    assert clearly.sum() >= 5
+    assert (change[clearly] < 0).all()
+    sigma = np.array([one.paint.change_sigma for one in compared])
+    assert np.mean(np.abs(change - true) <= 2 * sigma) >= 0.85
+
+
+def test_a_marking_that_no_image_shows_keeps_what_the_earlier_map_says(small_drive):
+    drive = read_drive(small_drive)
+    away = replace(read_truth(drive).map.markings[0], corners_map=np.eye(4)[:, :2] + 1e4, id=1)
+    before = HdMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
+    arguments = drive.images, [one.map_from_vehicle for one in drive.images], {}, grey_reader(drive)
+    assert with_wear(HdMap((away,)), *arguments, before).markings[0].paint == PaintLeft(0.7, 0.1)
+    assert with_wear(HdMap((away,)), *arguments).markings[0].paint is None

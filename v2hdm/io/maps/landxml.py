@@ -1,0 +1,60 @@
+"""Writing an HD map as LandXML 1.2 for surveyors' and road designers' programs.
+
+Every feature is a ``PlanFeature`` named by its id, its class as ``desc``, made of straight lines between
+points ``northing easting height``. Its ``Feature`` of properties holds sightings and sigma.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from v2hdm import __version__
+from v2hdm.geometry.geodetic import LOCAL, Grid
+from v2hdm.io.maps.features import features_of, properties_of
+from v2hdm.records import HdMap
+from v2hdm.store.files import replace_text
+
+_NAMESPACE = "http://www.landxml.org/schema/LandXML-1.2"
+
+
+def write_landxml(
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+) -> None:
+    """Write ``hd_map`` as LandXML, atomically, in metres of the ``grid``, else of the map's own frame.
+
+    A LandXML file has no place for the ``verdict``.
+    """
+    grid = grid or Grid(LOCAL, hd_map.origin)
+    now = datetime.now(UTC)
+    stamp = {"date": now.strftime("%Y-%m-%d"), "time": now.strftime("%H:%M:%S")}
+    root = ET.Element("LandXML", {"xmlns": _NAMESPACE, "version": "1.2", **stamp})
+    units = {"areaUnit": "squareMeter", "linearUnit": "meter", "volumeUnit": "cubicMeter"}
+    more = {"temperatureUnit": "celsius", "pressureUnit": "milliBars", "angularUnit": "decimal degrees"}
+    ET.SubElement(ET.SubElement(root, "Units"), "Metric", units | more)
+    system = {"desc": ", ".join(f"{key} {value}" for key, value in grid.stated.items())}
+    if grid.crs.upper().startswith("EPSG:"):
+        system["epsgCode"] = grid.crs[5:]
+    ET.SubElement(root, "CoordinateSystem", system)
+    ET.SubElement(root, "Application", {"name": "v2hdm", "version": __version__})
+    group = ET.SubElement(root, "PlanFeatures", {"name": "markings"})
+    for one in features_of(hd_map):
+        element = ET.SubElement(group, "PlanFeature", {"name": str(one.id), "desc": one.kind})
+        geometry = ET.SubElement(element, "CoordGeom")
+        east_first = one.positions(grid).tolist()
+        points = [f"{north:.4f} {east:.4f} {up:.4f}" for east, north, up in east_first]
+        for start, end in pairwise([*points, points[0]] if one.closed else points):
+            line = ET.SubElement(geometry, "Line")
+            ET.SubElement(line, "Start").text = start
+            ET.SubElement(line, "End").text = end
+        about = ET.SubElement(element, "Feature", {"code": "v2hdm"})
+        for key, value in properties_of(one).items():
+            if not isinstance(value, list):
+                text = f"{value:.5g}" if isinstance(value, float) else str(value)
+                ET.SubElement(about, "Property", {"label": key, "value": text})
+    ET.indent(root, " ")
+    replace_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n')

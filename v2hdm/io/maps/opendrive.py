@@ -1,0 +1,175 @@
+"""Writing an HD map as OpenDRIVE 1.7, for simulators.
+
+Every lane between two lane lines is a road of its own: its reference line is the left line, straight from
+vertex to vertex, its only lane ``-1`` is as wide as the right line is away, and both lines are road marks.
+Roads have no links and no junctions, for a map of paint does not say how lanes connect. Every marking and
+symbol is an object ``roadMark`` of the nearest road, its outline exact in the object's own axes. Where no two
+lines bound a lane, one road without width runs along the longest line or through the markings and carries
+them.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.geometry.geodetic import map_projection
+from v2hdm.io.maps.closed_lanes import closed_lanes
+from v2hdm.io.maps.features import Feature, features_of
+from v2hdm.records import LANE_DASH, FloatArray, HdMap
+from v2hdm.store.files import replace_text
+
+_LEAST_STEP_M = 1e-3  # between vertices of a reference line: shorter geometries are refused by readers
+
+
+@dataclass(frozen=True)
+class _Road:
+    """A reference line ``xyz`` (N, 3) m, the lane's width at each vertex, and the marks left and right."""
+
+    xyz: FloatArray
+    width_m: FloatArray
+    marks: tuple[str, str]
+
+    @property
+    def steps(self) -> FloatArray:
+        return np.diff(self.xyz[:, :2], axis=0)
+
+    @property
+    def s_m(self) -> FloatArray:
+        """The distance of each vertex along the line (N,)."""
+        return np.insert(np.cumsum(np.linalg.norm(self.steps, axis=1)), 0, 0.0)
+
+    def nearest(self, point: FloatArray) -> tuple[float, int, float]:
+        """Distance of a point (2,), the segment that it is nearest to, and how far along that, m."""
+        length = np.diff(self.s_m)
+        offset = point - self.xyz[:-1, :2]
+        along = np.clip((offset * self.steps).sum(axis=1) / length, 0.0, length)
+        away = np.linalg.norm(offset - self.steps * (along / length)[:, None], axis=1)
+        segment = int(np.argmin(away))
+        return float(away[segment]), segment, float(along[segment])
+
+
+def write_opendrive(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+    """Write ``hd_map`` as OpenDRIVE, atomically, in metres of the map frame, whose projection it states.
+
+    An OpenDRIVE file has no place for the ``verdict``.
+    """
+    features = features_of(hd_map)
+    roads = _roads(features)
+    root = ET.Element("OpenDRIVE")
+    stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    everything = np.concatenate([one.points_map for one in features] or [np.zeros((1, 2))])
+    (west, south), (east, north) = everything.min(axis=0), everything.max(axis=0)
+    bounds = {
+        key: f"{v:.4f}" for key, v in (("north", north), ("south", south), ("east", east), ("west", west))
+    }
+    about = {"revMajor": "1", "revMinor": "7", "name": path.stem, "date": stamp, "vendor": "v2hdm"}
+    header = ET.SubElement(root, "header", about | bounds)
+    if hd_map.origin is not None:
+        ET.SubElement(header, "geoReference").text = map_projection(hd_map.origin)
+    objects = [_write_road(root, number, road) for number, road in enumerate(roads, start=1)]
+    for one in features:
+        if one.closed:
+            centre = one.points_map.mean(axis=0)
+            found = [road.nearest(centre) for road in roads]
+            k = min(range(len(roads)), key=lambda number: found[number][0])
+            _write_object(objects[k], one, roads[k], *found[k][1:])
+    ET.indent(root, " ")
+    replace_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n')
+
+
+def _roads(features: Sequence[Feature]) -> list[_Road]:
+    lines = [one for one in features if not one.closed]
+    roads = []
+    for lane in closed_lanes([one.points_map for one in lines]):
+        left, right = (lines[number] for number, _ in (lane.left, lane.right))
+        xyz = _spaced(left.xyz_map[lane.left[1]])
+        across = _Road(_spaced(right.xyz_map[lane.right[1]]), np.zeros(0), ("", ""))
+        width_m = np.array([across.nearest(point)[0] for point in xyz[:, :2]])
+        roads.append(_Road(xyz, width_m, (_mark(left), _mark(right))))
+    if roads:
+        return roads
+    if lines:
+        longest = max(lines, key=lambda one: float(np.linalg.norm(np.ptp(one.points_map, axis=0))))
+        xyz = _spaced(longest.xyz_map)
+    else:
+        centres = np.array([one.xyz_map.mean(axis=0) for one in features]).reshape(-1, 3)
+        middle = centres.mean(axis=0) if len(centres) else np.zeros(3)
+        axis = np.linalg.svd(centres - middle)[2][0] if len(centres) > 1 else np.eye(3)[0]
+        reach_m = max(float(np.abs((centres - middle) @ axis).max(initial=0.0)), 1.0)
+        xyz = np.stack([middle - reach_m * axis, middle + reach_m * axis])
+    return [_Road(xyz, np.zeros(len(xyz)), ("none", "none"))]
+
+
+def _spaced(xyz: FloatArray) -> FloatArray:
+    """A line without vertices that lie upon one another."""
+    apart = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) > _LEAST_STEP_M
+    return xyz[np.insert(apart, 0, True)]
+
+
+def _mark(line: Feature) -> str:
+    return "broken" if line.kind == LANE_DASH else "solid"
+
+
+def _write_road(root: ET.Element, number: int, road: _Road) -> ET.Element:
+    """Write a road; returns the element of its objects."""
+    s_m = road.s_m
+    whole = {"name": "", "length": _text(s_m[-1]), "id": str(number), "junction": "-1"}
+    element = ET.SubElement(root, "road", whole)
+    view, profile = ET.SubElement(element, "planView"), ET.SubElement(element, "elevationProfile")
+    heading = np.arctan2(road.steps[:, 1], road.steps[:, 0])
+    slope = np.diff(road.xyz[:, 2]) / np.diff(s_m)
+    for k, (x, y, z) in enumerate(road.xyz[:-1].tolist()):
+        place = {"s": _text(s_m[k]), "x": _text(x), "y": _text(y), "hdg": _text(heading[k])}
+        geometry = ET.SubElement(view, "geometry", place | {"length": _text(s_m[k + 1] - s_m[k])})
+        ET.SubElement(geometry, "line")
+        ET.SubElement(profile, "elevation", {"s": _text(s_m[k])} | _cubic(z, slope[k]))
+    section = ET.SubElement(ET.SubElement(element, "lanes"), "laneSection", {"s": "0"})
+    mark = {"sOffset": "0", "weight": "standard", "color": "standard", "width": "0.15"}
+    middle = ET.SubElement(
+        ET.SubElement(section, "center"), "lane", {"id": "0", "type": "none", "level": "false"}
+    )
+    ET.SubElement(middle, "roadMark", mark | {"type": road.marks[0]})
+    kind = "driving" if road.width_m.any() else "none"
+    lane = ET.SubElement(
+        ET.SubElement(section, "right"), "lane", {"id": "-1", "type": kind, "level": "false"}
+    )
+    growth = np.diff(road.width_m) / np.diff(s_m)
+    for k, width_m in enumerate(road.width_m[:-1].tolist()):
+        ET.SubElement(lane, "width", {"sOffset": _text(s_m[k])} | _cubic(width_m, growth[k]))
+    ET.SubElement(lane, "roadMark", mark | {"type": road.marks[1]})
+    return ET.SubElement(element, "objects")
+
+
+def _write_object(objects: ET.Element, one: Feature, road: _Road, segment: int, along_m: float) -> None:
+    """Write a marking or symbol as an object ``along_m`` along a segment of its road."""
+    ahead = road.steps[segment] / np.linalg.norm(road.steps[segment])
+    axes = np.stack([ahead, [-ahead[1], ahead[0]]])
+    start = road.xyz[segment, :2] + along_m * ahead
+    height_m = np.interp(road.s_m[segment] + along_m, road.s_m, road.xyz[:, 2])
+    corners = one.xyz_map[one.ring]
+    t_m = float((corners[:, :2].mean(axis=0) - start) @ axes[1])
+    local = (corners[:, :2] - start - t_m * axes[1]) @ axes.T
+    length_m, width_m = np.ptp(local, axis=0)
+    place = {"s": _text(road.s_m[segment] + along_m), "t": _text(t_m), "zOffset": "0", "hdg": "0"}
+    size = {"length": _text(length_m), "width": _text(width_m), "height": "0", "orientation": "none"}
+    about = {"id": str(one.id), "name": one.kind, "type": "roadMark"}
+    element = ET.SubElement(objects, "object", about | place | size)
+    outline = ET.SubElement(ET.SubElement(element, "outlines"), "outline", {"id": "0", "closed": "true"})
+    for k, ((u, v), z) in enumerate(zip(local.tolist(), (corners[:, 2] - height_m).tolist(), strict=True)):
+        corner = {"u": _text(u), "v": _text(v), "z": _text(z), "height": "0", "id": str(k)}
+        ET.SubElement(outline, "cornerLocal", corner)
+
+
+def _cubic(start: float, growth: float) -> dict[str, str]:
+    return {"a": _text(start), "b": _text(growth), "c": "0", "d": "0"}
+
+
+def _text(value: float) -> str:
+    return f"{value:.9g}" if abs(value) < 1e5 else repr(float(value))

@@ -1,0 +1,199 @@
+"""How much of its paint each marking has left, as the nearest images show it.
+
+An image is decoded to linear light, in which a pixel half on paint and half on ground lies half way, and
+divided by the ground beside the marking, so that neither exposure nor light matters. The median over the
+nearest images at each cell of the marking leaves out what hides it in some. The cells are then explained as a
+mixture of full paint, bare ground and cells part of each; how bright full paint is over its ground is the
+marking's own, with a prior from all markings of its class: dirt dims paint that is whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import inverse
+from v2hdm.records import Calibration, FloatArray, HdMap, Image, PaintLeft
+
+_CELL_M = 0.02
+_EDGE_M = 0.03  # of a marking that is left out along its sides: blurred, and uncertain by a pose's error
+_BESIDE_M = np.array([0.06, 0.10, 0.14, 0.18])  # from its long sides, where the ground is measured
+_MOST_CELLS = (60, 24)  # along and across
+_NEAR_M = 12.0  # of the camera, within which images resolve flakes of paint
+_VIEWS = (2, 6)  # fewest and most images of a marking: the errors of more repeat themselves
+_GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
+"""Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
+
+_INDEPENDENT = 12.0
+"""Cells that count as independent: flakes, stains and the blur of images span many."""
+
+_CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
+_ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
+_MODEL_SIGMA = (0.03, 0.2)
+"""Sigma of a share beside that of the fit, and its growth with what is worn: flakes finer than a pixel look
+like dirt (38 rendered markings)."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Places (along, across, 2) in and beside a marking; the first and last columns lie on the ground."""
+
+    places_map: FloatArray
+    contrasts: list[FloatArray]
+
+    @classmethod
+    def of(cls, corners_map: FloatArray) -> Cells:
+        """The cells of a marking's corners (4, 2)."""
+        sides = np.linalg.norm(np.roll(corners_map, -1, axis=0) - corners_map, axis=1)
+        if sides[1] + sides[3] > sides[0] + sides[2]:
+            corners_map, sides = np.roll(corners_map, -1, axis=0), np.roll(sides, -1)
+        length, width = (max(float(sides[k] + sides[k + 2]) / 2, 4 * _EDGE_M) for k in (0, 1))
+        along, across = (
+            np.linspace(_EDGE_M / m, 1 - _EDGE_M / m, int(np.clip((m - 2 * _EDGE_M) / _CELL_M, least, most)))
+            for m, least, most in zip((length, width), (3, 2), _MOST_CELLS, strict=True)
+        )
+        across = np.concatenate([-_BESIDE_M[::-1] / width, across, 1 + _BESIDE_M / width])
+        s, t = (grid[..., None] for grid in np.meshgrid(along, across, indexing="ij"))
+        a, b, c, d = corners_map
+        return cls((1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d, [])
+
+    def add(self, light: FloatArray) -> None:
+        """Take the light (along, across) of one image."""
+        count = len(_BESIDE_M)
+        beside = np.concatenate([light[:, :count], light[:, -count:]], axis=1)
+        padded = np.pad(np.median(beside, axis=1), 4, mode="edge")
+        ground = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)
+        self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[:, None] - 1.0)
+
+    def fit(self) -> tuple[FloatArray, FloatArray]:
+        """Of each of :data:`_CONTRASTS` the log likelihood, and the share of paint if it is that of paint."""
+        every = np.clip(np.median(self.contrasts, axis=0).ravel(), -0.5, 4.0)
+        cells = every[:: -(-len(every) // _FITTED)]
+        paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
+        partly = norm.cdf(cells, 0.0, _GROUND_SIGMA) - norm.cdf(cells, paint, sigma)
+        bare = np.broadcast_to(norm.pdf(cells, 0.0, _GROUND_SIGMA), partly.shape)
+        densities = np.stack([norm.pdf(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint]) + 1e-6
+        weight = np.broadcast_to(np.array([0.6, 0.2, 0.2])[:, None, None], (3, len(paint), 1))
+        for _ in range(_ROUNDS):
+            joint = weight * densities
+            member = joint / joint.sum(axis=0)
+            weight = (member.sum(axis=2, keepdims=True) + np.array([1.0, 0.3, 0.3])[:, None, None]) / (
+                len(cells) + 1.6
+            )
+        share = (member[0] + member[2] * np.clip(cells / paint, 0.0, 1.0)).mean(axis=1)
+        log_likelihood = np.log((weight * densities).sum(axis=0)).sum(axis=1)
+        return log_likelihood * min(1.0, _INDEPENDENT / len(cells)), share
+
+
+def with_wear(
+    hd_map: HdMap,
+    images: Sequence[Image],
+    map_from_vehicle: Sequence[FloatArray],
+    calibrations: Mapping[str, Calibration],
+    grey: Callable[[Image], NDArray[np.float32]],
+    earlier: HdMap | None = None,
+    threads: int = 1,
+) -> HdMap:
+    """``hd_map`` with the share of paint that each marking has left, where two images or more show it near.
+
+    ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W).
+    A marking that the ``earlier`` map has, by its id, states the change, and keeps what that says where this
+    drive did not look.
+    """
+    cells = [Cells.of(one.corners_map) for one in hd_map.markings]
+    for number, light in _seen(cells, images, map_from_vehicle, calibrations, grey, threads):
+        cells[number].add(light)
+    known = [k for k, one in enumerate(cells) if len(one.contrasts) >= _VIEWS[0]]
+    shares = _shares([cells[k].fit() for k in known], [hd_map.markings[k].kind for k in known])
+    before = {} if earlier is None else {one.id: one.paint for one in earlier.markings}
+    found = dict(zip(known, shares, strict=True))
+    markings = []
+    for k, one in enumerate(hd_map.markings):
+        old = before.get(one.id) if one.id is not None else None
+        markings.append(replace(one, paint=found[k].since(old) if k in found else old))
+    return replace(hd_map, markings=tuple(markings))
+
+
+def _shares(fits: Sequence[tuple[FloatArray, FloatArray]], kinds: Sequence[str]) -> list[PaintLeft]:
+    """The shares, with the contrast of full paint of each class learned from all of its markings."""
+    out: dict[int, PaintLeft] = {}
+    log_contrasts = np.log(_CONTRASTS)
+    for kind in set(kinds):
+        mine = [k for k, one in enumerate(kinds) if one == kind]
+        likelihood, share = (np.stack([fits[k][part] for k in mine]) for part in (0, 1))
+        middle, spread = np.log(1.3), 0.5
+        for _ in range(3):
+            log_posterior = likelihood + norm.logpdf(log_contrasts, middle, spread)
+            posterior = np.exp(log_posterior - log_posterior.max(axis=1, keepdims=True))
+            posterior /= posterior.sum(axis=1, keepdims=True)
+            own = posterior @ log_contrasts
+            # A class of few markings keeps to the wide prior, as if four others had shown it.
+            middle = (own.sum() + 4 * np.log(1.3)) / (len(mine) + 4)
+            spread = float(np.sqrt((((own - middle) ** 2).sum() + 4 * 0.5**2) / (len(mine) + 4)))
+        mean = (posterior * share).sum(axis=1)
+        variance = (posterior * (share - mean[:, None]) ** 2).sum(axis=1)
+        floor, growth = _MODEL_SIGMA
+        sigma = np.sqrt(variance + floor**2 + (growth * (1.0 - mean)) ** 2)
+        out |= {k: PaintLeft(float(m), float(s)) for k, m, s in zip(mine, mean, sigma, strict=True)}
+    return [out[k] for k in range(len(kinds))]
+
+
+_LIGHT = np.arange(256, dtype=np.float32) / 255
+_LIGHT = np.where(_LIGHT <= 0.04045, _LIGHT / 12.92, ((_LIGHT + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""Linear light by the grey value of sRGB, which cameras follow closely enough for a ratio."""
+
+
+def _seen(
+    cells: Sequence[Cells],
+    images: Sequence[Image],
+    map_from_vehicle: Sequence[FloatArray],
+    calibrations: Mapping[str, Calibration],
+    grey: Callable[[Image], NDArray[np.float32]],
+    threads: int,
+) -> Iterator[tuple[int, FloatArray]]:
+    """(marking, light of its cells) in those of the images that show it whole from nearest."""
+    if not cells:
+        return
+    tree = cKDTree([one.places_map.mean(axis=(0, 1)) for one in cells])
+    views: list[list[tuple[float, int]]] = [[] for _ in cells]
+    for index, (image, pose) in enumerate(zip(images, map_from_vehicle, strict=True)):
+        if image.camera not in calibrations:
+            continue
+        own = calibrations[image.camera]
+        px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
+        size = np.array([own.info.width, own.info.height])
+        for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
+            edge = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
+            if ((edge @ px_from_map[2, :2] + px_from_map[2, 2]) <= 0.3).any():
+                continue
+            px = distort_points(own.info, apply_homography(px_from_map, edge))
+            if (px >= 2).all() and (px <= size - 3).all():
+                away_m = float(np.linalg.norm(edge.mean(axis=0) - pose[:2, 3]))
+                views[number].append((away_m, index))
+    wanted: dict[int, list[int]] = {}
+    for number, found in enumerate(views):
+        for _, index in sorted(found)[: _VIEWS[1]] if len(found) >= _VIEWS[0] else ():
+            wanted.setdefault(index, []).append(number)
+    order = sorted(wanted)
+    with ThreadPoolExecutor(threads) as readers:
+        for start in range(0, len(order), 8 * threads):  # of decoded images, few are in memory together
+            some = order[start : start + 8 * threads]
+            for index, pixels in zip(some, readers.map(lambda one: grey(images[one]), some), strict=True):
+                own = calibrations[images[index].camera]
+                cam_from_map = own.cam_from_vehicle @ inverse(map_from_vehicle[index])
+                px_from_map = pinhole_px_from_ground(own.info.intrinsic, cam_from_map)
+                light = _LIGHT[np.clip(pixels, 0, 255).astype(np.uint8)]
+                for number in wanted[index]:
+                    places = cells[number].places_map
+                    px = distort_points(own.info, apply_homography(px_from_map, places.reshape(-1, 2)))
+                    at = px.reshape(places.shape).astype(np.float32)
+                    yield number, cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
