@@ -196,4 +196,5 @@ def _seen(
                     places = cells[number].places_map
                     px = distort_points(own.info, apply_homography(px_from_map, places.reshape(-1, 2)))
                     at = px.reshape(places.shape).astype(np.float32)
-                    yield number, cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+                    seen = cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+                    yield number, np.asarray(seen, dtype=np.float64)

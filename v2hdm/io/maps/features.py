@@ -123,8 +123,8 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
         if one.symbol:
             symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m))
         elif one.closed:
-            more = one.covariance_m2, one.relative_sigma_m, one.heights_m, number, one.paint
-            markings.append(replace(Marking(*own, *more), heights_sigma_m=one.heights_sigma_m))
+            marking = Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number)
+            markings.append(replace(marking, paint=one.paint, heights_sigma_m=one.heights_sigma_m))
         else:
             lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m, one.heights_sigma_m))
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))

@@ -110,7 +110,8 @@ def _roads(features: Sequence[Feature]) -> list[_Road]:
 def _spaced(xyz: FloatArray) -> FloatArray:
     """A line without vertices that lie upon one another."""
     apart = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) > _LEAST_STEP_M
-    return xyz[np.insert(apart, 0, True)]
+    spaced: FloatArray = xyz[np.insert(apart, 0, True)]
+    return spaced
 
 
 def _mark(line: Feature) -> str:

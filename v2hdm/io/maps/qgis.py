@@ -89,7 +89,7 @@ def _layer(
         "checked": "Qt::Checked",
     }
     ET.SubElement(tree, "layer-tree-layer", entry | {"expanded": "1"})
-    element = ET.SubElement(layers, "maplayer", kind)
+    element = ET.SubElement(layers, "maplayer", dict(kind))
     for tag, text in (("id", identity), ("datasource", source), ("layername", name), ("provider", provider)):
         ET.SubElement(element, tag).text = text
     return element
