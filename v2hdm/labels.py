@@ -235,7 +235,7 @@ def _views(
     detected: set[int],
     range_m: float,
 ) -> list[_View]:
-    """What of the outlines lies in an image, within range."""
+    """The parts of the outlines that lie in an image, within range."""
     foot = camera_centre(eye.cam_from_map[:1])[0, :2]
     out = []
     for number, outline in enumerate(outlines):

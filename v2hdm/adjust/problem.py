@@ -77,7 +77,7 @@ class Observations:
         return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
 
     def take(self, rows: IntArray | BoolArray) -> Observations:
-        """Those at ``rows``, indices or a mask."""
+        """The observations at ``rows``, indices or a mask."""
         taken: list[Any] = [None if one is None else one[rows] for one in vars(self).values()]
         return Observations(*taken)
 
@@ -114,7 +114,7 @@ class ControlPoints:
     along: FloatArray | None = None
 
     def take(self, rows: IntArray | BoolArray, corner: IntArray) -> ControlPoints:
-        """Those at ``rows``, of corners that are now called ``corner``."""
+        """The points at ``rows``, of corners that are now called ``corner``."""
         along = None if self.along is None else self.along[rows]
         return ControlPoints(corner, self.points_map[rows], self.sigma_m[rows], along)
 

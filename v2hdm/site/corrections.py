@@ -1,4 +1,4 @@
-"""What a person says of candidates: it counts before all that images say, but for where other corners lie."""
+"""A person's word on candidates: it counts before all that images say, but for where other corners lie."""
 
 from __future__ import annotations
 

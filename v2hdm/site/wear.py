@@ -75,7 +75,7 @@ class Cells:
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[:, None] - 1.0)
 
     def fit(self) -> tuple[FloatArray, FloatArray]:
-        """Of each of :data:`_CONTRASTS` the log likelihood, and the share of paint if it is that of paint."""
+        """The log likelihood of each of :data:`_CONTRASTS`, and the share of paint if it is that of paint."""
         every = np.clip(np.median(self.contrasts, axis=0).ravel(), -0.5, 4.0)
         cells = every[:: -(-len(every) // _FITTED)]
         paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]

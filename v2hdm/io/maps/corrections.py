@@ -35,7 +35,7 @@ _MOST = 100_000
 
 @dataclass(kw_only=True)
 class Correction:
-    """What a person says of one marking, symbol or candidate that was left out.
+    """A person's word on one marking, symbol or candidate that was left out.
 
     ``kind`` and ``outline_map`` are its class and corners (N, 2), m, in the map that the person saw, a single
     point where it was left out. ``says`` is ``accepted``, ``rejected``, for a ``reason``, or ``corrected``:
