@@ -216,7 +216,7 @@ def _off_neighbours(motion: Motion, values: FloatArray) -> FloatArray:
 
 
 def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
-    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, and none stands out.
+    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, none stands out.
 
     A lost fix moves a few records, and any way; a late stamp moves each, and only along the way.
     """
