@@ -172,8 +172,12 @@ def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_
     found, gain = level.estimated(information, score, Recorded.of(road, noise))
     height, stated = found.height_m(points)
     off = height - ground(points)
-    assert np.sqrt(np.mean(off**2)) < 0.02
-    assert 0.5 < np.sqrt(np.mean((off / stated) ** 2)) < 1.5
+    # No image shows the height, grade and bank of the whole, which err as the receiver does.
+    whole = np.column_stack([np.ones(3000), points])
+    shape_off = off - whole @ np.linalg.lstsq(whole, off, rcond=None)[0]
+    assert np.sqrt(np.mean(shape_off**2)) < 0.01
+    # Nearly all of the error is these three: 99 % of their chi-square.
+    assert 0.07 / 3 < np.mean((off / stated) ** 2) < 12.8 / 3
     assert (gain < 8.0) if shape == "plane" else (gain > 100.0)
 
 
