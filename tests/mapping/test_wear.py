@@ -1,7 +1,6 @@
 """The share of paint that a marking has left, against what the renderer has painted."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,9 +22,18 @@ def share_rendered(paint):
     """The mean opacity of a marking's clean paint, by the renderer itself."""
     low, high = paint.polygon_map.min(axis=0), paint.polygon_map.max(axis=0)
     x, y = np.meshgrid(*(np.arange(a, b, 0.01, dtype=np.float32) for a, b in zip(low, high, strict=True)))
-    field = SimpleNamespace(x_m=x, y_m=y, footprint_m=np.full_like(x, FOOTPRINT_M))
-    everything = (slice(None), slice(None))
-    opacity, _ = ground._opacity(replace(paint, dirt=0.0), np.ones_like(x), field, everything)
+    tiles = [ground._WEAR_TILE, ground.MEDIUM_TILE, ground.fine_tile("asphalt")]
+    shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
+    scales = np.array([ground.scale_of(tile, shift) for tile in tiles], dtype=np.float32)
+    covered = np.array([[0, 0, 1]] * 4, dtype=np.float32)  # all of every pixel lies within the outline
+    white = np.ones((*x.shape, 3), dtype=np.float32)
+    black = ground._look(replace(paint, dirt=0.0, albedo_bgr=(0.0, 0.0, 0.0)))
+    whole, footprint_m = np.array([[0, x.shape[0], 0, x.shape[1]]]), np.full_like(x, FOOTPRINT_M)
+    ground.kernels.draw_paint(
+        whole, 1, 0, covered, (x, y), (x, y, footprint_m),
+        tuple(tile.padded for tile in tiles), scales, black, 1, white, np.zeros(x.shape, np.uint8),
+    )  # fmt: skip
+    opacity = 1 - white[..., 0]
     pixels = np.round((paint.polygon_map - low) / 0.01).astype(np.int32)
     inside = cv2.fillConvexPoly(np.zeros(x.shape, np.uint8), pixels, 1) > 0
     return float(opacity[inside].mean())

@@ -348,7 +348,7 @@ def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
     order = Order(source=run, into=into, precision="float32", judge_images=100, lane_images=100)
     before = digests(into)
 
-    def killed(gathered, tell, start):
+    def killed(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:

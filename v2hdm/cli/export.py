@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,8 +55,8 @@ def run(arguments: Sequence[str]) -> None:
     try:
         with logging_to(handler):
             source = os.path.relpath(parsed.source.resolve(), folder.resolve())  # both may be moved together
-            with listed_files(folder, "--output", f"v2hdm export of {source}"):
-                files = export(parsed, folder)
+            with listed_files(folder, "--output", f"v2hdm export of {source}") as check:
+                files = export(parsed, folder, check)
             print(*files, sep="\n")
     except BrokenPipeError:  # the reader of our output has had enough
         raise
@@ -64,7 +64,7 @@ def run(arguments: Sequence[str]) -> None:
         raise MapFileError(f"{error.filename}: cannot be written ({error.strerror}); set --output") from None
 
 
-def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
+def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path], object]) -> list[Path]:
     from v2hdm.io.maps.formats import (
         FORMATS,
         GROUND_FORMATS,
@@ -87,10 +87,12 @@ def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
         raise ConfigError(f"{parsed.source} would be written over: set another --output or --format")
     hd_map, verdict = read_map(parsed.source)
     check_crs(parsed.crs, parsed.format, hd_map.origin, "--crs")
+    for file in files:
+        check(file)
     return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs)
 
 
-def _export_mosaic(parsed: argparse.Namespace, folder: Path) -> list[Path]:
+def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:
     from v2hdm.io.drive.road import lay_flat
     from v2hdm.io.maps.cloud import write_cloud
     from v2hdm.io.maps.features import ground_height_m
@@ -114,7 +116,7 @@ def _refuse_crs(parsed: argparse.Namespace, reason: str) -> None:
         raise ConfigError(f"--crs: {reason}; leave it out")
 
 
-def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
+def _export_calibration(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:
     from v2hdm.io.calibration.reading import read_calibration, read_provenance
     from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration_as
 

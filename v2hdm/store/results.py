@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -249,20 +249,22 @@ def added_to(folder: Path, option: str) -> Iterator[Path]:
 
 
 @contextmanager
-def listed_files(folder: Path, option: str, made: str) -> Iterator[None]:
+def listed_files(folder: Path, option: str, made: str) -> Iterator[Callable[[Path], object]]:
     """Within, each file that is written whole into a folder is put on its list before it is there.
 
-    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well. Raises
-    ConfigError where what is to be replaced was not ``made`` by the same, or the folder cannot be written.
+    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well. Yields a
+    check of one file, for work that writes several or none. It and the writing raise ConfigError where what
+    is to be replaced was not ``made`` by the same, or the folder cannot be written.
     """
     there = _Target(folder, option)
     ours = there.digests(made)
     others = {} if there.read_list()[0] == made else {"made": made}
 
-    def list_file(new: Path, path: Path) -> None:
+    def name_of(path: Path) -> str | None:
+        """The file's name in the folder, None outside of it; refuses what must not be replaced."""
         named = (Path(os.path.abspath(one)) for one in (folder, there.path))  # noqa: PTH100  # links stay
         if not any(Path(os.path.abspath(path)).is_relative_to(one) for one in named):  # noqa: PTH100
-            return
+            return None
         place = path.parent.resolve() / path.name
         if path.is_symlink() or not place.is_relative_to(there.path):
             raise ConfigError(f"{path}: a link is not replaced; move it, or give another {option}")
@@ -270,6 +272,12 @@ def listed_files(folder: Path, option: str, made: str) -> Iterator[None]:
         if path.exists() and file_digest(path) not in ours.get(name, ()):
             maker = f"no unchanged result of {made}" if made else "no file of ours"
             raise ConfigError(f"{folder / name}: is {maker}; move it, or give another {option}")
+        return name
+
+    def list_file(new: Path, path: Path) -> None:
+        name = name_of(path)
+        if name is None:
+            return
         digest = file_digest(new)
         if not (there.path / LIST).exists():
             _write_list(there.path, made)
@@ -278,7 +286,7 @@ def listed_files(folder: Path, option: str, made: str) -> Iterator[None]:
         ours.setdefault(name, []).append(digest)
 
     with there.explained(_FULL), observed_writes(list_file):
-        yield
+        yield name_of
 
 
 @dataclass(frozen=True)
