@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 
 from v2hdm.errors import ConfigError
 from v2hdm.extras import need
@@ -57,6 +55,9 @@ def write_ground_geotiff(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] |
 
 def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
     """Heights and sigmas (2, K) of a strip at points (K, 2), infinite beyond it."""
+    from scipy.ndimage import map_coordinates  # of the map extra, whose runs alone have such a strip
+    from scipy.spatial import cKDTree
+
     out, (right_m, left_m) = np.full((2, len(cells)), np.inf), strip.left_m[[0, -1]].tolist()
     reach_m = max(-right_m, left_m)
     distance_m, near = cKDTree(strip.points_map).query(
