@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from v2hdm.association.groups import FusedGroups
-from v2hdm.site.candidates import Candidates, Counts, Dissent, with_dissent
+from v2hdm.site.candidates import Candidates, Counts, with_dissent
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -355,14 +355,15 @@ def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
     many = FusedGroups(candidates.corners_map, np.tile(1e-4 * np.eye(2), (3, 4, 1, 1)), np.full((3, 4), 9))
     longer = 0.1 * (true[1, 0] - true[1].mean(axis=0)) / np.linalg.norm(true[1, 0] - true[1].mean(axis=0))
     # One sighting of a tenth of the information sees the end 10 cm farther, one a metre beyond its reach.
-    dissent = Dissent(
+    found = with_dissent(
+        candidates,
+        many,
         row=np.array([5, 6]),
         group=np.array([1, 2]),
         corner=np.array([0, 0]),
         seen_map=np.stack([candidates.corners_map[1, 0] + longer, candidates.corners_map[2, 0] + [2.0, 0]]),
         covariance_m2=np.tile(9e-4 * np.eye(2), (2, 1, 1)),
     )
-    found = with_dissent(candidates, many, dissent)
     added = found.covariance_m2 - candidates.covariance_m2
     assert np.trace(added[1]) == pytest.approx(0.1 * 0.1**2, rel=0.1)
     np.testing.assert_allclose(added[1][2:, 2:], 0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from kornia.geometry import calibration as brown_conrady
 from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
-from kornia.geometry.conversions import Rt_to_matrix4x4, convert_points_to_homogeneous
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
@@ -107,22 +107,6 @@ def left_jacobian(tangent: Tensor) -> Tensor:
     first, second, third, fourth = _even_series(tangent[..., 3:], _LEFT_JACOBIAN_SERIES)
     eye = torch.eye(6, dtype=tangent.dtype, device=tangent.device)
     return eye + ad @ (first * eye + ad @ (second * eye + ad @ (third * eye + fourth * ad)))
-
-
-def extrinsic_from_ipm(intrinsic: Tensor, ipm: Tensor) -> Tensor:
-    """The rigid ``cam_from_vehicle`` (C, 4, 4) nearest to IPMs (C, 3, 3), their cameras above the ground.
-
-    As :func:`v2hdm.geometry.ipm.extrinsic_from_ipm`, which has the source; ``intrinsic`` (C, 3, 3) is K, px.
-    """
-    columns = torch.linalg.solve(intrinsic, torch.linalg.inv(ipm))
-    left, singular, right = torch.linalg.svd(columns[..., :2], full_matrices=False)
-    plane, translation = left @ right, columns[..., 2] / singular.mean(dim=-1, keepdim=True)
-    normal = torch.linalg.cross(plane[..., 0], plane[..., 1])
-    above = (normal * translation).sum(dim=-1, keepdim=True) <= 0
-    sign = torch.where(above, 1.0, -1.0).to(ipm)
-    rotation = torch.cat([sign[..., None] * plane, normal[..., None]], dim=-1)
-    cam_from_vehicle: Tensor = Rt_to_matrix4x4(rotation, (sign * translation)[..., None])
-    return cam_from_vehicle
 
 
 def back_project(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> Tensor:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.association.sightings import Sightings, collect_sightings
+from v2hdm.association.ground import easy_views, views_of
+from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
@@ -216,19 +216,14 @@ def _in_view(
     drive: Drive, sightings: Sightings, hd_map: HdMap, calibrations: Mapping[str, Calibration]
 ) -> BoolArray:
     """In which frames (F,) a whole marking of the map is near and within an image, by the recorded poses."""
-    corners = np.stack([marking.corners_map for marking in hd_map.markings])
-    out = np.zeros(len(sightings.stamp_s), dtype=bool)
-    times = {stamp: frame for frame, stamp in enumerate(sightings.stamp_s.tolist())}
-    for image in drive.images:
-        if image.camera not in calibrations:
-            continue
-        info = drive.cameras[image.camera].info
-        cam_from_map = calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(image.map_from_vehicle)
-        pixels, depth_m = project_ground(info.intrinsic, cam_from_map, corners.reshape(-1, 2))
-        inside = (pixels >= 0) & (pixels < [info.width, info.height])
-        near = inside.all(axis=1) & (depth_m > 0) & (depth_m < _IN_VIEW_M)
-        out[times[image.taken_s]] |= bool(near.reshape(-1, 4).all(axis=1).any())
-    return out
+    cameras = [drive.cameras[name] for name in sightings.cameras]
+    extrinsics = np.stack([calibrations[name].cam_from_vehicle for name in sightings.cameras])
+    rig = Rig(np.stack([one.info.intrinsic for one in cameras]), extrinsics, sightings.map_from_vehicle)
+    views = views_of(drive, sightings.cameras)
+    corners_map = np.stack([marking.corners_map for marking in hd_map.markings])
+    _, image = easy_views(views, rig, cameras, corners_map, _IN_VIEW_M)
+    shown = views.frame[np.isin(views.image, image)]
+    return np.isin(np.arange(len(sightings.stamp_s)), shown)
 
 
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:

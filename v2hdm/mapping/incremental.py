@@ -23,9 +23,8 @@ from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
-from v2hdm.mapping.bundle import Model, drive_problem
+from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]

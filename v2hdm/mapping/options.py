@@ -17,9 +17,8 @@ MODES = (BATCH, INCREMENTAL)
 """Values of ``mapping.mode``."""
 
 PLANE = "plane"
-CROSS_SECTION = "cross_section"
 SURFACE = "surface"
-GROUNDS = (PLANE, CROSS_SECTION, SURFACE, AUTO)
+GROUNDS = (PLANE, SURFACE, AUTO)
 """Values of ``mapping.ground``."""
 
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
@@ -128,10 +127,9 @@ class MappingOptions:
     states.
     ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
     and in the end solved as ``batch`` does.
-    ``ground`` is ``plane``, once the recorded road is laid flat; ``cross_section``, which rises or falls with
-    the distance from the vehicle's own path, alike along the route, as a road with a crown does; ``surface``,
-    which does so and is a smooth spline beside; or ``auto``, the plane unless the drive contradicts it and a
-    surface predicts held-out observations better.
+    ``ground`` is ``plane``, once the recorded road is laid flat; ``surface``, which rises or falls with the
+    distance from the vehicle's own path, as a road with a crown does, and is a smooth spline beside; or
+    ``auto``, the plane unless the drive contradicts it and a surface predicts held-out observations better.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """

@@ -101,44 +101,38 @@ class Exclusion:
     reason: str
 
 
-@dataclass(frozen=True)
-class Dissent:
-    """R corners that the joint solution rejected: candidate ``group`` (R,) and its ``corner`` (R,).
-
-    A sighting ``row`` (R,) saw it at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
-    """
-
-    row: IntArray
-    group: IntArray
-    corner: IntArray
-    seen_map: FloatArray
-    covariance_m2: FloatArray
-
-
-def with_dissent(candidates: Candidates, fused: FusedGroups, dissent: Dissent) -> Candidates:
+def with_dissent(
+    candidates: Candidates,
+    fused: FusedGroups,
+    row: IntArray,
+    group: IntArray,
+    corner: IntArray,
+    seen_map: FloatArray,
+    covariance_m2: FloatArray,
+) -> Candidates:
     """The candidates (G,), less certain where sightings contradict what ``fused`` ones agree on.
+
+    The joint solution rejected R corners: the ``corner`` (R,) of candidate ``group`` (R,), which sighting
+    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
 
     Most images may see where bright paint ends, and the nearest ones a worn end beyond it. Either is right in
     proportion to its information, not to a power of it: images of one view err alike. A mixture of two places
     has the variance p (1 - p) of their distance squared; p is small. Corners of one sighting go together.
     """
-    off = dissent.seen_map - candidates.corners_map[dissent.group, dissent.corner]
+    off = seen_map - candidates.corners_map[group, corner]
     away_m = np.linalg.norm(off, axis=1)
     # x' C^-1 x is the information along the line between both places, times its length squared.
-    agreed = fused.covariance_m2[dissent.group, dissent.corner]
-    usable = fused.valid[dissent.group, dissent.corner] & (away_m < 3 * _OTHER_EDGE_M)
-    usable &= np.isfinite(dissent.covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
+    agreed = fused.covariance_m2[group, corner]
+    usable = fused.valid[group, corner] & (away_m < 3 * _OTHER_EDGE_M)
+    usable &= np.isfinite(covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
     off, away_m, agreed = off[usable], away_m[usable], agreed[usable]
     one, all_others = (
-        np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off)
-        for each in (dissent.covariance_m2[usable], agreed)
+        np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off) for each in (covariance_m2[usable], agreed)
     )
     share = one / (one + all_others) * np.exp(-0.5 * (away_m / _OTHER_EDGE_M) ** 2)
-    sightings, number = np.unique(
-        np.stack([dissent.group, dissent.row])[:, usable], axis=1, return_inverse=True
-    )
+    sightings, number = np.unique(np.stack([group, row])[:, usable], axis=1, return_inverse=True)
     moved = np.zeros((sightings.shape[1], 4, 2))
-    moved[number.ravel(), dissent.corner[usable]] = np.sqrt(share)[:, None] * off
+    moved[number.ravel(), corner[usable]] = np.sqrt(share)[:, None] * off
     covariance, ways = candidates.covariance_m2.copy(), moved.reshape(-1, 8)
     np.add.at(covariance, sightings[0], ways[:, :, None] * ways[:, None, :])
     return Candidates(candidates.corners_map, covariance)
