@@ -363,7 +363,7 @@ class Surface:
         return np.asarray(block_diag(_SLOPE_SIGMA**-2 * np.eye(_HINGES), spline))
 
     def _recorded(self, recorded: Recorded) -> tuple[FloatArray, FloatArray, float]:
-        """Information (B, B) of what was recorded on the path, that times its values (B,), the mean height."""
+        """Information (B, B) of what was recorded on the path, that times its values, and the mean height."""
         size = len(self.parameters)
         frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
         height, slope = recorded.at(self.paths.position_map[frame])
@@ -415,13 +415,9 @@ class Surface:
     def flattened_px(
         self, intrinsic: FloatArray, cam_from_map: FloatArray, frame: IntArray, pixels: FloatArray
     ) -> FloatArray:
-        """Where images would show on the plane what they show at pinhole pixels (K, 2) of the ground.
+        """Where images would show on the plane what they show at pinhole ``pixels`` (K, 2) of the ground.
 
-        Args:
-            intrinsic: (K, 3, 3).
-            cam_from_map: (K, 4, 4).
-            frame: (K,).
-            pixels: (K, 2).
+        Each is of a camera ``intrinsic`` (K, 3, 3) at ``cam_from_map`` (K, 4, 4), taken at ``frame`` (K,).
         """
         turn = cam_from_map[:, :3, :3]
         cam = np.linalg.solve(intrinsic, np.column_stack([pixels, np.ones(len(pixels))])[..., None])

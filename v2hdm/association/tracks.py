@@ -124,7 +124,8 @@ class _Linker:
         t, d = self._near(last, mean_corners(corners, valid), size_m, rows)
         own = rows[d]
         found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
-        cost = self._mahalanobis2(found.offset, last[t], own)
+        covariance = self._noise_m2[last[t]] + self._noise_m2[own] + self._drift_covariance(last[t], own)
+        cost = np.sum(found.offset * np.linalg.solve(covariance, found.offset[..., None])[..., 0], axis=-1)
         tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], LEAST_TOLERANCE_M)
         shape = found.deformation_m / tolerance_m
         accepted = (cost <= self._options.gate_sigmas**2) & (shape <= 1.0)
@@ -145,12 +146,6 @@ class _Linker:
         alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
         pair = np.argwhere(alike & (apart_m <= reach_m))
         return pair[:, 0], pair[:, 1]
-
-    def _mahalanobis2(self, offset: FloatArray, last: IntArray, rows: IntArray) -> FloatArray:
-        """Squared normalised displacements (P,) between tracks' ``last`` sightings and ``rows``."""
-        covariance = self._noise_m2[last] + self._noise_m2[rows] + self._drift_covariance(last, rows)
-        solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
-        return np.asarray(np.sum(offset * solved, axis=-1))
 
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
         """The covariance that a wrong extrinsic adds between the images of two sightings (P, 2, 2).

@@ -205,10 +205,6 @@ def solve_bundle(
             "at a lower speed or raise the image rate."
         )
     knots, corners_start = lanes or (None, None)
-    camera, frame = sightings.camera[row], sightings.frame[row]
-    if knots is not None:
-        camera, frame = np.append(camera, knots.camera), np.append(frame, knots.frame)
-    used = _Used(*np.unique(camera, return_inverse=True), *np.unique(frame, return_inverse=True))
     own_corner = association.corner_order()[row, corner]
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
@@ -224,15 +220,13 @@ def solve_bundle(
     first = int(corner_index.max(initial=-1)) + 1
     if knots is not None:
         observations = _joined(observations, knots.observations(first))
-    observations = replace(observations, camera=used.camera, frame=used.frame)
-    names = [sightings.cameras[c] for c in used.cameras]
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
-    problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
     if knots is not None:
         held = knots.held(first)
         axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
         control = held if control is None else _joined(replace(control, along=axes), held)
         corners_start = np.concatenate([corners_start, held.points_map])
+    problem, used, frames = drive_problem(sightings, rig, cameras, model).seen_by(observations)
     problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
     if knots is not None:
@@ -243,18 +237,14 @@ def solve_bundle(
         factor = line_variance_factor(squared, knots.count / len(squared) + of_poses)
         knots = replace(knots, variance_factor=knots.variance_factor * factor)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
-    cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
-    map_from_vehicle[used.frames] = solution.map_from_vehicle
+    cam_from_vehicle[used], map_from_vehicle[frames] = solution.cam_from_vehicle, solution.map_from_vehicle
     adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
     if rig.read_out_s is not None:
         read_out_s = rig.read_out_s.copy()
-        read_out_s[used.cameras] = solution.read_out_s
+        read_out_s[used] = solution.read_out_s
         adjusted = replace(adjusted, read_out_s=read_out_s)
-    index = {n: c for c, n in enumerate(names)}
-    return Bundle(
-        adjusted, model, problem, solution, association, row, group, corner, corner_index, index, used.frames,
-        knots,
-    )  # fmt: skip
+    index, seen = {sightings.cameras[c]: k for k, c in enumerate(used.tolist())}, (row, group, corner)
+    return Bundle(adjusted, model, problem, solution, association, *seen, corner_index, index, frames, knots)
 
 
 _OF_OBSERVATIONS = "residual_px", "mahalanobis2", "verdict"
@@ -267,55 +257,29 @@ def _joined(one: _Rows, other: _Rows) -> _Rows:
     return type(one)(*(np.concatenate(pair) for pair in pairs))
 
 
-@dataclass(frozen=True)
-class _Used:
-    """The cameras (C,) and frames (J,) of a problem, and which of them each observation (K,) has."""
-
-    cameras: IntArray
-    camera: IntArray
-    frames: IntArray
-    frame: IntArray
-
-
-def _problem(
-    sightings: Sightings,
-    rig: Rig,
-    used: _Used,
-    cameras: Sequence[Camera],
-    observations: Observations,
-    model: Model,
-) -> Problem:
-    """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
+def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
+    """All cameras and frames of a drive and their priors, without any observation."""
+    none, stated = np.zeros(0, dtype=np.int64), [cameras[name] for name in sightings.cameras]
     # Camera centres are surveyed, or else implied by the starting extrinsic.
-    centre = camera_centre(rig.cam_from_vehicle[used.cameras])
+    centre = camera_centre(rig.cam_from_vehicle)
     sigma = np.full_like(centre, _UNSURVEYED_CENTRE_SIGMA_M)
-    for c, camera in enumerate(cameras):
+    for c, camera in enumerate(stated):
         if camera.centre_prior is not None:
             centre[c], sigma[c] = camera.centre_prior.centre_vehicle, camera.centre_prior.sigma_m
-    intrinsic = rig.intrinsic[used.cameras]
-    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     return Problem(
-        intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
-        cam_from_vehicle=rig.cam_from_vehicle[used.cameras],
-        map_from_vehicle=sightings.map_from_vehicle[used.frames],
-        observations=observations,
-        corner_count=int(observations.corner.max(initial=-1)) + 1,
+        intrinsic=np.column_stack([rig.intrinsic[:, 0, 0], rig.intrinsic[:, 1, 1], rig.intrinsic[:, :2, 2]]),
+        cam_from_vehicle=rig.cam_from_vehicle,
+        map_from_vehicle=sightings.map_from_vehicle,
+        observations=Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)),
+        corner_count=0,
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
-        twist_vehicle=twists[used.frames],
-        visit=sightings.visit[used.frames],
+        twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit),
+        visit=sightings.visit,
         clock_sigma_s=model.clock_sigma_s,
-        read_out_s=read_outs_s(cameras),
+        read_out_s=read_outs_s(stated),
     )
-
-
-def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
-    """All cameras and frames of a drive and their priors, without any observation."""
-    none = np.zeros(0, dtype=np.int64)
-    used = _Used(np.arange(len(sightings.cameras)), none, np.arange(len(sightings.map_from_vehicle)), none)
-    nothing = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
-    return _problem(sightings, rig, used, [cameras[name] for name in sightings.cameras], nothing, model)
 
 
 def _constraints(

@@ -370,12 +370,12 @@ def _brought_up_to_date(
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
-    hd_map, changes, names = update_map(base, made.hd_map, observer, mapped, over_m)
+    hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
     hd_map = replace(hd_map, ground=made.hd_map.ground)
     corners, residuals = StatedCorners(hd_map.markings), made.residuals
     if residuals is not None:
-        residuals = residuals.renamed(names.id, names.corner)
-    suspicions = [replace(one, marking=int(names.id[one.marking - 1])) for one in made.suspicions]
+        residuals = residuals.renamed(*names)
+    suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
     return replace(
         made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals, suspicions=suspicions
     )

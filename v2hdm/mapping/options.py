@@ -172,11 +172,12 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     if options.lanes.model not in (AFTER, JOINT):
         raise ConfigError(f"mapping.lanes.model is '{options.lanes.model}'; choose {AFTER} or {JOINT}.")
     check_settings(options, _RANGES, "mapping.")
-    _check_sizes(options, kinds)
-    _check_survey(options)
-
-
-def _check_survey(options: MappingOptions) -> None:
+    for kind, size in options.known_sizes.by_class_m.items():
+        key = f"mapping.known_sizes.by_class_m.{kind}"
+        if kinds is not None and kind not in kinds:
+            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
+        if len(size) != 2 or not 0 < size[1] <= size[0]:
+            raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
     for number, point in enumerate(options.survey.points_map):
         if len(point) != 2:
             raise ConfigError(f"mapping.survey.points_map[{number}] is {list(point)}; give x and y in m.")
@@ -190,12 +191,3 @@ def _check_survey(options: MappingOptions) -> None:
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
         raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")
-
-
-def _check_sizes(options: MappingOptions, kinds: Sequence[str] | None) -> None:
-    for kind, size in options.known_sizes.by_class_m.items():
-        key = f"mapping.known_sizes.by_class_m.{kind}"
-        if kinds is not None and kind not in kinds:
-            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
-        if len(size) != 2 or not 0 < size[1] <= size[0]:
-            raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
