@@ -44,17 +44,6 @@ _RECORD_GROWTH = 1.6
 _LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
 
-@dataclass(frozen=True)
-class Grown:
-    """The map so far: its markings as groups of sightings.
-
-    ``rig`` holds the extrinsics, and the poses as they were last solved for.
-    """
-
-    association: Association
-    rig: Rig
-
-
 @dataclass
 class _Place:
     """A mapped marking: the number of each corner (4,) there, -1 for none.
@@ -117,8 +106,10 @@ class IncrementalMapper:
         self.growth.append(tuple(whole))
         self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
-    def run(self, progress: Callable[[str], None]) -> Grown:
+    def run(self, progress: Callable[[str], None]) -> tuple[Association, Rig]:
         """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
+
+        Returns the markings as groups of sightings, and the rig that they lead to.
 
         Raises:
             MappingError: nothing can be solved for.
@@ -133,7 +124,7 @@ class IncrementalMapper:
             self._begin(rig, len(self._places))
             due *= _LINK_GROWTH
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
-        return Grown(association, self._present_rig())
+        return association, self._present_rig()
 
     def _begin(self, rig: Rig, known: int) -> None:
         """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""

@@ -63,10 +63,9 @@ from v2hdm.records import (
     Road,
     largest_noise,
 )
-from v2hdm.site.candidates import Candidates, Exclusion, with_dissent, with_shared_errors
-from v2hdm.site.markings import Support, classify, with_relative_sigma
+from v2hdm.site.candidates import Candidates, Exclusion, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.markings import Support, Suspicion, classify, most_suspicious, with_relative_sigma
 from v2hdm.site.parallax import PointViews, measure_parallax
-from v2hdm.site.suspicion import Suspicion, most_suspicious
 
 _log = logging.getLogger(__name__)
 
@@ -154,7 +153,11 @@ class Optimiser:
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
         progress("coarse solve")
-        bundle = self._solve_steep(tracks)
+        located = self._locate(self.initial_rig)
+        sine = np.where(located.valid, located.sine_depression, np.nan)
+        with np.errstate(invalid="ignore"):
+            steep = located.valid & (sine >= min(_STEEP_SINE, float(np.nanmedian(sine))))
+        bundle = self._solve(tracks, steep, self.initial_rig, coarse=True)
         for number in range(1, self._options.rounds + 1):
             progress(f"joint solve {number}")
             association = self._associate(bundle.rig)
@@ -216,7 +219,7 @@ class Optimiser:
         located.informs[:] &= usable
         fused = fuse_groups(final.association, located, jitter_rad=0.0)
         solved = _solved_candidates(final, ungated)
-        solved = with_shared_errors(solved, fused)
+        solved = with_shared_errors(solved, fused, _scatter(final))
         row, own = ungated.row, ungated.own_corner
         out = np.flatnonzero(~inlier & self.sightings.valid[row, own])
         place = ungated.group[out], ungated.corner[out]
@@ -309,10 +312,10 @@ class Optimiser:
             solve,
             coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
-        grown = mapper.run(progress)
+        association, rig = mapper.run(progress)
         self.growth = tuple(mapper.growth)
-        association = self._with_all_that_fit(grown.association, grown.rig)
-        bundle = self._solve(association, self._usable(association, grown.rig), grown.rig)
+        association = self._with_all_that_fit(association, rig)
+        bundle = self._solve(association, self._usable(association, rig), rig)
         self._reweigh(bundle)
         return self._weigh_poses(self._fit_ground(bundle, progress))
 
@@ -390,14 +393,6 @@ class Optimiser:
         jitter_rad = self._pose_noise.roll_pitch_rad
         fused = fuse_groups(association, self._locate(rig), jitter_rad)
         return attach(association, self.sightings, locate(self.sightings, rig), rig, fused, jitter_rad)
-
-    def _solve_steep(self, tracks: Association) -> Bundle:
-        located = self._locate(self.initial_rig)
-        sine = np.where(located.valid, located.sine_depression, np.nan)
-        threshold = min(_STEEP_SINE, float(np.nanmedian(sine)))
-        with np.errstate(invalid="ignore"):
-            steep = located.valid & (sine >= threshold)
-        return self._solve(tracks, steep, self.initial_rig, coarse=True)
 
     def _solve(
         self,
@@ -492,6 +487,16 @@ def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate:
     twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     read_out_s = np.zeros(len(rig.intrinsic)) if stated_s is None else stated_s
     return replace(rig, read_out_s=read_out_s, twist_vehicle=twists)
+
+
+def _scatter(bundle: Bundle) -> FloatArray:
+    """How many times as large as usual the variance of each corner's (G, 4) images is."""
+    corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
+    freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
+    squared, degrees = np.zeros(size), np.full(size, -2.0)
+    np.add.at(squared, corner, bundle.solution.mahalanobis2)
+    np.add.at(degrees, corner, freedom)
+    return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))
 
 
 def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:

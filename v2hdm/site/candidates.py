@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import polygamma, psi
 
 from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.quadrilateral import block_diagonal
@@ -138,17 +140,61 @@ def with_dissent(
     return Candidates(candidates.corners_map, covariance)
 
 
-def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates:
+def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: FloatArray) -> Candidates:
     """The solved candidates (G,), with the errors that all images of a corner share.
 
     A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
     are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
-    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says.
+    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says. Where the
+    images of a corner scatter more than others do, by ``scatter`` (G, 4), they know as much less of it.
     """
-    single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
-    unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]
-    shared = np.where(unseen, 0.0, CORRELATION * single)
+    seen = np.maximum(fused.seen, 1)
+    share = scatter - 1 + CORRELATION * seen * scatter
+    unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))
+    shared = np.where(unseen[..., None, None], 0.0, share[..., None, None] * fused.covariance_m2)
     # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
-    no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
+    no_point = (fused.seen == 0) & ~unseen
     shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
+
+
+_LARGEST = 1e9
+"""Variance of residuals, in squared sigmas, beyond which (and below whose inverse) all are alike."""
+
+_PRIOR_FREEDOM = (1.0, 1e4)
+"""Between these is the freedom of the prior of a variance: from tails as heavy as Cauchy's to none."""
+
+_LEAST_TO_COMPARE = 3  # variances from which they have a spread
+
+
+def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, float]:
+    """Scale and freedom of the inverse-gamma prior of variances (M,), each estimated with ``freedom`` (M,).
+
+    By moments of their logarithms (Smyth, Linear models and empirical Bayes methods, 2004, section 6.2); of
+    fewer than three nothing is known, and none is too large.
+    """
+    if len(variance) < _LEAST_TO_COMPARE:
+        return _LARGEST, _PRIOR_FREEDOM[1]
+    off = np.log(variance_within(variance)) - psi(freedom / 2) + np.log(freedom / 2)
+    beyond = off.var(ddof=1) - polygamma(1, freedom / 2).mean()
+    low, high = _PRIOR_FREEDOM
+    beyond = float(np.clip(beyond, polygamma(1, high / 2) * 1.001, polygamma(1, low / 2) * 0.999))
+    prior = float(brentq(lambda count: polygamma(1, count / 2) - beyond, low, high))
+    return float(np.exp(off.mean() + psi(prior / 2) - np.log(prior / 2))), prior
+
+
+def variance_within(variance: FloatArray) -> FloatArray:
+    """Variances without those that no comparison can do with."""
+    return np.clip(np.nan_to_num(variance, nan=_LARGEST), 1 / _LARGEST, _LARGEST)
+
+
+def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
+    """How many times as large as usual the variance of corners' (G, 4) images is, at least once.
+
+    By sums of their ``squared`` residuals (G, 4), in sigmas, over ``freedom`` (G, 4) degrees: each variance
+    is a mean of its own and of what those of all corners say.
+    """
+    known = freedom > 0
+    scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])
+    after = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))
+    return np.asarray(np.where(known, np.maximum(after / scale, 1.0), 1.0))
