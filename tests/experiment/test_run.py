@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from matplotlib.colors import to_rgb
 
 from tests.experiment.scene import CALIBRATED, ESTIMATED, TRUE, experiment, plain_map, record
 from v2hdm.cli.compose import conf_dir, register, to_dataclass
@@ -15,8 +16,13 @@ from v2hdm.experiment.drive import drive_record
 from v2hdm.experiment.measures import measure
 from v2hdm.experiment.plan import ExperimentConfig, Site, jobs
 from v2hdm.experiment.run import run_experiment
-from v2hdm.experiment.summary import claims, words, write_tables
+from v2hdm.experiment.summary import claims, latex, words, write_tables
 from v2hdm.pipeline.config import DriveConfig
+from v2hdm.report import style
+
+
+def rgb(method):
+    return [round(255 * part) for part in to_rgb(style.METHOD[method])]
 
 
 def composed(*overrides):
@@ -152,9 +158,18 @@ def test_tables_are_written_for_spreadsheets_and_papers(tmp_path):
     assert len(lines) == 4 * 3 * 5
     opt = next(line for line in lines if (line["port"], line["method"]) == ("port1", "Opt"))
     assert float(opt["RMSE (cm)"]) == pytest.approx(1.0)
-    columns = {line.count("|") for line in (tmp_path / "results.md").read_text().splitlines()}
-    assert len(columns) == 1
-    assert "Opt, paper" in (tmp_path / "calibrations.md").read_text()
+    for name in ("results", "calibrations"):
+        rows = [line for line in (tmp_path / f"{name}.tex").read_text().splitlines() if line.endswith(r"\\")]
+        assert len({line.count(" & ") for line in rows}) == 1
+        assert any("Opt, paper" in line for line in rows)
+
+
+def test_what_latex_would_take_for_a_command_is_a_letter_in_a_table():
+    text = latex(["port", "RMSE (cm)"], [["a_b & 5 %", "1.0 +- 0.2"], ["other", r"\x"]])
+    assert r"a\_b \& 5 \% & 1.0 $\pm$ 0.2 \\" in text
+    assert r"\textbackslash{}x" in text
+    assert text.startswith("\\begin{tabular}{lr}\n\\toprule\nport & RMSE (cm)")
+    assert text.count("\\midrule") == 2
 
 
 @pytest.mark.slow
@@ -172,6 +187,12 @@ def test_an_experiment_is_tables_figures_and_text_of_its_drives(tmp_path, monkey
         assert f"![{name}]({name})" in captions
         image = cv2.imread(str(folder / name))
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+    for said, method in (("(ENI, vermillion)", "ENI"), ("(ONI, green)", "ONI")):  # and nothing else is
+        assert said in captions
+        painted = np.all(cv2.imread(str(folder / "eni_oni_port1.png"))[..., ::-1] == rgb(method), axis=2)
+        assert painted.sum() > 100
+    for method, (colour, line) in style.WORDS.items():
+        assert f"{method} {colour} and {line}" in captions
     assert "All 14 figures agree" in (folder / "experiment.md").read_text()
 
 

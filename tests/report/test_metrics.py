@@ -14,7 +14,7 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
 from v2hdm.report import figures, style
 from v2hdm.report.check_points import COLUMNS, write_check_points
-from v2hdm.report.figures import save_birdseye, save_growth
+from v2hdm.report.figures import save_birdseye
 from v2hdm.report.metrics import (
     corner_errors,
     driven_past,
@@ -111,11 +111,7 @@ def test_the_birds_eye_view_is_drawn_with_and_without_truth(tmp_path):
         save_birdseye(tmp_path / name, maps, "Opt", route, known)
         image = cv2.imread(str(tmp_path / name))
         assert image.std() > 5.0
-
-
-def test_no_unfinished_figure_stays_behind(tmp_path):
-    save_growth(tmp_path / "growth.png", {"CNI": [(1, 0.2), (10, 0.1)], "Opt": [(1, 0.1), (10, 0.02)]})
-    assert [p.name for p in tmp_path.iterdir()] == ["growth.png"]
+    assert {p.name for p in tmp_path.iterdir()} == {"with.png", "without.png"}  # no unfinished one stays
 
 
 def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path):
@@ -149,7 +145,7 @@ def test_before_and_after_differ_in_dashes_and_not_in_colour_alone(tmp_path):
 
 
 def test_every_method_has_a_line_style_and_a_marker_of_its_own():
-    for look in (style.LINE, style.MARKER, style.METHOD):
+    for look in (style.LINE, style.WORDS, style.METHOD):
         assert set(look) == set(METHODS)
         assert len({str(one) for one in look.values()}) == len(METHODS)
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.figure import Figure
 
-from v2hdm.experiment.measures import Matched, Measured
-from v2hdm.records import FloatArray
+from v2hdm.experiment.measures import Matched, Measured, markings_of, truth_of
+from v2hdm.records import LANE_LINE, FloatArray, HdMap, Lane
 from v2hdm.report import style
+from v2hdm.report.figures import draw_truth, save_birdseye, site_and_detail
+from v2hdm.report.terminal import METHODS
 
 Caption = Mapping[str, Any]  # the values in a figure's caption, by their names in the template figures.md
 
@@ -37,187 +38,77 @@ def save_figures(
         firsts.setdefault(one.port, number)
     work: dict[str, tuple[str, Callable[[Path], Caption | None]]] = {}
     for port, n in firsts.items():
-        record, one = records[n], measured[n]
-        of_port = {
-            "map": partial(_save_map, record=record, measured=one),
-            "eni_oni": partial(_save_shift, record=record, measured=one),
-        }
-        work |= {f"{kind}_{port}.png": (kind, draw) for kind, draw in of_port.items()}
+        for kind, draw in (("map", _save_map), ("eni_oni", _save_shift)):
+            work[f"{kind}_{port}.png"] = kind, partial(draw, record=records[n], measured=measured[n])
     work["corners.png"] = "corners", partial(_save_boxes, firsts=[measured[n] for n in firsts.values()])
     captions = {}
     for done, (name, (kind, save)) in enumerate(work.items()):
         progress(done, len(work))
         caption = save(folder / name)
-        if caption is None:
-            (folder / name).unlink(missing_ok=True)
-        else:
+        if caption is not None:
             captions[name] = kind, caption
     progress(len(work), len(work))
     return captions
 
 
-LINK = "#e3001b"  # colour of lines between corners that belong together
-
-
-def _drive_of(record: Mapping[str, Any]) -> str:
-    return str(record["port"]) if record["seed"] is None else f"{record['port']}, seed {record['seed']}"
-
-
-_SITE_IN = 9.0  # longer side of the site
-_INSET_IN = 3.4
-_BESIDE_M = 12.0
-_WIDE = 1.6  # width of a site over its height above which the insets stand below it
-
-_OPT, _LANE = style.METHOD["Opt"], style.METHOD["ONI"]
-
-_NEAR_M, _FAR_M = 1.0, 6.0  # half the width, m, of an inset on a corner's error, and on a neighbourhood
-_LETTERS = {"a": (2, (3, 1)), "b": (0, (-9, -9)), "c": (3, (-9, 1))}
-"""Corner of each inset's square that its letter stands at, and how far from it (pt)."""
-
-_ENI = "#3a3f44"  # ENI's outlines, where its own red is that of the correspondences
-
-
 def _save_map(path: Path, record: Mapping[str, Any], measured: Measured) -> Caption | None:
-    """Draw the optimised map over the truth, with three insets."""
-    cameras = list(measured.matched)[-1]
-    found = measured.matched[cameras].get("Opt")
+    """Draw the optimised map over the truth, and a close-up of all methods."""
+    cameras, by_method = list(measured.matched.items())[-1]
+    found = by_method.get("Opt")
     if found is None or not len(found.true):
         return None
-    mapped = _mapped(record, found)
+    lanes = tuple(Lane(LANE_LINE, np.array(line), 1) for line in record["lanes"].get("Opt", []))
+    plain = record["maps"][cameras]
+    maps = {
+        one: HdMap(markings_of(plain[one]), lanes if one == "Opt" else ()) for one in METHODS if one in plain
+    }
+    save_birdseye(path, maps, "Opt", np.array(record["route"]), truth_of(record))
     error_cm = 100 * np.linalg.norm(found.errors_m, axis=2)
-    mean_cm = error_cm.mean(axis=1)
-    median, (worst, corner) = int(np.argsort(mean_cm)[len(mean_cm) // 2]), divmod(int(error_cm.argmax()), 4)
-    insets = [
-        (_crowd(mapped.mean(axis=1), _FAR_M), _FAR_M, "most markings together"),
-        (mapped[median].mean(axis=0), _NEAR_M, f"a usual one, {mean_cm[median]:.1f} cm off"),
-        (mapped[worst, corner], _NEAR_M, f"the worst corner, {error_cm.max():.1f} cm off"),
-    ]
-    lanes = [np.array(line) for line in record["lanes"].get("Opt", [])]
-    with style.figure(path, *_size_in(record, len(insets))) as fig:
-        site, others = _axes(fig, record, len(insets))
-        for axes in (site, *others):
-            _draw_truth(axes, record)
-            axes.add_collection(LineCollection(lanes, colors=_LANE, lw=1.0, zorder=2))
-            fill = _OPT if axes is site else "none"
-            outlines = PolyCollection(list(mapped), facecolors=fill, edgecolors=_OPT, lw=1.4, zorder=3)
-            axes.add_collection(outlines)
-        for letter, axes, place in zip("abc", others, insets, strict=True):
-            _frame(site, axes, place, letter)
-        site.set_title(f"{_drive_of(record)}: Opt, {cameras}, {len(mapped)} markings over the truth")
-        site.plot([], [], color=style.ROUTE, lw=5, label="route")
-        site.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
-        site.fill([], [], facecolor=_OPT, edgecolor=_OPT, label="mapped marking")
-        site.plot([], [], color=_LANE, lw=1.0, label="mapped lane line")
-        fig.legend(handles=site.get_legend_handles_labels()[0], loc="outside lower center", ncols=4)
-    median_cm, worst_cm = f"{mean_cm[median]:.1f}", f"{error_cm.max():.1f}"
-    return {"drive": _drive_of(record), "cameras": cameras, "median": median_cm, "worst": worst_cm}
+    of_marking, worst = np.median(error_cm.mean(axis=1)), error_cm.max()
+    drawn = [f"{one} {' and '.join(style.WORDS[one])}" for one in maps]
+    said = {"drive": measured.title, "cameras": cameras, "methods": ", ".join(drawn)}
+    return said | {"median": f"{of_marking:.1f}", "worst": f"{worst:.1f}"}
+
+
+_CLOSE_UP_M = 6.0  # half the width of the close-up on where most markings stand together
 
 
 def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Caption | None:
     """Draw ENI against ONI with corner correspondences."""
-    cameras = list(measured.matched)[-1]
-    before, after = (measured.matched[cameras].get(name) for name in ("ENI", "ONI"))
+    cameras, by_method = list(measured.matched.items())[-1]
+    before, after = by_method.get("ENI"), by_method.get("ONI")
     if before is None or after is None:
         return None
     common, rows, columns = np.intersect1d(before.true, after.true, return_indices=True)
     if not len(common):
         return None
-    eni, oni = _mapped(record, before)[rows], _mapped(record, after)[columns]
-    true = _true_corners(record)[common]
-    error_cm = [100 * np.sqrt(((corners - true) ** 2).sum(axis=2).mean()) for corners in (eni, oni)]
-    links = list(np.stack([eni.reshape(-1, 2), oni.reshape(-1, 2)], axis=1))
-    moved = np.linalg.norm(eni - oni, axis=2).mean(axis=1)
-    insets = [
-        (_crowd(true.mean(axis=1), _FAR_M), _FAR_M, "most markings together"),
-        (true[moved.argmax()].mean(axis=0), _FAR_M / 2, f"moved the most, by {100 * moved.max():.0f} cm"),
-    ]
-    with style.figure(path, *_size_in(record, len(insets))) as fig:
-        site, others = _axes(fig, record, len(insets))
-        for axes in (site, *others):
-            _draw_truth(axes, record)
-            width = 0.7 if axes is site else 1.5
-            for corners, colour in ((eni, _ENI), (oni, style.METHOD["ONI"])):
-                look: dict[str, Any] = {"edgecolors": colour, "lw": width, "zorder": 3}
-                axes.add_collection(PolyCollection(list(corners), facecolors="none", **look))
-            axes.add_collection(LineCollection(links, colors=LINK, lw=width, ls=(0, (3, 2)), zorder=4))
-        for letter, axes, place in zip("ab", others, insets, strict=True):
-            _frame(site, axes, place, letter)
-        site.set_title(f"{_drive_of(record)}: ENI against ONI, {cameras}")
-        site.plot([], [], color=_ENI, label="ENI")
-        site.plot([], [], color=style.METHOD["ONI"], label="ONI")
-        site.plot([], [], color=LINK, ls=(0, (3, 2)), label="the same corner")
-        site.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
-        fig.legend(handles=site.get_legend_handles_labels()[0], loc="outside lower center", ncols=4)
-    errors = {name: f"{error:.1f}" for name, error in zip(("eni", "oni"), error_cm, strict=True)}
-    return {"drive": _drive_of(record), "cameras": cameras, "markings": len(common), **errors}
+    truth = truth_of(record)
+    true = np.array([marking.corners_map for marking in truth.map.markings])[common]
+    moved = {"ENI": true + before.errors_m[rows], "ONI": true + after.errors_m[columns]}
+    links = np.stack([one.reshape(-1, 2) for one in moved.values()], axis=1)
+    with site_and_detail(path, np.array(record["route"])) as (site, detail):
+        for axes, width in ((site, 0.7), (detail, 1.5)):
+            draw_truth(axes, truth)
+            for method, corners in moved.items():
+                outline: dict[str, Any] = {"facecolors": "none", "edgecolors": style.METHOD[method]}
+                outlines = PolyCollection(list(corners), lw=width, zorder=3, label=method, **outline)
+                axes.add_collection(outlines)
+            dashes: dict[str, Any] = {"colors": "k", "ls": (0, (3, 2)), "label": "the same corner"}
+            axes.add_collection(LineCollection(list(links), lw=width, zorder=4, **dashes))
+        site.set_title(f"{measured.title}: ENI against ONI, {cameras}")
+        style.cut_to_square(detail, _crowd(true.mean(axis=1)), _CLOSE_UP_M)
+        detail.set_title("Where most markings stand together")
+    said: dict[str, Any] = {"drive": measured.title, "cameras": cameras, "markings": len(common)}
+    for method, corners in moved.items():
+        rmse_cm = 100 * np.sqrt(((corners - true) ** 2).sum(axis=2).mean())
+        said |= {method: f"{rmse_cm:.1f}", f"{method}_colour": style.WORDS[method][0]}
+    return said
 
 
-_Place = tuple[FloatArray, float, str]  # an inset: its centre (2,) and half its width, m, and its title
-
-
-def _true_corners(record: Mapping[str, Any]) -> FloatArray:
-    return np.array(record["truth"]["corners"]).reshape(-1, 4, 2)
-
-
-def _mapped(record: Mapping[str, Any], found: Matched) -> FloatArray:
-    return np.asarray(_true_corners(record)[found.true] + found.errors_m)
-
-
-def _crowd(centres: FloatArray, half_m: float) -> FloatArray:
-    """The centre (2,) with the most others within a square about it."""
-    near = (np.abs(centres[:, None] - centres[None]).max(axis=2) < half_m).sum(axis=1)
+def _crowd(centres: FloatArray) -> FloatArray:
+    """The centre (2,) with the most others in the close-up about it."""
+    near = (np.abs(centres[:, None] - centres[None]).max(axis=2) < _CLOSE_UP_M).sum(axis=1)
     return np.asarray(centres[int(near.argmax())])
-
-
-def _layout(record: Mapping[str, Any]) -> tuple[bool, float, float]:
-    """Whether the insets stand below the site, which is much wider than high; its width and height."""
-    extent_m = np.ptp(np.array(record["route"]), axis=0) + 2 * _BESIDE_M
-    width_in, height_in = (_SITE_IN * extent_m / extent_m.max()).tolist()
-    return extent_m[0] > _WIDE * extent_m[1], width_in, height_in
-
-
-def _size_in(record: Mapping[str, Any], insets: int) -> tuple[float, float]:
-    below, width, height = _layout(record)
-    if below:
-        return max(width, insets * _INSET_IN) + 0.6, height + _INSET_IN + 1.4
-    return width + _INSET_IN + 1.4, max(height, insets * (_INSET_IN + 0.5)) + 0.8
-
-
-def _axes(fig: Figure, record: Mapping[str, Any], insets: int) -> tuple[Axes, list[Axes]]:
-    """The site with its route, and the axes of the insets."""
-    below, width, height = _layout(record)
-    if below:
-        grid = fig.add_gridspec(2, insets, height_ratios=[height, _INSET_IN])
-        site, others = fig.add_subplot(grid[0, :]), [fig.add_subplot(grid[1, n]) for n in range(insets)]
-    else:
-        grid = fig.add_gridspec(insets, 2, width_ratios=[width, _INSET_IN])
-        site, others = fig.add_subplot(grid[:, 0]), [fig.add_subplot(grid[n, 1]) for n in range(insets)]
-    route = np.array(record["route"])
-    site.plot(*route.T, color=style.ROUTE, lw=5, zorder=0, solid_capstyle="round")
-    low, high = route.min(axis=0) - _BESIDE_M, route.max(axis=0) + _BESIDE_M
-    site.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    for axes in (site, *others):
-        style.set_map_axes(axes)
-    return site, others
-
-
-def _draw_truth(axes: Axes, record: Mapping[str, Any]) -> None:
-    paint: dict[str, Any] = {"facecolors": style.PAINT, "edgecolors": style.TRUTH, "lw": 0.4}
-    axes.add_collection(PolyCollection(list(_true_corners(record)), zorder=1, **paint))
-    lanes = [np.array(line) for line in record["true_lanes"]]
-    axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2, zorder=0.5))
-
-
-def _frame(site: Axes, inset: Axes, place: _Place, letter: str) -> None:
-    """Cut an inset to a square, and mark that square on the site."""
-    centre, half_m, text = place
-    square = centre + half_m * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    site.plot(*square.T, color="k", lw=1.0, zorder=5)
-    corner, offset = _LETTERS[letter]
-    bold: dict[str, Any] = {"weight": "bold", "zorder": 6, "fontsize": 12}
-    site.annotate(letter, square[corner], xytext=offset, textcoords="offset points", **bold)
-    style.cut_to_square(inset, centre, half_m)
-    inset.set_title(f"{letter}: {text}", fontsize=10)
 
 
 _BOX = "#7fb8b4"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.experiment.plan import OURS, RECIPES
-from v2hdm.records import DIAMOND, FloatArray, HdMap, IntArray, Marking, Truth
+from v2hdm.records import DIAMOND, LANE_LINE, FloatArray, HdMap, IntArray, Lane, Marking, Truth
 from v2hdm.report.metrics import corner_errors, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
 
@@ -77,10 +77,17 @@ def markings_of(plain: Mapping[str, Any]) -> tuple[Marking, ...]:
     )
 
 
+def truth_of(record: Mapping[str, Any]) -> Truth:
+    """The true map of a drive's record."""
+    true = markings_of(record["truth"])
+    lanes = tuple(Lane(LANE_LINE, np.array(line), 1) for line in record["true_lanes"])
+    return Truth(HdMap(true, lanes), {}, np.empty((0, 4, 4)), np.empty((0, len(true))), (), {})
+
+
 def measure(record: Mapping[str, Any]) -> Measured:
     """The figures of a drive's record."""
-    true = markings_of(record["truth"])
-    truth = Truth(HdMap(true), {}, np.empty((0, 4, 4)), np.empty((0, len(true))), (), {})
+    truth = truth_of(record)
+    true = truth.map.markings
     passed = _passed(true, np.array(record["route"], dtype=np.float64))
     rows: dict[str, Mapping[str, Row]] = {}
     matched: dict[str, Mapping[str, Matched]] = {}

@@ -31,10 +31,12 @@ COLUMNS: Mapping[str, tuple[Callable[[Row], float], int]] = {
 """The figure of each column, and the digits behind the point."""
 
 _EXTRINSICS = ("rotation (deg)", "centre (cm)")
+_WORDS = ("port", "method", "cameras", "camera", "extrinsic of", "claim", "where")  # columns of words
+_ESCAPED = str.maketrans({one: f"\\{one}" for one in "&%$#_{}"} | {"\\": r"\textbackslash{}"})
 
 
 def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
-    """Write ``results`` and ``calibrations`` as .csv (a line per seed) and .md into a folder."""
+    """Write ``results`` and ``calibrations`` as .csv (a line per seed) and .tex into a folder."""
     results = [
         [one.port, one.seed, cameras, method, *(f"{take(row):.6g}" for take, _ in COLUMNS.values())]
         for one in measured
@@ -51,8 +53,7 @@ def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
         ("calibrations", ("camera", "extrinsic of", *_EXTRINSICS), calibrations_table, calibrations),
     ):
         replace_csv(folder / f"{name}.csv", [["port", "seed", *keys], *rows])
-        heads, lines = table(measured)
-        replace_text(folder / f"{name}.md", markdown(heads, lines))
+        replace_text(folder / f"{name}.tex", latex(*table(measured)))
 
 
 def results_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
@@ -92,9 +93,21 @@ def by_port(measured: Sequence[Measured]) -> dict[str, list[Measured]]:
 
 def markdown(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """A table in Markdown; columns of figures are aligned to the right."""
-    left = ("port", "method", "cameras", "camera", "extrinsic of", "claim", "where")
-    rule = [":--" if head in left else "--:" for head in heads]
+    rule = [":--" if head in _WORDS else "--:" for head in heads]
     return "".join(f"| {' | '.join(line)} |\n" for line in [heads, rule, *lines])
+
+
+def latex(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """A table as a ``tabular`` of the package booktabs, a rule between ports."""
+    rows = [" & ".join(one.translate(_ESCAPED).replace("+-", "$\\pm$") for one in row) for row in lines]
+    firsts = [row.partition(" & ")[0] for row in rows]
+    body = [
+        ("\\midrule\n" if not n or firsts[n] != firsts[n - 1] else "") + f"{row} \\\\\n"
+        for n, row in enumerate(rows)
+    ]
+    columns = "".join("l" if head in _WORDS else "r" for head in heads)
+    head = f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{' & '.join(heads)} \\\\\n"
+    return f"{head}{''.join(body)}\\bottomrule\n\\end{{tabular}}\n"
 
 
 def _extrinsics(one: Measured) -> list[tuple[str, str, tuple[float, float]]]:
@@ -224,7 +237,6 @@ def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
         tested=tested,
         broken=[claim for claim in tested if not claim.holds],
         claims_table=markdown(["claim", "where", "asked", "measured", "on shared markings", "holds"], lines),
-        remarks=_on_shared(measured),
         failures=[(one.title, *failure) for one in measured for failure in one.failures],
         results_table=markdown(*results_table(measured)),
         calibrations_table=markdown(*calibrations_table(measured)),
@@ -237,21 +249,6 @@ def _filled(template: str, **values: Any) -> str:
         loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
     return found.get_template(template).render(**values)
-
-
-def _on_shared(measured: Sequence[Measured]) -> list[tuple[str, ...]]:
-    """Cameras, markings that all methods share, and errors on them (cm): CNI, Opt, Opt by the paper."""
-    out: list[tuple[str, ...]] = []
-    for port, drives in by_port(measured).items():
-        for cameras in drives[0].rows:
-            rows = _common(drives, cameras, ("CNI", "Opt"))
-            if rows:
-                of_paper = _common(drives, cameras, ("Opt, paper",))
-                cni, opt = (_cm(row[name].shared_rmse_m for row in rows) for name in ("CNI", "Opt"))
-                recipe = _cm(row["Opt, paper"].shared_rmse_m for row in of_paper) if of_paper else ""
-                shared = f"{np.mean([row['Opt'].shared for row in rows]):.0f}"
-                out.append((f"{port}, {cameras}", shared, cni, opt, recipe))
-    return out
 
 
 def _known(values: Iterable[float]) -> tuple[float, ...]:
@@ -269,8 +266,3 @@ def _common(drives: Sequence[Measured], cameras: str, methods: Sequence[str]) ->
     """The rows of those drives in which all of some methods gave a map."""
     found = (one.rows.get(cameras, {}) for one in drives)
     return [rows for rows in found if all(method in rows for method in methods)]
-
-
-def _cm(values_m: Iterable[float]) -> str:
-    known = _known(values_m)
-    return f"{100 * np.mean(known):.1f}" if known else "-"

@@ -19,8 +19,7 @@ from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_feat
 from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.keys import base_files
-from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
-from v2hdm.report.figures import save_changes
+from v2hdm.records import Change, Changes, Drive, Fate, HdMap, Image
 from v2hdm.site.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
@@ -97,8 +96,8 @@ def _as_json(one: Change) -> dict[str, Any]:
     return {name: value.tolist() if hasattr(value, "tolist") else value for name, value in plain.items()}
 
 
-def write_changes(changes: Changes, hd_map: HdMap, folder: Path, route_map: FloatArray) -> None:
-    """Write ``changes.geojson`` and ``changes.png`` into ``folder``.
+def write_changes(changes: Changes, hd_map: HdMap, folder: Path) -> None:
+    """Write ``changes.geojson`` into ``folder``.
 
     A feature is a change: its outline now, or that which it had if it is gone, where the map has it now.
     """
@@ -109,4 +108,3 @@ def write_changes(changes: Changes, hd_map: HdMap, folder: Path, route_map: Floa
         ring = geojson_positions(corners, None, hd_map.origin)
         features.append(geojson_feature(f"changes/{one.id}", "Polygon", [[*ring, ring[0]]], _as_json(one)))
     write_features(folder / "changes.geojson", features, hd_map.origin, {"same": changes.same})
-    save_changes(folder / "changes.png", changes, hd_map, route_map)

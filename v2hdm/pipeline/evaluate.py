@@ -25,13 +25,12 @@ CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both
 class Judgement:
     """The figures of a run.
 
-    ``metrics`` goes into ``metrics.json``; ``headlines`` are sentences for a reader; ``growth``
-    holds per method the corner RMSE (m) after so many markings; ``truth`` is None on a real drive.
+    ``metrics`` goes into ``metrics.json``; ``headlines`` are sentences for a reader; ``truth`` is
+    None on a real drive.
     """
 
     metrics: Mapping[str, Any]
     headlines: Sequence[str]
-    growth: Mapping[str, Sequence[tuple[int, float]]]
     truth: Truth | None
 
 
@@ -61,16 +60,16 @@ def evaluate(
             ideal = run_naive("true extrinsic", Inputs(drive, detections, cameras, options), ipms)
             reference[name] = {"naive_true_extrinsic": map_figures(ideal.hd_map, truth, expected)}
     progress(len(methods), len(methods))
-    growth = {} if truth is None else growth_of(list(methods.values())[-1], truth)
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
-        metrics |= {"reference": reference, "disturbances": truth.disturbances, "growth": growth}
+        metrics |= {"reference": reference, "disturbances": truth.disturbances}
+        metrics["growth"] = growth_of(list(methods.values())[-1], truth)
     headlines = [headline(name, by_method) for name, by_method in results.items()]
     if truth is not None and truth.disturbances:
         disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
         headlines.insert(0, f"disturbances: {disturbed}")
     headlines += list(methods.values())[-1]["Opt"].certainty.values()
-    return Judgement(metrics, headlines, growth, truth)
+    return Judgement(metrics, headlines, truth)
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.keys import Contents, made_of_drives
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
-from v2hdm.report.figures import save_birdseye, save_growth
+from v2hdm.report.figures import save_birdseye
 from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
@@ -247,7 +247,7 @@ def _write_map(
     if best.residuals is not None:
         write_residuals(best.residuals, folder / RESIDUALS)
     if best.changes is not None:
-        write_changes(best.changes, best.hd_map, folder, _route(drive))
+        write_changes(best.changes, best.hd_map, folder)
     if result.check_points is not None:
         write_check_points(result.check_points, folder / "check_points.csv")
     excluded = [
@@ -258,8 +258,6 @@ def _write_map(
     write_exclusions(excluded, folder / "excluded.geojson", drive.origin, drive.road)
     maps = {name: one.hd_map for name, one in list(result.methods.values())[-1].items()}
     save_birdseye(folder / "birdseye.png", maps, BEST, _route(drive), judgement.truth)
-    if any(judgement.growth.values()):
-        save_growth(folder / "growth.png", judgement.growth)
     for name in best.calibrations:
         image = _fullest_image(drive, name, result.detections)
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)

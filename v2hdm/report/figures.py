@@ -1,17 +1,17 @@
-"""The figures of a run as PNG: map against truth, growth, route, and changes to an earlier map."""
+"""The figures of a run as PNG: the map against the truth, and the route."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.patches import Polygon
 
-from v2hdm.records import Change, Changes, Fate, FloatArray, HdMap, Trajectory, Truth
+from v2hdm.records import FloatArray, HdMap, Trajectory, Truth
 from v2hdm.report import metrics, style
 
 _HEIGHT_IN = 7.6
@@ -32,42 +32,37 @@ def save_birdseye(
     The best map's markings are coloured by their corner error where there is truth. ``route_map`` (N, 2), m,
     has nan between two drives.
     """
-    span_m = np.nanmax(route_map, axis=0) - np.nanmin(route_map, axis=0)
-    extent_m = np.maximum(span_m, 1.0) + 2 * _BESIDE_ROUTE_M
+    with site_and_detail(path, route_map) as (site, detail):
+        if truth is not None:
+            draw_truth(site, truth)
+        _draw_best(site, maps[best], truth)
+        site.set_title(f"{best}: {len(maps[best].markings)} markings, {len(maps[best].lanes)} lane lines")
+        _close_up(detail, maps, best, truth)
+
+
+@contextmanager
+def site_and_detail(path: Path, route_map: FloatArray) -> Iterator[tuple[Axes, Axes]]:
+    """A figure of two panels, the site with the route (N, 2) in it and a close-up; legends below them."""
+    low, high = np.nanmin(route_map, axis=0) - _BESIDE_ROUTE_M, np.nanmax(route_map, axis=0) + _BESIDE_ROUTE_M
+    extent_m = high - low
     site_width_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.5, 2.0)) + 1.6
     with style.figure(path, site_width_in + _HEIGHT_IN, _HEIGHT_IN) as fig:
         site, detail = fig.subplots(1, 2, width_ratios=[site_width_in, _HEIGHT_IN])
         site.plot(*route_map.T, color=style.ROUTE, lw=6, zorder=0, solid_capstyle="round", label="route")
-        if truth is not None:
-            _draw_truth(site, truth)
-        _draw_best(site, maps[best], truth)
-        site.set_title(f"{best}: {len(maps[best].markings)} markings, {len(maps[best].lanes)} lane lines")
-        _close_up(detail, maps, best, truth)
+        site.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        yield site, detail
         for axes in (site, detail):
-            style.set_map_axes(axes)
-        site.legend(loc="upper left", bbox_to_anchor=(0.0, -0.09), ncols=4, borderaxespad=0.0)
+            if axes.axison:
+                style.set_map_axes(axes)
+                axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=5, borderaxespad=3.5)
 
 
-def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -> None:
-    """Draw corner RMSE (m) against the number of markings mapped so far, a line per method."""
-    with style.figure(path, 7.5, 4.2) as fig:
-        axes = fig.subplots()
-        for method, points in growth.items():
-            if points:
-                counts, errors = np.array(points, dtype=np.float64).T
-                axes.plot(counts, 100 * errors, ms=4.5, label=method, **style.line_of(method))
-        style.set_logarithmic(axes, "y")
-        axes.set(xlabel="markings mapped so far", ylabel="corner RMSE (cm)")
-        axes.set_title("Growth of the error with the map")
-        fig.legend(ncols=4, loc="outside lower center", handlelength=3.2)
-
-
-def _draw_truth(axes: Axes, truth: Truth) -> None:
+def draw_truth(axes: Axes, truth: Truth) -> None:
+    """Draw the true paint."""
     polygons, lanes = [m.corners_map for m in truth.map.markings], [one.points_map for one in truth.map.lanes]
     paint = PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.4, label="truth")
     axes.add_collection(paint)
     axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
-    axes.autoscale_view()
 
 
 def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
@@ -80,7 +75,6 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     polygons = [m.corners_map for m in hd_map.markings]
     if truth is None:
         axes.add_collection(PolyCollection(polygons, facecolors=solid, edgecolors=solid, label="markings"))
-        axes.autoscale_view()
         return
     rows, columns = metrics.match_markings(hd_map.markings, truth.map.markings)
     error_cm = np.full(len(polygons), np.nan)
@@ -92,7 +86,6 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     shown.set_clim(0.0, max(1.0, top))
     axes.add_collection(shown)
     axes.figure.colorbar(shown, ax=axes, shrink=0.6, label="corner error of the marking (cm)")
-    axes.autoscale_view()
 
 
 def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | None) -> None:
@@ -113,7 +106,6 @@ def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | N
             axes.plot(*closed.T, label=None if number else method, **look)
     style.cut_to_square(axes, centre, _DETAIL_RADIUS_M)
     axes.set_title("Close-up: the markings by every method")
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.09), ncols=5, borderaxespad=0.0, handlelength=3.0)
 
 
 def _wholly_near(hd_map: HdMap, centre: FloatArray) -> list[FloatArray]:
@@ -176,88 +168,3 @@ def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     }
     arrows = (length * poses[chosen, :2, 0]).T
     axes.quiver(*place[chosen].T, *arrows, angles="xy", scale_units="xy", scale=1, **look)
-
-
-_AROUND_M = 2.0  # ground around a change in its close-up, m
-_MOST_CLOSE_UPS = 12
-
-_COLOURS = {Fate.MOVED: "#3b6fb6", Fate.VANISHED: "#d0432b", Fate.NEW: "#0b7a75"}
-
-
-def save_changes(path: Path, changes: Changes, hd_map: HdMap, route_map: FloatArray) -> None:
-    """Draw the changes over the map as it is now, beside close-ups of the largest moves.
-
-    ``route_map`` (N, 2), m, has nan between two drives.
-    """
-    moved = sorted(changes.of(Fate.MOVED), key=_distance_m, reverse=True)[:_MOST_CLOSE_UPS]
-    columns = 3 if len(moved) > 4 else 2
-    corners = np.concatenate([route_map, *(one.corners_map for one in hd_map.markings)])
-    extent_m = np.nanmax(corners, axis=0) - np.nanmin(corners, axis=0) + _BESIDE_ROUTE_M
-    site_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.6, 2.0)) + 1.0
-    detail_in = _HEIGHT_IN * columns / 3 if moved else 0.01
-    with style.figure(path, site_in + detail_in, _HEIGHT_IN) as fig:
-        if moved:
-            whole, close = np.asarray(fig.subfigures(1, 2, width_ratios=[site_in, detail_in])).tolist()
-            rows = -(-len(moved) // columns)
-            axes = close.subplots(rows, columns, squeeze=False).ravel()
-            title = "The largest moves by id: dashed before, solid now; east and north (m)"
-            close.suptitle(title, fontsize=9)
-            for place, one in zip(axes, moved, strict=False):
-                _move_close_up(place, one, changes, hd_map)
-            for place in axes[len(moved) :]:
-                place.set_axis_off()
-        else:
-            whole = fig
-        _site(whole.subplots(), changes, hd_map, route_map)
-
-
-def _site(axes: Axes, changes: Changes, hd_map: HdMap, route_map: FloatArray) -> None:
-    axes.plot(*route_map.T, color=style.ROUTE, lw=5, zorder=0, solid_capstyle="round", label="route")
-    _draw_map(axes, hd_map)
-    for fate, colour in _COLOURS.items():
-        own = changes.of(fate)
-        outlines = [one.before if one.after is None else one.after for one in own]
-        places = np.array([one.mean(axis=0) for one in outlines if one is not None]).reshape(-1, 2)
-        marker = {Fate.MOVED: "o", Fate.VANISHED: "x", Fate.NEW: "+"}[fate]
-        face = "none" if fate is Fate.MOVED else colour
-        label = f"{len(own)} {fate.value}"
-        axes.plot(*places.T, marker, ms=9, mew=1.6, mec=colour, mfc=face, zorder=3, label=label)
-        beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": colour}
-        for one, (east, north) in zip(own, places.tolist(), strict=True):
-            axes.annotate(str(one.id), (east, north), (5, 5), **beside)
-    axes.set_title(f"{changes.same} markings as they were, {len(changes.of(Fate.NOT_SEEN))} not seen")
-    style.set_map_axes(axes)
-    axes.legend(loc="best")
-
-
-def _move_close_up(axes: Axes, one: Change, changes: Changes, hd_map: HdMap) -> None:
-    """Old outline dashed, new one solid, an arrow from centre to centre with its length and sigma."""
-    assert one.before is not None
-    assert one.after is not None
-    assert one.shift_sigma_m is not None
-    _draw_map(axes, hd_map)
-    for other in changes.changes:
-        colour = _COLOURS.get(other.fate)
-        for corners, line in ((other.before, "--"), (other.after, "-")):
-            if corners is not None and colour:
-                look: dict[str, Any] = {"edgecolor": colour, "lw": 1.4, "ls": line, "zorder": 3}
-                axes.add_patch(Polygon(corners, closed=True, fill=False, **look))
-    begin, end = one.before.mean(axis=0), one.after.mean(axis=0)
-    axes.annotate("", xy=end, xytext=begin, arrowprops={"arrowstyle": "->", "color": "#2d3439", "lw": 1.4})
-    sigma_cm = 100 * float(np.sqrt(np.mean(one.shift_sigma_m**2)))
-    axes.set_title(f"id {one.id}: {100 * _distance_m(one):.0f} +- {sigma_cm:.1f} cm", fontsize=8)
-    style.cut_to_square(axes, np.concatenate([one.before, one.after]).mean(axis=0), _AROUND_M)
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=6)
-
-
-def _draw_map(axes: Axes, hd_map: HdMap) -> None:
-    lanes = [lane.points_map for lane in hd_map.lanes]
-    axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=1.6))
-    polygons = [one.corners_map for one in hd_map.markings]
-    axes.add_collection(PolyCollection(polygons, facecolors="#c9d3da", edgecolors="#9aa4ad", lw=0.4))
-    axes.autoscale_view()
-
-
-def _distance_m(one: Change) -> float:
-    return 0.0 if one.shift_m is None else float(np.linalg.norm(one.shift_m))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -31,24 +31,17 @@ PAINT = "#dfe4e8"  # filling of true markings
 GRID = "#e6eaed"
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
-METHOD = {
-    "CNI": OKABE_ITO["orange"],
-    "ENI": OKABE_ITO["vermillion"],
-    "Opt": OKABE_ITO["blue"],
-    "ONI": OKABE_ITO["green"],
+WORDS = {
+    "CNI": ("orange", "dashed"),
+    "ENI": ("vermillion", "dotted"),
+    "Opt": ("blue", "solid"),
+    "ONI": ("green", "dash-dotted"),
 }
-"""Colour of each method, the same in every figure."""
+"""Colour and line of each method in words, the same in every figure: they differ without colour, too."""
+
+METHOD = {method: OKABE_ITO[colour] for method, (colour, _) in WORDS.items()}
 
 LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
-"""Line style of each method: they differ without colour, too."""
-
-MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}  # marker of each method
-
-
-def line_of(method: str) -> dict[str, Any]:
-    """Colour, marker and line style of a method as keywords of ``plot``."""
-    marker, line = MARKER.get(method, "."), LINE.get(method, "-")
-    return {"color": METHOD.get(method, "k"), "marker": marker, "ls": line}
 
 
 RC: dict[Any, Any] = {
@@ -108,12 +101,3 @@ def draw_arrows(
 def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
     """Show the square about a point (2,) that reaches ``half`` to each side."""
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
-
-
-def set_logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
-    """A logarithmic axis with a grid, whose 1, 2 and 5 have labels."""
-    axes.set(**{f"{which}scale": "log"})
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:g}".lstrip("0.")[:1] in ("2", "5") else "")
-    axes.grid(axis=which, which="both", color=GRID)

@@ -70,6 +70,24 @@ def verdict(status: str = "PASS") -> dict[str, object]:
     }
 
 
+GONE = (DIAMOND_M + np.array([4.5, 1.2])).tolist()
+
+
+def changes() -> dict[str, object]:
+    """As ``metrics.json`` lists them: the first marking has come 30 cm north, another one is gone."""
+    seen = {"class": DIAMOND, "probability": 0.99, "found": 0, "views": 7}
+    now = DIAMOND_M + PLACES[0]
+    moved = {
+        "id": 1,
+        "fate": "moved",
+        "before_map": (now - np.array([0.0, 0.3])).tolist(),
+        "after_map": now.tolist(),
+    }
+    gone = {"id": 9, "fate": "vanished", "before_map": GONE, "after_map": None}
+    by = {"shift_m": [0.0, 0.3], "shift_sigma_m": [0.01, 0.01]}
+    return {"listed": [{**seen, **moved, **by}, {**seen, **gone, **dict.fromkeys(by)}]}
+
+
 def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: str = "PASS") -> Drive:
     """Write a result into ``folder/result`` and its drive into ``folder/drive``, which is returned."""
     hd_map, cam_from_vehicle = small_map(kind), looking_forward(2.0, 0.25)
@@ -117,6 +135,7 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
             "drive": {"name": name, "paths": [str(drive.root)], "cameras": ["front"], "images": 5},
             "results": {"front": {"Opt": figures}}, "seconds": {"detect": 1.5},
             "extrinsics": {"front": {"certainty": "front: the drive fixes both", "x_change_m": 0.1}},
+            "changes": changes(),
         }  # fmt: skip
         write_json(result / "metrics.json", metrics)
     return drive

@@ -65,7 +65,7 @@ def test_every_layer_changes_the_picture_when_it_is_switched(browser, report):
         page = watched.page
         page.evaluate(ON_SCREEN, PLACES[0].tolist())
         boxes = page.locator("#layers input")
-        assert boxes.count() == 6  # no truth, no mosaic
+        assert boxes.count() == 7  # no truth, no mosaic
         for number in range(boxes.count()):
             if not boxes.nth(number).is_checked():
                 boxes.nth(number).check()
@@ -140,6 +140,12 @@ def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(brows
         page.wait_for_timeout(100)
         tooltip = page.locator(".leaflet-tooltip:not(.corner)")
         assert f"reason: its place is unsure {NASTY}" in tooltip.inner_text()
+        page.mouse.move(*page.evaluate(ON_SCREEN, [4.5, 1.2]))  # what is gone since an earlier map
+        page.wait_for_timeout(400)  # the tooltip before it fades
+        assert "vanished: with probability 0.990; seen in 0 of 7 images" in tooltip.inner_text()
+        page.fill("#find-id", "1")
+        page.click("#find button")
+        assert "30.0 cm ± 1.0 cm" in page.locator("#details dl").inner_text()
         page.fill("#find-id", "3")
         page.click("#find button")
         assert page.locator("#details h3").inner_text() == "Marking 3, diamond"

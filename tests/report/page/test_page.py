@@ -8,7 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, SHIFT_PX, make_result, make_site
+from tests.report.page.folder import (
+    DIAMOND_M,
+    GONE,
+    INFO,
+    NASTY_NAME,
+    PLACES,
+    SHIFT_PX,
+    make_result,
+    make_site,
+)
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import read_drive
@@ -176,6 +185,13 @@ def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map
     first = dict(zip(page.check_points.headings, page.check_points.rows[0], strict=True))
     assert (first["point"], first["east (cm)"], first["north (cm)"]) == ("P1", "1.2", "−0.4")
     assert [one["off"] for one in page.map_data["checks"]] == [[0.0123, -0.004], [None, None]]
+
+
+def test_what_changed_since_an_earlier_map_is_a_layer_of_the_map(page):
+    moved, gone = page.map_data["changes"]
+    assert (moved["fate"], moved["p"]) == ("moved", (DIAMOND_M + PLACES[0]).tolist())
+    assert np.mean(moved["before"], axis=0).tolist() == pytest.approx([PLACES[0][0], PLACES[0][1] - 0.3])
+    assert (gone["fate"], gone["before"], gone["p"], gone["views"]) == ("vanished", GONE, GONE, 7)
 
 
 def test_coordinates_under_the_pointer_are_those_of_the_origin_to_a_millimetre(result):

@@ -146,6 +146,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             for one in facts.excluded
         ],
         "checks": _checks(facts),
+        "changes": _changes(facts),
         "truth": facts.truth
         and {
             "markings": [_metres(one.corners_map) for one in facts.truth.map.markings],
@@ -220,6 +221,16 @@ def _checks(facts: Facts) -> list[dict[str, Any]]:
             inside = one.get("inside_95_percent", "")
             checks.append({"id": one.get("id", ""), "p": place, "off": off, "inside": inside})
     return checks
+
+
+def _changes(facts: Facts) -> list[dict[str, Any]]:
+    """What is no longer as in the map that this one was built on, as ``metrics.json`` lists it."""
+    return [
+        {name: one[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
+        | {"k": one["class"], "n": one["found"], "p": one["after_map"] or one["before_map"]}
+        | {"before": one["before_map"] or []}
+        for one in (facts.metrics.get("changes") or {}).get("listed") or []
+    ]
 
 
 def _number(text: str | None) -> float | None:

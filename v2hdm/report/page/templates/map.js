@@ -48,10 +48,10 @@
   const layers = {};
   const small = { noClip: true, smoothFactor: 0 }; // four corners gain nothing by clipping and simplifying
   const still = (renderer) => ({ renderer, interactive: false, smoothFactor: 0.3 });
-  if (data.mosaic) {
-    const [west, south, east, north] = data.mosaic.bounds;
-    layers.mosaic = L.imageOverlay(`data:${data.mosaic.type};base64,${data.mosaic.src}`, [[south, west], [north, east]],
-      { pane: "tilePane", interactive: false });
+  for (const [zIndex, name] of ["background", "mosaic"].entries()) {
+    if (!data[name]) continue;
+    const { type, src, bounds: [west, south, east, north] } = data[name];
+    layers[name] = L.imageOverlay(`data:${type};base64,${src}`, [[south, west], [north, east]], { pane: "tilePane", interactive: false, zIndex: zIndex + 1 });
   }
   if (data.truth) {
     layers.truth = L.featureGroup([
@@ -77,6 +77,14 @@
     feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
   layers.checks = L.featureGroup(data.checks.map((one, n) =>
     feature(L.circleMarker(at(one.p), { radius: 6 }), { ...one, key: `c${n}`, what: "check" })));
+  const FATES = { moved: "blue", vanished: "vermillion", new: "green" };
+  const changed = new Map(data.changes.map((one) => [one.id, one]));
+  // What is still there answers as its marking does; what is gone answers for itself.
+  layers.changes = L.featureGroup(data.changes.flatMap(({ before, ...one }) => {
+    const dashed = { fate: one.fate, dashArray: "5 4" };
+    if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...small, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
+    return [[before, dashed], [one.p, { fate: one.fate }]].map(([corners, look]) => L.polygon(corners.map(at), { ...still(above), ...small, ...look, fill: false }));
+  }));
   layers.ellipses = L.layerGroup();
   layers.arrows = L.layerGroup();
   const selection = L.layerGroup().addTo(map);
@@ -113,6 +121,7 @@
     layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
     layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
     layers.checks.setStyle({ color: ink, weight: 2, fillColor: colour("orange"), fillOpacity: 0.9 });
+    layers.changes.eachLayer((shape) => shape.setStyle({ color: colour(FATES[shape.options.fate]), weight: 2.5, fillOpacity: 0 }));
     layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
     legend();
     detail();
@@ -167,9 +176,9 @@
   // ---- the panel ----
   const NAMES = {
     markings: "markings and symbols", lanes: "lane lines", truth: "truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
-    recorded: "route, recorded", excluded: "left out", arrows: "residual arrows", mosaic: "ground mosaic",
+    recorded: "route, recorded", excluded: "left out", changes: "changes", arrows: "residual arrows", mosaic: "ground mosaic", background: "background picture",
   };
-  const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "ellipses", "mosaic"];
+  const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
   const swatch = (stroke, dashes, shape = "line") => {
     const made = element("svg", { viewBox: "0 0 26 14", "aria-hidden": "true" });
     const look = { style: `stroke:${stroke};stroke-width:2;fill:none`, ...(dashes ? { "stroke-dasharray": dashes } : {}) };
@@ -182,9 +191,9 @@
   const SWATCHES = {
     markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
     adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
-    arrows: ["var(--purple)", null, "arrow"], mosaic: ["var(--line)"],
+    arrows: ["var(--purple)", null, "arrow"], changes: ["var(--vermillion)", "5 4"], mosaic: ["var(--line)"], background: ["var(--line)"],
   };
-  const COUNTS = { markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
+  const COUNTS = { changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
   for (const name of Object.keys(NAMES)) {
     const empty = !layers[name] || (name === "arrows" && !data.markings.some((one) => one.a)) || COUNTS[name] === 0;
     if (empty) continue;
@@ -225,12 +234,15 @@
   }
 
   // ---- pointing and selecting ----
-  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Left out: ${words(about.k)}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
+  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Left out: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
   function facts(about) {
     if (about.what === "check") return checked(about);
     const rows = [];
     if (about.what === "excluded") rows.push(["reason", about.why]);
-    rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
+    const change = about.what === "marking" ? changed.get(about.id) : about.fate && about;
+    if (change?.shift_m) rows.push(["moved by", `${cm(Math.hypot(...change.shift_m))} \u00b1 ${cm(Math.hypot(...change.shift_sigma_m) / Math.SQRT2)}`]);
+    if (change) rows.push([change.fate, `with probability ${number(change.probability, 3)}; seen in ${change.n} of ${change.views} images`]);
+    if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
     if (Number.isFinite(about.r)) rows.push(["95 %, relative", cm(about.r)]);
     if (Number.isFinite(worst(about))) rows.push(["95 %, absolute", cm(worst(about))]);
     if (Number.isFinite(about.t)) rows.push(["off the truth", `${cm(about.t)} RMS`]);
@@ -249,7 +261,7 @@
     if (about.c) about.c.forEach(([x, y], n) => box.append(`${n + 1}: ${number(x, 3)} E, ${number(y, 3)} N`, element("br")));
     return box;
   }
-  for (const name of ["markings", "excluded", "checks"]) {
+  for (const name of ["markings", "excluded", "checks", "changes"]) {
     layers[name].bindTooltip(tooltip, { sticky: true, direction: "auto", opacity: 1 });
     layers[name].on("click", (event) => select(event.layer));
   }
@@ -275,7 +287,7 @@
       selection.addLayer(L.polygon(about.c.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
       about.c.forEach((corner, n) => selection.addLayer(L.tooltip({ permanent: true, direction: "center", className: "corner", interactive: false }).setLatLng(at(corner)).setContent(String(n + 1))));
       text.append(corners(about));
-    } else if (about.what === "symbol") selection.addLayer(L.polygon(about.p.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
+    } else if (["symbol", "change"].includes(about.what)) selection.addLayer(L.polygon(about.p.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
     else selection.addLayer(L.circleMarker(at(about.p), { ...still(above), radius: 9, color: colour("ink"), weight: 3, fill: false }));
     const shots = element("div", { class: "shots" }, ...picturesOf(about.key).map(shot));
     const side = element("div");
