@@ -21,7 +21,6 @@ from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import LOSSES, POSE_STATES, CameraPrior
 from v2hdm.adjust.reduced import ReducedSystem
 from v2hdm.adjust.whitening import factorise
-from v2hdm.geometry import tensors as transform
 
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
 MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)]
@@ -70,7 +69,7 @@ def estimate_of(engine, problem, generator, size=0.01, behind=True):
     corners[5] -= 100.0 if behind else 0.0
     arrays = engine.arrays
     state, clock = draw(arrays.state_information_root), draw(arrays.no_clock())
-    cameras = transform.exp(draw(torch.zeros(arrays.camera_count, 6))) @ cameras
+    cameras = model.rigid(draw(torch.zeros(arrays.camera_count, 6))).detach() @ cameras
     return Estimate(cameras, state, corners, clock)
 
 

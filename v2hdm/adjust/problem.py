@@ -26,7 +26,7 @@ the camera's *centre in the vehicle frame*, which a survey measures, and not on 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -226,6 +226,22 @@ class Problem:
     lengths: KnownLengths | None = None
     camera_prior: CameraPrior | None = None
     visit: IntArray | None = None
+
+    def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
+        """With the cameras and frames of some ``observations`` alone, and which of its own these are.
+
+        What is known of corners is left out: they are those of the observations.
+        """
+        cameras, camera = np.unique(observations.camera, return_inverse=True)
+        frames, frame = np.unique(observations.frame, return_inverse=True)
+        of_cameras = "intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s"
+        of_frames = "map_from_vehicle", "twist_vehicle", "visit"
+        rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
+        own = {name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None}
+        seen = replace(observations, camera=camera, frame=frame)
+        own |= {"corners_start": None, "control": None, "lengths": None, "camera_prior": None}
+        count = int(observations.corner.max(initial=-1)) + 1
+        return replace(self, observations=seen, corner_count=count, **own), cameras, frames
 
     @property
     def visit_of_frame(self) -> IntArray:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.geodetic import geodetic_from_enu, utm_from_geodetic
+from v2hdm.geometry.geodetic import Grid, geodetic_from_enu, utm_of
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -174,8 +174,9 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
     places += [] if route is None else [route.map_from_vehicle[:, :2, 3]]
     low, high = (of(np.concatenate([*places, np.zeros((1, 2))]), axis=0) for of in (np.min, np.max))
     x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(low - 50.0, high + 50.0, 7).T))
-    earth = geodetic_from_enu(hd_map.origin, np.column_stack([x, y, np.zeros_like(x)]))
-    code, grid = utm_from_geodetic(hd_map.origin, earth)
+    places_map, code = np.column_stack([x, y, np.zeros_like(x)]), utm_of(hd_map.origin)
+    earth = geodetic_from_enu(hd_map.origin, places_map)
+    grid = Grid(code, hd_map.origin).positions(places_map)[:, :2]
     scale = float(np.abs([x, y]).max())
     terms = np.column_stack([(x / scale) ** a * (y / scale) ** b for a in range(4) for b in range(4 - a)])
     return [
