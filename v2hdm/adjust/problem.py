@@ -51,7 +51,6 @@ READ_OUT_SIGMA_S = 0.03
 phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
-SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
 ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
 
 
@@ -274,12 +273,10 @@ class SolveOptions:
         loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
         loss_scale: residual, in standard deviations, from which the loss departs from least squares.
         gate_probability: share of sound observations that the verdict on outliers may cost.
-        solver: ``lbfgs``, or ``lm`` (Schur-complement Levenberg-Marquardt) to cross-check.
         coarse: where the start is far off, or the problem large, first solve a subset of steep rays, which
             converges from ten degrees away.
         gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
-        max_refreshes: how often the problem is whitened anew at most; ``lm`` does so at each step, and is
-            limited by its evaluations alone.
+        max_refreshes: how often the problem is whitened anew at most.
         max_evaluations: of cost and gradient, over all refreshes.
         engine: who evaluates and linearises, of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU,
             ``torch`` by autograd anywhere; ``auto`` is numba on the CPU, torch elsewhere.
@@ -292,7 +289,6 @@ class SolveOptions:
     loss: str = "cauchy"
     loss_scale: float = 2.0
     gate_probability: float = 1e-4
-    solver: str = "lbfgs"
     coarse: bool = True
     gap_tolerance: float = 1e-11
     max_refreshes: int = 20

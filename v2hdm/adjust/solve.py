@@ -63,7 +63,6 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
         engine,
         start,
         robust,
-        options.solver,
         options.gap_tolerance,
         options.max_refreshes,
         options.max_evaluations,
