@@ -285,7 +285,7 @@ def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
         passed = ahead[np.argmin((offset**2).sum(axis=2), axis=1)]
         if (passed * np.gradient(lane.points_map, axis=0)).sum() < 0:
             by_vertex = {name: getattr(lane, name) for name in _BY_VERTEX}
-            turned = {name: None if one is None else one[::-1] for name, one in by_vertex.items()}
+            turned: dict[str, Any] = {name: one[::-1] for name, one in by_vertex.items() if one is not None}
             lane = replace(lane, **turned)
         lanes.append(lane)
     return replace(hd_map, lanes=tuple(lanes))
