@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.cli.main import Command, answer_signals
@@ -30,8 +29,6 @@ def _export() -> int:
 def _run(job: Job) -> None:
     from export.console import export
 
-    output = Path(job.settings.output)
-    job.settings.output = str(Path(job.folder(str(output.parent))) / output.name)
     export(job.settings)
 
 

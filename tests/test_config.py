@@ -1,4 +1,4 @@
-"""Every shipped run composes, every key is explained, a typo is one line, a sweep does all its jobs."""
+"""Every shipped run composes, every key is explained, a typo is one line."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +10,8 @@ from omegaconf import OmegaConf
 from export.config import ExportConfig
 from train.config import TrainConfig
 from v2hdm.cli import compose as config
-from v2hdm.cli.compose import work_on
 from v2hdm.cli.keys_help import help_text, keys_of
-from v2hdm.cli.main import Command, run
+from v2hdm.cli.main import run
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.config import RunConfig
 
@@ -103,35 +102,3 @@ def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped()
     assert "Shipped runs: kitti, port1, port2" in page
     assert all(key.name in page for key in keys_of(RunConfig))
     assert max(map(len, page.splitlines())) <= 110
-
-
-COMMAND = Command("export", "Exports.")
-
-
-def sweep(folder):
-    return ["--multirun", "checkpoint=a", "opset=18,19", f"output={folder / 'net.onnx'}"]
-
-
-def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(tmp_path):
-    def work(job):
-        folder = Path(job.folder(str(tmp_path)))
-        folder.mkdir()
-        (folder / "opset").write_text(str(job.settings.opset))
-        return 3 if job.settings.opset == 19 else 0
-
-    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path), "") == 3
-    written = {path.parent.name: path.read_text() for path in tmp_path.glob("*/opset")}
-    assert written == {"0-opset=18": "18", "1-opset=19": "19"}
-
-
-def test_a_job_that_fails_names_itself_and_the_others_go_on(tmp_path, capsys):
-    done: list[int] = []
-
-    def work(job):
-        if job.settings.opset == 18:
-            raise ConfigError("not this one")
-        done.append(job.settings.opset)
-
-    assert work_on(COMMAND, "export", ExportConfig, work, sweep(tmp_path), "") == 2
-    assert done == [19]
-    assert "error: job 0-opset=18: not this one" in capsys.readouterr().err.splitlines()

@@ -30,7 +30,6 @@ def _train() -> int:
 def _run(job: Job) -> None:
     from train.console import train
 
-    job.settings.output = job.folder(job.settings.output)
     train(job.settings)
 
 

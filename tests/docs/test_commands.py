@@ -161,9 +161,6 @@ def test_what_is_not_run_names_commands_and_settings_that_are_there(block, shell
         name = module.removeprefix("v2hdm.").removeprefix("cli.")
         if name in COMPOSED:
             own = ROOT / "docs" / "own-class"
-            if "--multirun" in arguments:  # one configuration is composed: the first of a sweep
-                arguments.remove("--multirun")
-                arguments = [re.sub(r"=([^\[{,]+),.*", r"=\1", one) for one in arguments]
             arguments = [one.replace("docs/own-class", str(own)) for one in arguments]
             assert shell(shlex.join([*program_of(module), *arguments, "--cfg=job"]), tmp_path)
         else:

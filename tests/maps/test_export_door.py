@@ -21,7 +21,7 @@ from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration,
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
-from v2hdm.io.maps.reading import read_geojson, read_verdict
+from v2hdm.io.maps.reading import read_geojson, read_map, read_verdict
 from v2hdm.records import Calibration
 
 VERDICT = {"status": "PASS"}
@@ -85,6 +85,24 @@ def test_an_export_replaces_what_it_has_written_itself_and_nothing_else(folder, 
     (folder / "map_lanelet2").rename(folder / "elsewhere")
     (folder / "map_lanelet2").symlink_to("elsewhere")
     _refused(folder, "elsewhere/map_projector_info.yaml", capsys)
+
+
+@pytest.mark.parametrize("source", ["map.geojson", "map.gpkg"])
+def test_a_project_opens_the_geopackage_that_is_there_and_replaces_no_other(folder, source, capsys):
+    data = (folder / "map.gpkg").read_bytes()
+    assert run(["export", source, "--format", "qgis"]) == 0
+    assert capsys.readouterr().out.split() == ["map.qgs"]
+    assert (folder / "map.gpkg").read_bytes() == data
+    if source == "map.geojson":
+        write_geopackage(replace(street(), symbols=(), lanes=()), folder / "map.gpkg")
+        _refused(folder, "map.gpkg", capsys, ("export", source, "--format", "qgis"))
+
+
+def test_a_geopackage_of_an_earlier_export_is_made_anew_for_a_project(folder):
+    for there in (replace(street(), lanes=()), street()):
+        write_geojson(there, folder / "map.geojson")
+        assert run(["export", "map.geojson", "--format", "qgis", "--output", "there"]) == 0
+        assert len(read_map(folder / "there" / "map.gpkg")[0].lanes) == len(there.lanes)
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,9 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
-from v2hdm.pipeline.result import write_trajectories
+from v2hdm.pipeline.result import _along_route, write_trajectories
 from v2hdm.pipeline.run import run
-from v2hdm.records import Drive, Trajectory
+from v2hdm.records import Drive, HdMap, Image, Lane, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.verdict import Status
 
@@ -245,3 +245,14 @@ def test_poses_that_were_laid_flat_are_written_at_their_recorded_height(tmp_path
     assert header == "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
     assert first == "10.000000000,1,0.01,0.02,0.003,0.0001,0.0002,0.0003"
     assert second.split(",")[1] == "0"
+
+
+def test_a_lane_that_is_turned_to_the_route_takes_the_sigmas_of_its_vertices_along():
+    rising = np.arange(3.0)
+    lane = Lane("lane_line", np.column_stack([-rising, rising]), 3, rising, 1, rising + 1, rising + 2)
+    drive = Drive("east", Path(), {}, [Image("front", 0.0, Path("0.png"), np.eye(4))])
+    (turned,) = _along_route(HdMap((), (lane,)), drive).lanes
+    assert turned.points_map[:, 0].tolist() == [-2, -1, 0]
+    assert turned.heights_m.tolist() == [2, 1, 0]
+    assert turned.sigma_m.tolist() == [3, 2, 1]
+    assert turned.heights_sigma_m.tolist() == [4, 3, 2]

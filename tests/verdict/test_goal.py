@@ -126,7 +126,7 @@ def test_the_terminal_ends_with_how_good_the_map_is(monkeypatch, capsys):
     verdict = judged(mapped([marking(n, shared_m=0.05) for n in range(30)]))
     result = RunResult(Path("out"), {"results": {}}, (), verdict)
     monkeypatch.setattr("v2hdm.pipeline.run.run", lambda *_: result)
-    assert _map(Job(RunConfig(name="yard"), "", None)) == 0
+    assert _map(Job(RunConfig(name="yard"), "")) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     assert [line.split(":")[0] for line in lines] == ["WARN coarse (map)", "results in out", "verdict"]
     assert "95 % of the corners of 30 markings within 12 cm" in lines[-1]

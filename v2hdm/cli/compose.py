@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import itertools
 import re
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -44,24 +41,11 @@ def register(name: str, schema: type[Any]) -> None:
     ConfigStore.instance().store(name=f"{name}_schema", node=schema)
 
 
-@dataclass(frozen=True)
-class Job:
-    """One configuration to work on: ``settings``, and the same as text with all references resolved.
-
-    ``label`` is, of a sweep (``--multirun``), the job's number and what it sets, as part of a file's name.
-    """
+class Job(NamedTuple):
+    """One configuration to work on: ``settings``, and the same as text with all references resolved."""
 
     settings: Any
     yaml: str
-    label: str | None
-
-    def folder(self, output: str) -> str:
-        """The folder ``output``, of a sweep one within it for this job; raises ConfigError for a URL then."""
-        if self.label is None:
-            return output
-        if "://" in output:
-            raise ConfigError(f"output={output}: a sweep writes to folders of this machine; give one")
-        return str(Path(output) / self.label)
 
 
 def work_on(
@@ -74,15 +58,13 @@ def work_on(
 ) -> int:
     """Compose ``conf/<name>.yaml`` with the command line and work on it; returns the exit code.
 
-    Nothing is done after ``--help``. A sweep (``--multirun``) works on each of its configurations in turn and
-    ends with the code of the first that failed; a job that fails is one line, as the command's own failure.
-    ``advice`` is on values that are missing. Raises ConfigError where a key or value is wrong.
+    Nothing is done after ``--help``. ``advice`` is on values that are missing. Raises ConfigError where a key
+    or value is wrong.
     """
     parser = argparse.ArgumentParser(command.name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
     parser.add_argument("--help", "-h", action="store_true")
     parser.add_argument("--config-dir", "-cd", type=Path, action="append", default=[])
-    parser.add_argument("--multirun", "-m", action="store_true")
     parser.add_argument("--cfg", "-c", choices=["job"])
     parsed = parser.parse_intermixed_args(arguments)
     if parsed.help:
@@ -91,44 +73,16 @@ def work_on(
         print(help_text(command.name, command.says, schema, conf_dir()))
         return 0
     try:
-        swept = _sweep(parsed.overrides) if parsed.multirun else [parsed.overrides]
         _check_own_files(parsed.config_dir, parsed.overrides)
-        composed = [_compose(name, schema, one, parsed.config_dir) for one in swept]
+        composed = _compose(name, schema, parsed.overrides, parsed.config_dir)
     except V2hdmError:
         raise
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
         raise explain(error, schema, parsed.overrides) from error
     if parsed.cfg:
-        print("\n".join(OmegaConf.to_yaml(one) for one in composed))
+        print(OmegaConf.to_yaml(composed))
         return 0
-    if not parsed.multirun:
-        return work(Job(to_dataclass(composed[0], schema, advice), to_yaml(composed[0]), None)) or 0
-    codes = []
-    for number, (one, overrides) in enumerate(zip(composed, swept, strict=True)):
-        chosen = ",".join(override for override in overrides if override not in parsed.overrides)
-        label = re.sub(r"[^\w.=,+-]+", "_", f"{number}-{chosen}")[:_LABEL_LETTERS].rstrip("-.")
-
-        def labelled(one: DictConfig = one, label: str = label) -> int | None:
-            try:
-                return work(Job(to_dataclass(one, schema, advice), to_yaml(one), label))
-            except V2hdmError as error:
-                raise type(error)(f"job {label}: {error}") from error
-
-        codes.append(command.guard(labelled))
-    return next((code for code in codes if code), 0)
-
-
-_LABEL_LETTERS = 100
-
-
-def _sweep(overrides: Sequence[str]) -> list[list[str]]:
-    """The overrides of each job: every combination of the values of those that have several."""
-    choices = []
-    for one in OverridesParser.create().parse_overrides(list(overrides)):
-        is_swept, key = one.is_sweep_override() and one.is_discrete_sweep(), one.get_key_element()
-        several = one.sweep_string_iterator() if is_swept else ()
-        choices.append([f"{key}={value}" for value in several] or [str(one.input_line)])
-    return [list(each) for each in itertools.product(*choices)]
+    return work(Job(to_dataclass(composed, schema, advice), to_yaml(composed))) or 0
 
 
 def _compose(
@@ -176,12 +130,11 @@ def _check_own_files(folders: Sequence[Path], overrides: Sequence[str]) -> None:
     for folder in folders:
         if not folder.is_dir():
             raise ConfigError(f"--config-dir {folder}: no such folder")
-        for group, _, names in (one.lstrip("+").partition("=") for one in overrides):
-            for path in (folder / group / f"{one}.yaml" for one in names.split(",")):
-                if path.is_file():
-                    read_yaml(path, ConfigError)
-                    if group == "run":
-                        _refuse_headless(path)
+        for group, _, chosen in (one.lstrip("+").partition("=") for one in overrides):
+            if (path := folder / group / f"{chosen}.yaml").is_file():
+                read_yaml(path, ConfigError)
+                if group == "run":
+                    _refuse_headless(path)
 
 
 def _refuse_headless(path: Path) -> None:
@@ -233,7 +186,7 @@ _FEW_OVERRIDES = 3
 
 _NOISE = re.compile(
     r"(\^$|full_key|To append to your config|reference_type|object_type|Config search path|provider="
-    r"|Set the environment variable|See https?:)"
+    r"|Set the environment variable|See https?:|\d\. To sweep over)"
 )
 
 _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous input|Unknown function")

@@ -26,5 +26,4 @@ def run(arguments: Sequence[str]) -> int:
 def _compare(job: Job) -> None:
     from v2hdm.experiment.run import experiment_on_terminal
 
-    job.settings.output = job.folder(job.settings.output)
     experiment_on_terminal(job.settings, job.yaml)

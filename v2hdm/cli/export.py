@@ -70,6 +70,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
         GROUND_FORMATS,
         check_crs,
         check_formats,
+        holds,
         with_data,
         write_map,
     )
@@ -81,15 +82,19 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
             f"'export=[geojson,{ground[0]}]'"
         )
     check_formats(parsed.format, "--format")
-    name = parsed.source.stem
-    files = [folder / FORMATS[one].file.format(name=name) for one in with_data(parsed.format)]
+    name, chosen = parsed.source.stem, with_data(parsed.format)
+    hd_map, verdict = read_map(parsed.source)
+    grid = check_crs(parsed.crs, chosen, hd_map.origin, "--crs").get("gpkg")
+    # A project takes the GeoPackage that is there, whoever wrote it, where it is of this map.
+    there = folder / FORMATS["gpkg"].file.format(name=name)
+    has_data = "gpkg" not in parsed.format and holds(there, hd_map, None if grid is None else grid.crs)
+    kept = ["gpkg"] if has_data else []
+    files = [folder / FORMATS[one].file.format(name=name) for one in chosen if one not in kept]
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be written over: set another --output or --format")
-    hd_map, verdict = read_map(parsed.source)
-    check_crs(parsed.crs, parsed.format, hd_map.origin, "--crs")
     for file in files:
         check(file)
-    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs)
+    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept)
 
 
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:

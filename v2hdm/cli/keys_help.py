@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 _USAGE = """\
-Usage: {command} [key=value ...] [--config-dir FOLDER] [--multirun]
+Usage: {command} [key=value ...] [--config-dir FOLDER]
 
   +run=NAME           a run: what conf/run/NAME.yaml or FOLDER/run/NAME.yaml sets
   key=value           sets a key; null is nothing, lists are [1.0, 2.0], texts with blanks want quotes
   +key.name=value     adds an entry to a key that is a mapping
   --config-dir FOLDER adds a folder of your own; its runs lie in FOLDER/run and begin with
                       '# @package _global_'
-  --multirun          one job for each of several values: key=1,2,3; each has its own folder of results
   --cfg job           only prints the configuration
 """
 _OFTEN = {

@@ -36,7 +36,6 @@ def _map(job: Job) -> int:
     from v2hdm.viewer import RerunViewer, check_viewer
 
     config, console = job.settings, Console(file=patient(sys.stdout))
-    config.output = job.folder(config.output)
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
     with logging_to(handler), progress_bars(console) as progress:

@@ -270,6 +270,9 @@ def _route(drive: Drive) -> FloatArray:
     return np.insert(places, ends, np.nan, axis=0)
 
 
+_BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")
+
+
 def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
     """The map with every lane line in the direction in which the drive passed it: that of its lanelets."""
     route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
@@ -279,8 +282,9 @@ def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
         offset = lane.points_map[:, None] - route_map
         passed = ahead[np.argmin((offset**2).sum(axis=2), axis=1)]
         if (passed * np.gradient(lane.points_map, axis=0)).sum() < 0:
-            heights = None if lane.heights_m is None else lane.heights_m[::-1]
-            lane = replace(lane, points_map=lane.points_map[::-1], heights_m=heights)
+            by_vertex = {name: getattr(lane, name) for name in _BY_VERTEX}
+            turned: dict[str, Any] = {name: one[::-1] for name, one in by_vertex.items() if one is not None}
+            lane = replace(lane, **turned)
         lanes.append(lane)
     return replace(hd_map, lanes=tuple(lanes))
 

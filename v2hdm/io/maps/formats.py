@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
@@ -28,9 +28,10 @@ from v2hdm.io.maps.landxml import write_landxml
 from v2hdm.io.maps.lanelet2 import write_lanelet2
 from v2hdm.io.maps.opendrive import write_opendrive
 from v2hdm.io.maps.qgis import write_qgis
-from v2hdm.io.maps.reading import Verdict
+from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
 from v2hdm.records import GeodeticOrigin, HdMap
 from v2hdm.store.files import replace_csv, whole_file
+from v2hdm.store.inputs import protected_inputs
 
 _log = logging.getLogger(__name__)
 
@@ -170,6 +171,18 @@ def check_formats(names: Sequence[str], key: str) -> None:
             need(package, "gis", f"the format {name}", ConfigError)
 
 
+def holds(path: Path, hd_map: HdMap, crs: str | None) -> bool:
+    """Whether the GeoPackage at ``path`` holds just this map's features, in the system ``crs``."""
+    try:
+        with protected_inputs():  # where it holds others, it may be written anew
+            there, stated = read_geopackage(path), stated_in(path, "crs")
+    except (V2hdmError, OSError):
+        return False
+    mine, its = ([properties_of(one) for one in features_of(whole)] for whole in (hd_map, there))
+    same = sorted(mine, key=lambda one: one["id"]) == sorted(its, key=lambda one: one["id"])
+    return same and there.origin == hd_map.origin and stated == crs
+
+
 def with_data(formats: Sequence[str]) -> list[str]:
     """``formats``, each once, with the GeoPackage that a project of QGIS opens."""
     return list(dict.fromkeys(["gpkg", *formats] if "qgis" in formats else formats))
@@ -194,18 +207,19 @@ def write_map(
     verdict: Verdict = None,
     projector: str | None = None,
     crs: str | None = None,
+    kept: Sequence[str] = (),
 ) -> list[Path]:
     """Write a map in several of :data:`FORMATS` to ``folder``; returns the files, each written atomically.
 
     ``name`` is that of the files, ``verdict`` that on the run which made the map, as JSON, ``projector`` that
     of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`, and ``crs`` the system of the other formats' coordinates
-    in place of their own. Raises ConfigError when a format is not known or lacks its package, or when the
-    projector or the system does not suit the map.
+    in place of their own; files of the formats ``kept`` are there already. Raises ConfigError when a format
+    is not known or lacks its package, or when the projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
     grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
     written = []
-    for chosen in with_data(formats):
+    for chosen in [one for one in with_data(formats) if one not in kept]:
         path = folder / _ALL[chosen].file.format(name=name)
         if chosen in GROUND_FORMATS and not hd_map.ground:
             _log.warning(

@@ -101,7 +101,7 @@ def read_geojson(path: Path) -> HdMap:
 def read_verdict(path: Path) -> Verdict:
     """The verdict beside a map, None where there is none; errors as :func:`read_map`."""
     if path.suffix.lower() == ".gpkg":
-        verdict = _about(path, "verdict")
+        verdict = stated_in(path, "verdict")
     else:
         about = load_json(path, MapFileError).get("v2hdm")
         verdict = about.get("verdict") if isinstance(about, dict) else None
@@ -110,9 +110,9 @@ def read_verdict(path: Path) -> Verdict:
 
 def read_geopackage(path: Path) -> HdMap:
     """Read our own GeoPackage, which others may have edited, as :func:`read_geojson` does."""
-    origin = take_origin(_about(path, "origin"), f"{path}: origin", MapFileError)
+    origin = take_origin(stated_in(path, "origin"), f"{path}: origin", MapFileError)
     rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else np.array(_BINARY_ROUNDING)
-    reader = _Reader(path, origin, rounding, _about(path, "crs"))
+    reader = _Reader(path, origin, rounding, stated_in(path, "crs"))
     for key, layer in LAYERS.items():
         for number, properties in enumerate(_layer(path, layer)):
             where = f"{path}: {layer}, row {number + 1}"
@@ -317,7 +317,7 @@ def _of_wkb(blob: object, where: str) -> Geometry | None:
     return Geometry(read[:-1] if closed else read, closed)
 
 
-def _about(path: Path, key: str) -> object:
+def stated_in(path: Path, key: str) -> object:
     """The entry ``key`` of a GeoPackage's table about the map."""
     rows = _layer(path, "v2hdm")
     return _json(rows[0].get(key), f"{path}: {key}") if rows else None
