@@ -1,6 +1,6 @@
 """What a class has in common, and how often a place was seen, say what lies there and where."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -261,24 +261,12 @@ def test_what_one_image_shows_as_an_arrow_stays_a_marking():
     assert of_one_class(solved(painted([DIAMOND] * 40, rng), rng), counts).log_odds[7] > 5
 
 
-@dataclass(frozen=True)
-class Told:
-    """Counts that are known beforehand, in the place of images."""
-
-    kind: np.ndarray
-    known: Counts
-
-    def names(self):
-        return ("diamond",) * len(self.kind)
-
-    def counts(self, corners_map):
-        return self.known
-
-
 def verdict(candidates, counts=None):
-    told = Told(np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates)))
+    kind, counts = np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates))
     on_ground = Parallax(np.ones((len(candidates), 1)), np.full((len(candidates), 1, 1), 1e-4))
-    return classify(candidates, told, on_ground, AcceptanceOptions())
+    return classify(
+        candidates, kind, ("diamond",), lambda corners_map: counts, on_ground, AcceptanceOptions()
+    )
 
 
 def test_reasons_name_what_has_won():

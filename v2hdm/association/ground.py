@@ -54,11 +54,6 @@ class Located:
         """Horizontal distance (S, 4) of each corner from its camera."""
         return np.asarray(np.linalg.norm(self.ray_map, axis=-1))
 
-    @property
-    def sine_depression(self) -> FloatArray:
-        """Sine (S, 4) of the angle by which each corner's ray points below the horizon."""
-        return np.asarray(self.height_m[:, None] / np.hypot(self.range_m, self.height_m[:, None]))
-
     def direction_covariance_m2(self, sigma_rad: float) -> FloatArray:
         """The part (S, 4, 2, 2) of ``covariance_m2`` due to an uncertain viewing direction."""
         return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)

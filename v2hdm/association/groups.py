@@ -313,11 +313,10 @@ def squared_distances(
     """Squared distances (P, 4), in sigmas, of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
     camera = sightings.camera[row]
     # By the pose at which the row of each seen corner was read, where shutters roll.
-    rows = sightings.row_share[row] if rig.read_out_s is not None else np.zeros((len(row), 1))
-    cam_from_map = rig.cam_from_map(camera[:, None], sightings.frame[row][:, None], rows)
+    seen = camera[:, None], sightings.frame[row][:, None], sightings.row_share[row]
+    cam_from_map = rig.cam_from_map(*np.broadcast_arrays(*seen))
     expected, depth_m = project_ground(rig.intrinsic[camera][:, None], cam_from_map, corners_map[:, None])
-    own = SHIFTS if rig.read_out_s is not None else np.zeros_like(SHIFTS)
-    expected, depth_m = expected[:, own, np.arange(4)], depth_m[:, own, np.arange(4)]
+    expected, depth_m = expected[:, SHIFTS, np.arange(4)], depth_m[:, SHIFTS, np.arange(4)]
     jitter_px = rig.intrinsic[camera, 0, 0] * jitter_rad
     noise = sightings.covariance_px[row] + jitter_px[:, None, None, None] ** 2 * np.eye(2)
     used = located.informs[row]

@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.sparse import csr_array, diags_array, hstack
@@ -201,11 +202,10 @@ def _hinges(left_m: FloatArray) -> FloatArray:
 
 def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntArray, FloatArray]:
     """The four of ``count`` uniform cubic B-splines (K, 4) that places (K,) lie in, with their values."""
-    place = np.clip((at - first) / step, 0.0, count - 3 - 1e-9)
-    begin = np.floor(place).astype(np.int64)
-    u = place - begin
-    own = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-    return begin[:, None] + np.arange(4), np.column_stack(own) / 6
+    within = np.clip(at, first, first + (count - 3 - 1e-9) * step)
+    knots = first + step * np.arange(-3.0, count + 1)
+    design = BSpline.design_matrix(within, knots, 3)
+    return design.indices.reshape(-1, 4).astype(np.int64), design.data.reshape(-1, 4)
 
 
 @dataclass(frozen=True)

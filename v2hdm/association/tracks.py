@@ -16,6 +16,7 @@ from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.geometry.ipm import ray_covariance
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
@@ -121,7 +122,11 @@ class _Linker:
         corners = np.stack([track.corners_map for track in tracks])
         valid = np.stack([track.valid for track in tracks])
         size_m = diameters(corners, valid)
-        t, d = self._near(last, mean_corners(corners, valid), size_m, rows)
+        # Pairs of one class that are no farther apart than their sizes.
+        apart_m = np.linalg.norm(mean_corners(corners, valid)[:, None] - self._centre_map[rows], axis=-1)
+        reach_m = self._options.max_gate_m + size_m[:, None] + self._size_m[rows]
+        alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
+        t, d = np.argwhere(alike & (apart_m <= reach_m)).T
         own = rows[d]
         found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
         covariance = self._noise_m2[last[t]] + self._noise_m2[own] + self._drift_covariance(last[t], own)
@@ -137,16 +142,6 @@ class _Linker:
         picked = zip(*linear_sum_assignment(costs), strict=True)
         return {int(rows[d]): (tracks[t], int(shift[t, d])) for t, d in picked if costs[t, d] < _REFUSED}
 
-    def _near(
-        self, last: IntArray, centre_map: FloatArray, size_m: FloatArray, rows: IntArray
-    ) -> tuple[IntArray, IntArray]:
-        """Pairs of tracks and ``rows``, by index, of one class and no farther apart than their sizes."""
-        apart_m = np.linalg.norm(centre_map[:, None] - self._centre_map[rows], axis=-1)
-        reach_m = self._options.max_gate_m + size_m[:, None] + self._size_m[rows]
-        alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
-        pair = np.argwhere(alike & (apart_m <= reach_m))
-        return pair[:, 0], pair[:, 1]
-
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
         """The covariance that a wrong extrinsic adds between the images of two sightings (P, 2, 2).
 
@@ -160,7 +155,7 @@ class _Linker:
         direction = self._direction_rad
         along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
         across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
-        return _ray_covariance(self._ray_map[rows], along_m, across_m)
+        return ray_covariance(self._ray_map[rows], along_m, across_m)
 
 
 def _noise_covariances(located: Located, ray: FloatArray, noise: PoseNoise) -> FloatArray:
@@ -171,15 +166,6 @@ def _noise_covariances(located: Located, ray: FloatArray, noise: PoseNoise) -> F
     pixels = np.sum(
         np.where(located.valid[..., None, None], located.covariance_m2, 0.0) * weight[..., None, None], axis=1
     )
-    spread = _ray_covariance(ray, jitter_m, noise.roll_pitch_rad * range_m)
+    spread = ray_covariance(ray, jitter_m, noise.roll_pitch_rad * range_m)
     position_m2 = noise.position_m**2 + _POSITION_FLOOR_M**2
     return np.asarray(pixels + spread + position_m2 * np.eye(2))
-
-
-def _ray_covariance(ray: FloatArray, along_m: FloatArray, across_m: FloatArray) -> FloatArray:
-    """Covariances (..., 2, 2) with the given sigmas along and across ``ray`` (..., 2)."""
-    along = ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
-    outer = along[..., :, None] * along[..., None, :]
-    return np.asarray(
-        along_m[..., None, None] ** 2 * outer + across_m[..., None, None] ** 2 * (np.eye(2) - outer)
-    )

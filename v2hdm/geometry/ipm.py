@@ -120,14 +120,15 @@ def direction_covariance(ray_ground: FloatArray, height_m: FloatArray, sigma_rad
     the ray by (r^2 + h^2) / h * d, one of yaw across it by r * d.
     """
     range_m = np.linalg.norm(ray_ground, axis=-1)
-    along = ray_ground / np.maximum(range_m, 1e-9)[..., None]
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    sigma_along = (range_m**2 + height_m**2) / height_m * sigma_rad
-    sigma_across = range_m * sigma_rad
-    return np.asarray(
-        sigma_along[..., None, None] ** 2 * along[..., :, None] * along[..., None, :]
-        + sigma_across[..., None, None] ** 2 * across[..., :, None] * across[..., None, :]
-    )
+    return ray_covariance(ray_ground, (range_m**2 + height_m**2) / height_m * sigma_rad, range_m * sigma_rad)
+
+
+def ray_covariance(ray_ground: FloatArray, along_m: FloatArray, across_m: FloatArray) -> FloatArray:
+    """Covariances (..., 2, 2) of points with these sigmas (...) along and across rays (..., 2)."""
+    along = ray_ground / np.maximum(np.linalg.norm(ray_ground, axis=-1, keepdims=True), 1e-9)
+    outer = along[..., :, None] * along[..., None, :]
+    along_m2, across_m2 = np.square(along_m)[..., None, None], np.square(across_m)[..., None, None]
+    return np.asarray(along_m2 * outer + across_m2 * (np.eye(2) - outer))
 
 
 def _homogeneous(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:

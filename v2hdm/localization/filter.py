@@ -19,7 +19,7 @@ from v2hdm.geometry.ipm import (
 from v2hdm.geometry.least_squares import Normal, gauss_newton
 from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse, rotation_from_euler
-from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray, Marking
+from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray
 
 # Standard deviation of the acceleration that holds for a second: a yard truck brakes with 2 to 3 m/s^2.
 _ACCELERATION_M_S2 = 1.5
@@ -186,7 +186,8 @@ class Markings:
 
     def __init__(self, hd_map: HdMap) -> None:
         self._corners = np.stack([marking.corners_map for marking in hd_map.markings])
-        total = np.stack([_covariance(marking) for marking in hd_map.markings])
+        stated = [marking.covariance_m2 for marking in hd_map.markings]
+        total = np.stack([_UNKNOWN_SIGMA_M**2 * np.eye(8) if one is None else one for one in stated])
         variance = np.einsum("nii->n", total) / 8
         own = np.array([marking.relative_sigma_m or np.inf for marking in hd_map.markings]) ** 2
         share = np.minimum(own / variance, 1.0)
@@ -287,7 +288,3 @@ def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[Stat
             break
         waiting = later
     return state, matched
-
-
-def _covariance(marking: Marking) -> FloatArray:
-    return np.eye(8) * _UNKNOWN_SIGMA_M**2 if marking.covariance_m2 is None else marking.covariance_m2

@@ -121,11 +121,6 @@ class Bundle:
     knots: Knots | None = None
 
     @property
-    def markings_map(self) -> FloatArray:
-        """The corners (N, 2) of the solution that are of markings."""
-        return self.solution.corners_map[: int(self.corner_index.max(initial=-1)) + 1]
-
-    @property
     def corners_map(self) -> FloatArray:
         """Adjusted corners (G, 4, 2), nan where a corner is not part of the solution."""
         out = np.full((*self.corner_index.shape, 2), np.nan)

@@ -119,12 +119,13 @@ class IncrementalMapper:
         while not ended:
             association, ended = self._take_up_safely(tracks, usable, due)
             progress(f"linking anew with {len(self._places)} markings mapped")
-            rig = self._solve(association, usable, self._present_rig())
+            present = replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)
+            rig = self._solve(association, usable, present)
             tracks, usable = self._link(rig, False)
             self._begin(rig, len(self._places))
             due *= _LINK_GROWTH
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
-        return association, self._present_rig()
+        return association, replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)
 
     def _begin(self, rig: Rig, known: int) -> None:
         """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""
@@ -258,8 +259,16 @@ class IncrementalMapper:
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
         tolerance_m = max(self._options.association.shape_tolerance * size_m, LEAST_TOLERANCE_M)
-        best: tuple[float, int | None, int] = (self._gate_m(track), None, 0)
-        near = np.linalg.norm(self._centres - np.nanmean(corners, axis=0), axis=1) < best[0] + size_m
+        # How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic.
+        middle = np.nanmean(corners, axis=0)
+        options, frame = self._options.association, self._sightings.frame[track.rows]
+        away = middle - self._rig.map_from_vehicle[frame, :2, 3]
+        range_m = float(np.median(np.linalg.norm(away, axis=1)))
+        height_m = float(np.median(self._rig.height_m[self._sightings.camera[track.rows]]))
+        floor_m = np.hypot(self._floor_m, options.refined_sigma_rad * range_m**2 / height_m)
+        gate_m = float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
+        best: tuple[float, int | None, int] = (gate_m, None, 0)
+        near = np.linalg.norm(self._centres - middle, axis=1) < gate_m + size_m
         for marking in np.flatnonzero(near).tolist():
             place = self._places[marking]
             if place.kind != track.kind or not images.isdisjoint(place.images):
@@ -271,16 +280,3 @@ class IncrementalMapper:
             if off_m < best[0] and there.deformation_m < tolerance_m:
                 best = (off_m, marking, int(there.shift))
         return best[1], best[2]
-
-    def _gate_m(self, track: _Track) -> float:
-        """How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic."""
-        options, frame = self._options.association, self._sightings.frame[track.rows]
-        away = np.nanmean(track.corners_map, axis=0) - self._rig.map_from_vehicle[frame, :2, 3]
-        range_m = float(np.median(np.linalg.norm(away, axis=1)))
-        height_m = float(np.median(self._rig.height_m[self._sightings.camera[track.rows]]))
-        floor_m = np.hypot(self._floor_m, options.refined_sigma_rad * range_m**2 / height_m)
-        return float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
-
-    def _present_rig(self) -> Rig:
-        """The extrinsics, and the poses as they were last solved for."""
-        return replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)

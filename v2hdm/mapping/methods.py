@@ -190,9 +190,11 @@ def run_methods(
     progress("linking sightings")
     given = Inputs(drive, detections, cameras, options)
     results: dict[str, MethodResult] = {}
-    for name, ipm in _given_ipms(drive, cameras).items():
-        progress(name)
-        results[name] = run_naive(name, given, ipm)
+    for name, known_as in NAIVE_IPMS.items():
+        ipms = {one: camera_of(drive, one).ipm for one in cameras}
+        if all(known_as in ipm for ipm in ipms.values()):
+            progress(name)
+            results[name] = run_naive(name, given, {one: ipm[known_as] for one, ipm in ipms.items()})
     begin_s = time.perf_counter()
     outcome, optimised = optimise(given, progress)
     optimal = _optimised_result(outcome, optimised, begin_s)
@@ -205,16 +207,6 @@ def run_methods(
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
     results["ONI"] = replace(run_naive("ONI", outcome.inputs, ipm_found), calibrations=found)
     return results
-
-
-def _given_ipms(drive: Drive, cameras: Sequence[str]) -> dict[str, dict[str, FloatArray]]:
-    """By naive method the IPMs of the cameras, for methods whose IPM every camera has."""
-    ipms = {c: camera_of(drive, c).ipm for c in cameras}
-    return {
-        name: {c: ipm[known_as] for c, ipm in ipms.items()}
-        for name, known_as in NAIVE_IPMS.items()
-        if all(known_as in ipm for ipm in ipms.values())
-    }
 
 
 def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:

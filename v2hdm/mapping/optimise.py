@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from v2hdm.adjust import (
     predicts_better,
     select_model,
 )
-from v2hdm.association.ground import Located, Views, locate
+from v2hdm.association.ground import Located, Views, easy_views, images_with_symbol, locate
 from v2hdm.association.groups import (
     Association,
     attach,
@@ -63,8 +64,8 @@ from v2hdm.records import (
     Road,
     largest_noise,
 )
-from v2hdm.site.candidates import Candidates, Exclusion, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.markings import Support, Suspicion, classify, most_suspicious, with_relative_sigma
+from v2hdm.site.candidates import Candidates, Counts, Exclusion, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
 from v2hdm.site.parallax import PointViews, measure_parallax
 
 _log = logging.getLogger(__name__)
@@ -154,7 +155,8 @@ class Optimiser:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
         progress("coarse solve")
         located = self._locate(self.initial_rig)
-        sine = np.where(located.valid, located.sine_depression, np.nan)
+        height_m = located.height_m[:, None]
+        sine = np.where(located.valid, height_m / np.hypot(located.range_m, height_m), np.nan)
         with np.errstate(invalid="ignore"):
             steep = located.valid & (sine >= min(_STEEP_SINE, float(np.nanmedian(sine))))
         bundle = self._solve(tracks, steep, self.initial_rig, coarse=True)
@@ -192,7 +194,8 @@ class Optimiser:
             progress("lanes")
             # By turns: how well lines are seen, only their residuals say.
             for _ in range(_LANE_ROUNDS):
-                lanes = final.knots or knots, final.markings_map
+                count = int(final.corner_index.max(initial=-1)) + 1
+                lanes = final.knots or knots, final.solution.corners_map[:count]
                 final = self._solve(final.association, usable, final.rig, lanes=lanes)
         return self._conclude(final, bundle, inlier, usable)
 
@@ -205,16 +208,6 @@ class Optimiser:
         Raises:
             MappingError: no candidate is accepted.
         """
-        seen = Support(
-            kind=group_kinds(final.association, self.sightings),
-            sightings=self.sightings,
-            rig=final.rig,
-            views=self._views,
-            cameras=tuple(self._cameras.values()),
-            row=ungated.row,
-            group=ungated.group,
-            accepted=inlier,
-        )
         located = locate(self.sightings, final.rig)
         located.informs[:] &= usable
         fused = fuse_groups(final.association, located, jitter_rad=0.0)
@@ -229,7 +222,9 @@ class Optimiser:
         noise = final.model.variance_factor, final.model.pose_sigma
         corners = PointViews.of_corners(final.association, self.sightings, located, *noise)
         parallax = measure_parallax(corners, final.association.count)
-        classified = classify(solved, seen, parallax, self._options.acceptance)
+        kind, kinds = group_kinds(final.association, self.sightings), self.sightings.kinds
+        counted = partial(self._counts, final.rig, ungated, inlier)
+        classified = classify(solved, kind, kinds, counted, parallax, self._options.acceptance)
         scale = max(1.0, final.solution.chi2_per_dof)
         covariance = final.solution.extrinsic_covariance * scale
         index, names = final.camera_index, self.sightings.cameras
@@ -260,6 +255,22 @@ class Optimiser:
             reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
             initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
             suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
+        )
+
+    def _counts(self, rig: Rig, bundle: Bundle, accepted: BoolArray, corners_map: FloatArray) -> Counts:
+        """How often candidates of corners (G, 4, 2) were seen, by observations (K,), accepted or not."""
+        count = len(corners_map)
+        group, image = bundle.group[accepted], self.sightings.image[bundle.row[accepted]]
+        shown = np.unique(np.stack([group, image]), axis=1)
+        easy = np.stack(easy_views(self._views, rig, list(self._cameras.values()), corners_map))
+        found = np.isin(*(pairs[0] * (1 << 32) + pairs[1] for pairs in (easy, shown)))
+        return Counts(
+            images=np.bincount(shown[0], minlength=count),
+            observations=np.bincount(bundle.group, minlength=count),
+            agreeing=np.bincount(group, minlength=count),
+            easy_views=np.bincount(easy[0], minlength=count),
+            found=np.bincount(easy[0, found], minlength=count),
+            as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map),
         )
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:

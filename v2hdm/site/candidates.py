@@ -175,17 +175,12 @@ def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, fl
     """
     if len(variance) < _LEAST_TO_COMPARE:
         return _LARGEST, _PRIOR_FREEDOM[1]
-    off = np.log(variance_within(variance)) - psi(freedom / 2) + np.log(freedom / 2)
+    off = np.log(np.clip(variance, 1 / _LARGEST, _LARGEST)) - psi(freedom / 2) + np.log(freedom / 2)
     beyond = off.var(ddof=1) - polygamma(1, freedom / 2).mean()
     low, high = _PRIOR_FREEDOM
     beyond = float(np.clip(beyond, polygamma(1, high / 2) * 1.001, polygamma(1, low / 2) * 0.999))
     prior = float(brentq(lambda count: polygamma(1, count / 2) - beyond, low, high))
     return float(np.exp(off.mean() + psi(prior / 2) - np.log(prior / 2))), prior
-
-
-def variance_within(variance: FloatArray) -> FloatArray:
-    """Variances without those that no comparison can do with."""
-    return np.clip(np.nan_to_num(variance, nan=_LARGEST), 1 / _LARGEST, _LARGEST)
 
 
 def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:

@@ -146,14 +146,7 @@ def update_map(
         if len(base.poses)
         else Watched.never(len(new)),
     )
-    paired = np.zeros(len(old), dtype=bool)
-    paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
-    looked = (now.views >= _LOOKED) | paired
-    if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
-        raise MappingError(
-            f"map.base: this drive finds {paired.sum()} of {looked.sum()} markings again that it should have "
-            "seen; is the map of this site and frame? Map the drive by itself to see"
-        )
+    _check_site(decision, now, len(old))
     by_old, by_new = fused_markings(old, new, decision)
     # Ids that no feature of the map has or ever had.
     known = [one.id or 0 for some in (old, base.hd_map.lanes, base.hd_map.symbols) for one in some]
@@ -199,6 +192,18 @@ def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Look
             if one.kind == kind and off_m < diagonals_m.max() / 2:
                 found[k] = max(found[k], sightings)
     return Looks(np.maximum(np.bincount(seen, minlength=len(places)), found), found)
+
+
+def _check_site(decision: Decision, now: Looks, count: int) -> None:
+    """Refuse a map of which the drive finds nearly nothing where it looked."""
+    paired = np.zeros(count, dtype=bool)
+    paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
+    looked = (now.views >= _LOOKED) | paired
+    if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
+        raise MappingError(
+            f"map.base: this drive finds {paired.sum()} of {looked.sum()} markings again that it should have "
+            "seen; is the map of this site and frame? Map the drive by itself to see"
+        )
 
 
 def _changes(

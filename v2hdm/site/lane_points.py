@@ -75,9 +75,6 @@ class LaneCloud:
     jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
 
-Flattening = Callable[[IntArray, FloatArray], FloatArray]
-
-
 @dataclass(frozen=True)
 class ImageGround:
     """How each image of a drive maps to the ground; nan for images of cameras that are not used.
@@ -91,7 +88,7 @@ class ImageGround:
     map_from_pinhole_px: FloatArray
     centre_map: FloatArray
     moved_map: FloatArray | None = None
-    flattened_px: Flattening = lambda image, points_px: points_px
+    flattened_px: Callable[[IntArray, FloatArray], FloatArray] = lambda image, points_px: points_px
 
     @classmethod
     def of_images(

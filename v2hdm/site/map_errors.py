@@ -221,20 +221,14 @@ def _moved(points_map: FloatArray, shift: Shift, of_old: bool) -> FloatArray:
 
 def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
     """The earlier line of the same class that most of a new line lies on."""
-    shares = [
-        (_apart(lane.points_map, one.points_map) <= _SAME_LINE_M).mean() * (one.kind == lane.kind)
-        for one in lanes
-    ]
+    shares = []
+    for one in lanes:
+        place, along = _stations(lane.points_map, one.points_map), length_along(one.points_map)
+        foot = np.column_stack([np.interp(place, along, axis) for axis in one.points_map.T])
+        near = np.linalg.norm(lane.points_map - foot, axis=1) <= _SAME_LINE_M
+        shares.append(near.mean() * (one.kind == lane.kind))
     best = int(np.argmax(shares)) if shares else 0
     return best if shares and shares[best] >= _LEAST_SHARED else None
-
-
-def _apart(points: FloatArray, line: FloatArray) -> FloatArray:
-    """Distances (N,) of points (N, 2) from a polyline (M, 2)."""
-    place = _stations(points, line)
-    along = length_along(line)
-    foot = np.column_stack([np.interp(place, along, line[:, k]) for k in (0, 1)])
-    return np.asarray(np.linalg.norm(points - foot, axis=1))
 
 
 def _stations(points: FloatArray, line: FloatArray) -> FloatArray:

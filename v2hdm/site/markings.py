@@ -13,11 +13,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import beta, f
 
-from v2hdm.association.ground import Views, easy_views, images_with_symbol
-from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Candidates, Counts, Exclusion, variance_prior, variance_within
+from v2hdm.records import FloatArray, IntArray, Marking
+from v2hdm.site.candidates import Candidates, Counts, Exclusion, variance_prior
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -34,44 +32,6 @@ _CLUTTER_BY = (
     "its sightings contradict each other",
 )
 """Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Support:
-    """The sightings of G candidates and the rig that they were seen by.
-
-    ``kind`` (G,) indexes ``sightings.kinds``. Observation k is of row ``row`` (K,) of the sightings and
-    candidate ``group`` (K,), and ``accepted`` (K,) or not. ``cameras`` are in the rig's order.
-    """
-
-    kind: IntArray
-    sightings: Sightings
-    rig: Rig
-    views: Views
-    cameras: tuple[Camera, ...]
-    row: IntArray
-    group: IntArray
-    accepted: BoolArray
-
-    def names(self) -> tuple[str, ...]:
-        """The class of each candidate."""
-        return tuple(self.sightings.kinds[kind] for kind in self.kind)
-
-    def counts(self, corners_map: FloatArray) -> Counts:
-        """How often candidates of corners (G, 4, 2) were seen."""
-        count = len(self.kind)
-        group, image = self.group[self.accepted], self.sightings.image[self.row[self.accepted]]
-        shown = np.unique(np.stack([group, image]), axis=1)
-        easy = np.stack(easy_views(self.views, self.rig, list(self.cameras), corners_map))
-        found = np.isin(*(pairs[0] * (1 << 32) + pairs[1] for pairs in (easy, shown)))
-        return Counts(
-            images=np.bincount(shown[0], minlength=count),
-            observations=np.bincount(self.group, minlength=count),
-            agreeing=np.bincount(group, minlength=count),
-            easy_views=np.bincount(easy[0], minlength=count),
-            found=np.bincount(easy[0, found], minlength=count),
-            as_symbol=images_with_symbol(self.sightings.symbols, self.rig, corners_map),
-        )
 
 
 @dataclass(frozen=True)
@@ -131,24 +91,30 @@ class Classified:
         )
 
 
-def classify(solved: Candidates, seen: Support, parallax: Parallax, options: AcceptanceOptions) -> Classified:
+def classify(
+    solved: Candidates,
+    kind: IntArray,
+    kinds: Sequence[str],
+    counted: Callable[[FloatArray], Counts],
+    parallax: Parallax,
+    options: AcceptanceOptions,
+) -> Classified:
     """Decide which of the ``solved`` candidates are markings of the map, and where their corners are.
 
-    ``parallax`` says which of them lie on the ground.
+    They are of the classes ``kind`` (G,), by their place in ``kinds``; ``counted`` says how often candidates
+    of corners (G, 4, 2) were seen, and ``parallax`` which of them lie on the ground.
     """
-    counts = seen.counts(np.where(solved.known[..., None], solved.corners_map, np.nan))
-    first = posterior(solved, seen.kind, counts)
-    names = list(seen.names())
-    stated, number = Stated.of(options.corrections, first.candidates.corners_map, names), seen.kind.copy()
+    first = posterior(solved, kind, counted(np.where(solved.known[..., None], solved.corners_map, np.nan)))
+    names, number = [kinds[one] for one in kind], kind.copy()
+    stated = Stated.of(options.corrections, first.candidates.corners_map, names)
+    known = {kinds[one]: one for one in np.unique(kind).tolist()}
     for group, correction in stated.kept.items():
         names[group] = correction.new_kind or names[group]
         # The shape of a class is learned from its candidates: without another one there is none.
-        number[group] = dict(zip(seen.names(), seen.kind.tolist(), strict=True)).get(
-            names[group], number[group]
-        )
+        number[group] = known.get(names[group], number[group])
     solved = stated.placed(solved, first.candidates)
     # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
-    counts = seen.counts(first.candidates.corners_map)
+    counts = counted(first.candidates.corners_map)
     found = posterior(solved, number, counts)
     found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
     found.log_odds[list(stated.kept)] = np.inf
@@ -278,9 +244,9 @@ def most_suspicious(
     seen, agreed = counts.observations[accepted], counts.agreeing[accepted]
     freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two an observation, less those of four corners
     # Beside its freedom a variance has an inverse-gamma prior, so that it follows Fisher's F distribution.
-    variance = squared[accepted] / freedom
+    variance = np.nan_to_num(squared[accepted], nan=1e9) / freedom
     scale, prior = variance_prior(variance, freedom)
-    residuals = f.sf(variance_within(variance) / scale, freedom, prior)
+    residuals = f.sf(variance / scale, freedom, prior)
     # The tail of a binomial distribution, continued to parts of an image.
     rate = (seen - agreed).sum() / max(seen.sum(), 1)
     disputes, images = (seen - agreed) / CORNERS_OF_IMAGE, seen / CORNERS_OF_IMAGE

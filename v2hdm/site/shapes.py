@@ -174,7 +174,11 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
         if count < _FEWEST_MEMBERS:
             break
         spread_m, about_m = _spread_m(corners, left.subset(members))
-        shape = Shape(corners, spread_m * _predictive(count), count / len(candidates))
+        # Of so few, five directions each, mean and spread err: sigma of Student's t distribution about a mean
+        # (Gelman et al., Bayesian Data Analysis, section 3.2).
+        freedom = 5 * (count - 1)
+        wider = float(np.sqrt((1 + 1 / count) * freedom / (freedom - 2)))
+        shape = Shape(corners, spread_m * wider, count / len(candidates))
         if count < least and (shapes or 2 * count < len(whole) or about_m > _STENCIL_M):
             break
         shapes.append(shape)
@@ -182,19 +186,14 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
     return tuple(shapes)
 
 
-def _predictive(members: int) -> float:
-    """How much wider than their spread the next one's is after so few members, whose mean and spread err.
-
-    Each has five directions; sigma of Student's t distribution about a mean (Gelman et al., Bayesian Data
-    Analysis, section 3.2).
-    """
-    freedom = 5 * (members - 1)
-    return float(np.sqrt((1 + 1 / members) * freedom / (freedom - 2)))
-
-
 def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
     """The shape (4, 2) that most of N candidates have, and which (N,) have it."""
-    lengths = _lengths(candidates.corners_map)
+    # Sides and diagonals, each pair sorted, whichever corner comes first.
+    corners_map = candidates.corners_map
+    side = np.linalg.norm(np.roll(corners_map, -1, axis=1) - corners_map, axis=2)
+    diagonals = np.linalg.norm(corners_map[:, 2:] - corners_map[:, :2], axis=2)
+    pairs = 0.5 * (side[:, :2] + side[:, 2:]), diagonals
+    lengths = np.concatenate([np.sort(pair, axis=1) for pair in pairs], axis=1)
     limit_m = np.maximum(_MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
     apart = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
     typical = int(np.argmax((apart <= limit_m[:, None]).sum(axis=1) - apart.mean(axis=1) / limit_m))
@@ -208,14 +207,6 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
             break
         shape = parallelograms(np.median(laid.in_frame_of_shape(candidates.corners_map)[members], axis=0))
     return shape, members
-
-
-def _lengths(corners: FloatArray) -> FloatArray:
-    """Sides and diagonals (N, 4), each pair sorted, whichever corner comes first."""
-    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    pairs = np.sort(0.5 * (side[:, :2] + side[:, 2:]), axis=1)
-    diagonals = np.sort(np.linalg.norm(corners[:, 2:] - corners[:, :2], axis=2), axis=1)
-    return np.concatenate([pairs, diagonals], axis=1)
 
 
 def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
