@@ -15,6 +15,9 @@ from v2hdm.simulate.port.drive import rendered_drive
 ROUTE = [[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]]
 """A straight, a bend and a straight, as [metres, degrees to the left]."""
 
+TINY_ROUTE = [[12.0, 0.0], [12.0, 55.0], [4.0, 0.0]]
+"""The same, barely longer than the shortest route that a port may have: runs over it take 5 s."""
+
 
 def short_port() -> PortConfig:
     """A straight and a bend of the default port, fewer obstacles, another vehicle's IPM to start from."""
@@ -68,6 +71,12 @@ def short_drive(rendered: Callable[[PortConfig], Path]) -> Path:
 def small_drive(rendered: Callable[[PortConfig], Path]) -> Path:
     """The drive through :func:`small_port`."""
     return rendered(small_port())
+
+
+@pytest.fixture(scope="session")
+def tiny_drive(rendered: Callable[[PortConfig], Path]) -> Path:
+    """A drive like that through :func:`small_port`, of 13 images: for tests of all but the map's quality."""
+    return rendered(small_port(route=RouteConfig(pieces=TINY_ROUTE, image_spacing_m=2.0)))
 
 
 @pytest.fixture(scope="session")

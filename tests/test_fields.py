@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from train.checkpoint import own_entries
 from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES, SHIPPED, load_catalogue
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.geometry.lens import distort_points, undistort_points
@@ -123,8 +124,8 @@ def test_own_classes_come_after_the_shipped_ones(tmp_path):
 def test_own_classes_survive_as_plain_data(tmp_path):
     text = f"classes:\n  pad: {{family: stripe, {SIZES}, softness: 0.1, group: stop_line}}\n"
     catalogue = load_catalogue(written(tmp_path, text))
-    assert SHIPPED.with_own(catalogue.own_entries(), "a file") == catalogue
-    assert SHIPPED.own_entries() == {}
+    assert SHIPPED.with_own(own_entries(catalogue), "a file") == catalogue
+    assert own_entries(SHIPPED) == {}
 
 
 def test_the_catalogue_of_the_documentation_is_read():

@@ -33,6 +33,16 @@ _FREE_TO_CHANGE = (
 )
 
 _VIEWS_TO_UNFOLD = 24
+_ENTRY = ("family", "length_m", "width_m", "softness", "group")
+
+
+def own_entries(catalogue: Catalogue) -> dict[str, dict[str, Any]]:
+    """The classes that are not shipped, as plain data that :meth:`Catalogue.with_own` takes."""
+    own = {name: asdict(one) for name, one in catalogue.classes.items() if name not in SHIPPED.classes}
+    return {
+        name: {key: list(one[key]) if isinstance(one[key], tuple) else one[key] for key in _ENTRY}
+        for name, one in own.items()
+    }
 
 
 @dataclass
@@ -77,7 +87,7 @@ def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) ->
     """
     if catalogue is None and config.catalogue is not None:
         catalogue = load_catalogue(Path(config.catalogue))
-    state = Checkpoint(config=asdict(config), own_classes=(catalogue or SHIPPED).own_entries())
+    state = Checkpoint(config=asdict(config), own_classes=own_entries(catalogue or SHIPPED))
     if config.start is None:
         return state
     path = Path(config.start)
@@ -92,7 +102,7 @@ def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) ->
             "give its `net` settings"
         )
     catalogue = catalogue or earlier.catalogue
-    state.own_classes = catalogue.own_entries()
+    state.own_classes = own_entries(catalogue)
     classes, where = earlier.catalogue.names, f"start={config.start}"
     if isinstance(earlier, Checkpoint) and then == config.net:
         state.averaged = with_classes(earlier.averaged, classes, catalogue, where)
@@ -154,7 +164,7 @@ def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Pat
             f"{path} was trained with another {', '.join(changed)}: set it back, or choose a new `output`"
         )
     if config.catalogue is not None:
-        own = load_catalogue(Path(config.catalogue)).own_entries()
+        own = own_entries(load_catalogue(Path(config.catalogue)))
         if list(own) != list(checkpoint.own_classes):
             raise ConfigError(
                 f"{path} was trained with the classes {', '.join(checkpoint.own_classes)}, not "

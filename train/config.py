@@ -6,8 +6,12 @@ from dataclasses import dataclass, field
 
 from models import NetConfig
 from models.marking_net import MULTIPLE
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
+
+
+class LabelError(V2hdmError):
+    """Labels to train the detector from are missing, damaged or of a class that is not known."""
 
 
 @dataclass(kw_only=True)

@@ -34,17 +34,22 @@ from train.scenes.hardships import NONE
 from v2hdm.catalogue import OUTLINED_CLASSES
 from v2hdm.detection.classifier import (
     AMONG,
+    CHANNELS,
+    CLAIMED,
+    CLAIMED_CHANNELS,
     COMPANIES,
+    FEATURES,
     SHAPES,
+    SIZE,
     Readings,
     features_among,
     one_hot,
     shape_of,
 )
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.evidence import CHANNELS, CLAIMED, CLAIMED_CHANNELS, FEATURES, SIZE
+from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE, being_fitted
+from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.quadrilateral import Quad, following
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text, whole_file
@@ -246,9 +251,9 @@ class Part:
 
 def gather(part: Part) -> Part:
     """Write the readings of a part of the scenes to its file, which appears whole or not at all."""
-    options = DetectorOptions(model=str(part.model), max_range_m=24.0, min_confidence=0.0)
-    with being_fitted():
-        detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
+    options = DetectorOptions(max_range_m=24.0, min_confidence=0.0)
+    network = Network(part.model)
+    detectors = [Detector(network, replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
     for number, photo in enumerate(part.photographs.images if part.photographs else ()):
         index = part.images + part.numbers[number]

@@ -27,8 +27,9 @@ from v2hdm.detection.lanes import boundaries as score
 from v2hdm.detection.lanes import lines as lane_lines
 from v2hdm.detection.lanes.boundaries import draw
 from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints
+from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.weights import LANE_SCORE_FILE, being_fitted
+from v2hdm.detection.weights import LANE_SCORE_FILE
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text
 
@@ -155,8 +156,7 @@ class Part:
 
 def see(part: Part) -> list[Seen]:
     """The evidence for lanes in a part of the scenes."""
-    with being_fitted():
-        detector = Detector.load(options=DetectorOptions(model=str(part.model), max_range_m=24.0))
+    detector = Detector(Network(part.model), DetectorOptions(max_range_m=24.0))
     return [seen(render_to_fit(number, part.images, SEED)[1], detector) for number in part.numbers]
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from models.marking_net import MULTIPLE
 from train.augment import random_crop, random_photometry
-from train.config import DataConfig
+from train.config import DataConfig, LabelError
 from train.label_hints import CELL_PX, with_hints
 from train.labels_coco import UNKNOWN, read_coco
 from train.labels_image import PAINT_ONLY, LabelledImage
@@ -22,7 +22,7 @@ from train.labels_tusimple import read_tusimple
 from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
-from v2hdm.errors import ConfigError, DriveError, LabelError
+from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, FloatArray

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from train.config import LabelError
 from train.labels_image import LabelledImage
-from v2hdm.errors import LabelError
 from v2hdm.io.safe.texts import parse_json, read_text, shown
 from v2hdm.records import FloatArray
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -111,14 +111,6 @@ class Catalogue:
     def of_family(self, *families: str) -> tuple[str, ...]:
         """Names of the classes of some families."""
         return tuple(name for name, one in self.classes.items() if one.family in families)
-
-    def own_entries(self) -> dict[str, dict[str, Any]]:
-        """The classes that are not shipped, as plain data that :meth:`with_own` takes."""
-        own = {name: asdict(one) for name, one in self.classes.items() if name not in SHIPPED.classes}
-        return {
-            name: {key: list(v) if isinstance(v, tuple) else v for key, v in one.items() if key in _KEYS}
-            for name, one in own.items()
-        }
 
     def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
         """This catalogue and a user's classes after it, by name as ``catalogue.yaml`` has them.

@@ -38,10 +38,6 @@ class AdjustError(V2hdmError):
     """A bundle adjustment problem is malformed: the message names the offending item."""
 
 
-class LabelError(V2hdmError):
-    """Labels to train the detector from are missing, damaged or of a class that is not known."""
-
-
 EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
 

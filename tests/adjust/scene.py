@@ -3,11 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from v2hdm.adjust import Observations, PoseSigma, Problem
-from v2hdm.geometry import tensors as transform
+from v2hdm.geometry.rigid import exp
 
 WIDTH, HEIGHT, FOCAL = 1280, 720, 900.0
 PIXEL_SIGMA = 0.7
@@ -30,10 +29,6 @@ class Scene:
         return np.rad2deg(
             np.linalg.norm(Rotation.from_matrix(off.reshape(-1, 3, 3)).as_rotvec(), axis=1)
         ).reshape(off.shape[:-2])
-
-
-def exp(tangent: np.ndarray) -> np.ndarray:
-    return transform.exp(torch.as_tensor(tangent, dtype=torch.float64)).numpy()
 
 
 def mounted(x: float, height: float, pitch_deg: float, *, rear: bool = False, y: float = 0.0) -> np.ndarray:

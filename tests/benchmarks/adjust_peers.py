@@ -9,7 +9,6 @@ time that of ``ceres::Solve`` alone. Ours is all of ``solve()``, with checks, la
 The other peers are slower and solve once: Ceres through pyceres with pycolmap's compiled cost functions and
 GTSAM (the extra ``bench``), and SciPy's trust region, which knows the Jacobian's sparsity and is left out
 beyond the size that it can manage. GTSAM holds the poses to 10 um, so its cost ends a little below the least.
-Our own rival is Levenberg-Marquardt on the same kernels (``ours, lm``).
 
 The model is the paper's, extrinsics and corners. ``--states`` gives every frame six states, and Ceres a pose
 a frame under the same prior.
@@ -171,7 +170,7 @@ def in_turn(problem: Problem, states: bool, threads: int, rounds: int) -> list[R
     options = SolveOptions(loss="none") if states else PAPER
     rows: list[Row] = []
     for _ in range(rounds):
-        rows += [ours(problem, options, "ours"), ours(problem, replace(options, solver="lm"), "ours, lm")]
+        rows.append(ours(problem, options, "ours"))
         if build()[0] is not None:
             for name in POSE_SOLVERS if states else PAPER_SOLVERS:
                 asked = NativeOptions(frame_poses=states, threads=threads, linear_solver=name)

@@ -22,9 +22,8 @@ import torch
 
 from v2hdm.detection.frames import read_bgr
 from v2hdm.io.drive.of_result import drive_of
-from v2hdm.mosaic.blend import whole
+from v2hdm.mosaic.blend import Canvas, Lens, Shot, whole
 from v2hdm.mosaic.result import MULTIPLE_PX, RESOLUTION_M, ground_of
-from v2hdm.mosaic.shots import Canvas, Lens, Shot
 
 Undistort = Callable[[str, np.ndarray], np.ndarray]
 

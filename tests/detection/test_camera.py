@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-import torch
 
 from tests.detection.pictures import LENSES, extrinsic, make_camera, to_image
 from v2hdm.detection.camera import FARTHEST_M, RoadCamera, camera_from_calibration, rough_calibration
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.tensors import exp
+from v2hdm.geometry.rigid import exp
 from v2hdm.records import Calibration, Camera, CameraInfo
 
 GRID_PX = np.stack(np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 359, 11)), axis=-1).reshape(-1, 2)
@@ -87,8 +86,7 @@ def footprint(calibration, points_px):
 
 def moved(calibration, tangent):
     """The calibration perturbed on the left, as its covariance means it."""
-    step = exp(torch.as_tensor(tangent)).numpy()
-    return Calibration(calibration.info, step @ calibration.cam_from_vehicle)
+    return Calibration(calibration.info, exp(np.asarray(tangent)) @ calibration.cam_from_vehicle)
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "equidistant"])

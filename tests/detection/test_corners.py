@@ -16,9 +16,9 @@ from tests.detection.pictures import (
     to_image,
 )
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.coverage import variance_inflation
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.fit import fit_quadrilaterals
+from v2hdm.detection.lattice import variance_inflation
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.propose import open_sides
 from v2hdm.errors import ConfigError

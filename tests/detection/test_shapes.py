@@ -18,13 +18,13 @@ from tests.detection.pictures import (
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection import patch
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.coverage import blurred_coverage, normal_cdf, normal_pdf
+from v2hdm.detection.classifier import CHANNELS, SIZE
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.evidence import CHANNELS, SIZE
+from v2hdm.detection.lattice import blurred_coverage, normal_cdf, normal_pdf
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.patch import ImageQuads, LensFrames
-from v2hdm.detection.propose import Blob, find_blobs, outline_polygon, zero_crossings
+from v2hdm.detection.propose import Blob, _outlines, find_blobs, outline_polygon
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import Quad, order_corners, side_frames
 from v2hdm.records import DIAMOND, LANE_DASH
@@ -81,9 +81,11 @@ def test_the_derivative_of_coverage_is_its_slope():
         np.testing.assert_allclose(slope, difference, atol=2e-3)
 
 
-def test_zero_crossings_are_interpolated_between_neighbours():
-    level = np.array([[-1.0, 3.0, -1.0]])
-    np.testing.assert_allclose(zero_crossings(level), [[0.25, 0.0], [1.75, 0.0]])
+def test_outlines_are_interpolated_between_neighbours():
+    level = np.full((3, 3), -1.0)
+    level[1, 1] = 3.0
+    (points,) = _outlines(level, (level > 0).astype(np.int16), 1)
+    np.testing.assert_allclose(sorted(points.tolist()), [[0.25, 1.0], [1.0, 0.25], [1.0, 1.75], [1.75, 1.0]])
 
 
 def test_the_outline_polygon_of_an_arrow_encloses_its_cells():

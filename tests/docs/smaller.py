@@ -1,12 +1,12 @@
 """What is added to a documented command so that it ends in seconds on one core."""
 
 SMALL_PORT = (
-    "simulate.seed=11", "simulate.route.pieces=[[20.0,0.0],[16.0,70.0],[10.0,0.0]]",
+    "simulate.seed=11", "simulate.route.pieces=[[12.0,0.0],[12.0,55.0],[4.0,0.0]]",
     "simulate.route.image_spacing_m=2.0", "~simulate.cameras.rear", "simulate.cameras.front.width=640",
     "simulate.cameras.front.height=360", "simulate.cameras.front.focal_px=450.0",
     "simulate.yard.parked_trucks=0", "simulate.yard.barriers=0", "simulate.yard.shadow_strips=1",
 )  # fmt: skip
-"""46 m of a port, one camera, half its pixels, little in the way."""
+"""28 m of a port, one camera, half its pixels, little in the way."""
 
 
 def smaller(arguments: list[str]) -> list[str]:

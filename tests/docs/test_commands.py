@@ -75,19 +75,13 @@ if [ "$1" = map ]; then eval "python ${{told##*bin/python }}"; fi
 """``make``: its target must be there; that of a run is run, and the others are what runs these tests."""
 
 
-GIT = """#!/bin/bash
-[ "$1" = clone ] && mkdir "$3"
-"""
-"""``git clone URL FOLDER``: an empty folder, for ``make`` above works in the repository."""
-
-
 @pytest.fixture(scope="module")
 def shell(tmp_path_factory):
     make = shutil.which("make")
     if make is None:
         pytest.skip("no make: install it")
     folder = tmp_path_factory.mktemp("programs")
-    programs = {"make": MAKE.format(make=make, root=ROOT), "pip": "#!/bin/sh\n", "git": GIT}
+    programs = {"make": MAKE.format(make=make, root=ROOT), "pip": "#!/bin/sh\n"}
     for name, text in programs.items():
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
@@ -100,9 +94,8 @@ def furnished(shell, tmp_path_factory):
     """The README's first block makes the drive and the result that all other commands work on."""
     folder = tmp_path_factory.mktemp("furnished")
     shell(RUN[0].text, folder)
-    (cloned,) = folder.iterdir()
-    furnish(cloned)
-    return cloned
+    furnish(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")

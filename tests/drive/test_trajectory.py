@@ -17,7 +17,6 @@ from v2hdm.geometry.rigid import (
     quaternion_from_rotation,
     rotation_from_euler,
     rotation_from_quaternion,
-    slerp,
 )
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.drive import join_drives, read_drive, with_clock_offsets
@@ -60,12 +59,12 @@ def test_euler_angles_mean_what_scipy_means_by_fixed_axes(seed):
 
 
 @given(SEEDS, st.floats(0.0, 1.0))
-def test_slerp_agrees_with_scipy_whatever_the_signs(seed, fraction):
-    rng = np.random.default_rng(seed)
-    ends = Rotation.random(2, rng)
-    first, second = ends.as_quat()[:1], ends.as_quat()[1:] * rng.choice([-1.0, 1.0])
-    got = rotation_from_quaternion(slerp(first, second, np.array([fraction])))
-    np.testing.assert_allclose(got[0], Slerp([0, 1], ends)(fraction).as_matrix(), atol=1e-9)
+def test_rotations_between_two_poses_agree_with_scipy_s_slerp(seed, fraction):
+    ends = Rotation.random(2, np.random.default_rng(seed))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, :3] = ends.as_matrix()
+    got, _ = interpolate(Trajectory(np.arange(2.0), poses), np.array([fraction]), max_gap_s=2.0)
+    np.testing.assert_allclose(got[0, :3, :3], Slerp([0, 1], ends)(fraction).as_matrix(), atol=1e-9)
 
 
 @given(SEEDS)

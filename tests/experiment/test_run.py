@@ -207,8 +207,8 @@ def test_a_folder_with_files_of_the_users_is_refused(tmp_path, name):
 
 
 @pytest.mark.slow
-def test_a_drive_is_mapped_by_every_recipe_and_its_stages_are_kept(small_drive, tmp_path):
-    ports = {"small": Site(drive=DriveConfig(path=str(small_drive)))}
+def test_a_drive_is_mapped_by_every_recipe_and_its_stages_are_kept(tiny_drive, tmp_path):
+    ports = {"small": Site(drive=DriveConfig(path=str(tiny_drive)))}
     config = experiment("out", ports=ports, recipes=["paper"], cache=str(tmp_path))
     (job,) = jobs(config)
     told: list[tuple[str, int, int]] = []

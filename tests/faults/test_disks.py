@@ -11,9 +11,8 @@ from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.situations import Expected, Situation, calibrating
 from tests.faults.cases import picture
 from tests.faults.judge import Case, judge, judge_again
-from v2hdm.mosaic.blend import Sheet
+from v2hdm.mosaic.blend import Canvas, Sheet
 from v2hdm.mosaic.result import geotiff
-from v2hdm.mosaic.shots import Canvas
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
 

@@ -4,60 +4,45 @@ import numpy as np
 import pytest
 import torch
 from kornia.geometry.liegroup import Se3
-from kornia.geometry.linalg import transform_points
+from scipy.linalg import expm
 
 from v2hdm.geometry import ipm, lens, rigid, tensors
-from v2hdm.geometry import tensors as tf
 from v2hdm.geometry.tensors import inverse_depth
 from v2hdm.records import CameraInfo
 
 BATCHES = [(), (1,), (3, 2)]
-TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
 
 
-def log(motion):
-    return Se3.from_matrix(motion.reshape(-1, 4, 4)).log().reshape(*motion.shape[:-2], 6)
-
-
-def apply(motion, points):
-    motions, batched = motion.reshape(-1, 4, 4), points.reshape(-1, *points.shape[-2:])
-    return transform_points(motions, batched).reshape(points.shape)
-
-
-def tangents(batch, dtype=torch.float64, size=1.0, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return size * torch.randn(*batch, 6, generator=generator, dtype=torch.float64).to(dtype)
+def tangents(batch, size=1.0, seed=0):
+    return size * np.random.default_rng(seed).normal(size=(*batch, 6))
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-@pytest.mark.parametrize("dtype", TOLERANCE)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_motion_times_its_inverse_is_the_identity(batch, dtype):
-    motion = tf.exp(tangents(batch, dtype))
+    motion = torch.as_tensor(rigid.exp(tangents(batch)), dtype=dtype)
     identity = torch.eye(4, dtype=dtype).expand(*batch, 4, 4)
-    torch.testing.assert_close(motion @ tf.inverse(motion), identity, atol=TOLERANCE[dtype], rtol=0)
+    atol = {torch.float32: 2e-5, torch.float64: 1e-12}[dtype]
+    torch.testing.assert_close(motion @ tensors.inverse(motion), identity, atol=atol, rtol=0)
+    agree(rigid.inverse(motion.numpy()), tensors.inverse(motion), atol)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1.0])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_log_undoes_exp(batch, size):
     tangent = tangents(batch, size=size)
-    torch.testing.assert_close(log(tf.exp(tangent)), tangent, atol=1e-12, rtol=1e-9)
+    np.testing.assert_allclose(rigid.log(rigid.exp(tangent)), tangent, atol=1e-12, rtol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.3, 3.14])
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 0.3, 3.1])
 def test_exp_agrees_with_the_matrix_exponential_and_with_kornia(angle):
     tangent = tangents((4,), seed=3)
-    tangent[:, 3:] *= angle / tangent[:, 3:].norm(dim=1, keepdim=True)
-    generator = torch.zeros(4, 4, 4, dtype=torch.float64)
-    generator[:, :3, :3], generator[:, :3, 3] = tf.hat(tangent[:, 3:]), tangent[:, :3]
-    torch.testing.assert_close(tf.exp(tangent), torch.linalg.matrix_exp(generator), atol=1e-12, rtol=0)
-    torch.testing.assert_close(tf.exp(tangent), Se3.exp(tangent).matrix().detach(), atol=1e-12, rtol=0)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-7, 1.0])
-def test_exp_has_correct_derivatives_at_the_identity_too(size):
-    tangent = tangents((2,), size=size).requires_grad_()
-    assert torch.autograd.gradcheck(tf.exp, (tangent,), eps=1e-6)
+    tangent[:, 3:] *= angle / np.linalg.norm(tangent[:, 3:], axis=1, keepdims=True)
+    generator = np.zeros((4, 4, 4))
+    generator[:, :3, :3], generator[:, :3, 3] = rigid.hat(tangent[:, 3:]), tangent[:, :3]
+    np.testing.assert_allclose(rigid.exp(tangent), np.stack([expm(one) for one in generator]), atol=1e-12)
+    agree(rigid.exp(tangent), Se3.exp(torch.as_tensor(tangent)).matrix(), atol=1e-12)
+    np.testing.assert_allclose(rigid.log(rigid.exp(tangent)), tangent, atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.1, 1.5])
@@ -65,27 +50,25 @@ def test_the_left_jacobian_is_the_derivative_of_exp(size):
     tangent = tangents((), size=size, seed=4)
 
     def perturbation(other):
-        return log(tf.exp(other) @ tf.inverse(tf.exp(tangent)))
+        return rigid.log(rigid.exp(other) @ rigid.inverse(rigid.exp(tangent)))
 
     step = 1e-6
     columns = [
-        (perturbation(tangent + step * e) - perturbation(tangent - step * e)) / (2 * step)
-        for e in torch.eye(6, dtype=torch.float64)
+        (perturbation(tangent + step * e) - perturbation(tangent - step * e)) / (2 * step) for e in np.eye(6)
     ]
-    torch.testing.assert_close(tf.left_jacobian(tangent), torch.stack(columns, -1), atol=1e-8, rtol=0)
+    np.testing.assert_allclose(rigid.left_jacobian(tangent), np.stack(columns, -1), atol=1e-8)
 
 
 @pytest.mark.parametrize("batch", BATCHES)
 def test_the_adjoint_carries_a_tangent_through_a_motion(batch):
-    motion, tangent = tf.exp(tangents(batch, seed=5)), tangents(batch, size=0.3, seed=6)
-    carried = (tf.adjoint(motion) @ tangent[..., None])[..., 0]
-    torch.testing.assert_close(motion @ tf.exp(tangent), tf.exp(carried) @ motion)
+    motion, tangent = rigid.exp(tangents(batch, seed=5)), tangents(batch, size=0.3, seed=6)
+    carried = (rigid.adjoint(motion) @ tangent[..., None])[..., 0]
+    np.testing.assert_allclose(motion @ rigid.exp(tangent), rigid.exp(carried) @ motion, atol=1e-12)
 
 
 def test_pitch_lowers_the_nose_and_heading_turns_left():
-    nose = torch.tensor([[1.0, 0.0, 0.0]])
-    pitched = apply(tf.exp(torch.tensor([0.0, 0, 0, 0, 0.1, 0])), nose)
-    turned = apply(tf.exp(torch.tensor([0.0, 0, 0, 0, 0, 0.1])), nose)
+    nose = np.array([[1.0, 0.0, 0.0]])
+    pitched, turned = (rigid.apply(rigid.exp(0.1 * np.eye(6)[k]), nose) for k in (4, 5))
     assert pitched[0, 2] < 0
     assert turned[0, 1] > 0
 
@@ -98,11 +81,6 @@ LENSES = {
 }
 K = np.array([[700.0, 0, 630], [0, 690, 350], [0, 0, 1]])
 GRID_PX = np.stack(np.meshgrid(np.linspace(0, 1279, 13), np.linspace(0, 719, 9)), axis=-1).reshape(-1, 2)
-
-
-def tangents_in_numpy(seed=0, count=12):
-    rng = np.random.default_rng(seed)
-    return np.column_stack([rng.normal(0, 5, (count, 3)), rng.normal(0, 1, (count, 3))])
 
 
 def cameras(seed=0, count=12):
@@ -122,20 +100,6 @@ def agree(ours, twin, atol=1e-9):
     np.testing.assert_allclose(ours, twin.detach().numpy(), atol=atol, rtol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.3, 3.1])
-def test_tangents_and_motions_agree(angle):
-    tangent = tangents_in_numpy()
-    tangent[:, 3:] *= angle / np.linalg.norm(tangent[:, 3:], axis=1, keepdims=True)
-    motion = rigid.exp(tangent)
-    as_torch = torch.as_tensor(tangent)
-    agree(motion, tensors.exp(as_torch))
-    np.testing.assert_allclose(rigid.log(motion), tangent, atol=1e-9)
-    agree(rigid.inverse(motion), tensors.inverse(torch.as_tensor(motion)))
-    agree(rigid.adjoint(motion), tensors.adjoint(torch.as_tensor(motion)))
-    agree(rigid.left_jacobian(tangent), tensors.left_jacobian(as_torch))
-    agree(rigid.hat(tangent[:, :3]), tensors.hat(as_torch[:, :3]))
-
-
 def test_a_half_turn_has_a_logarithm():
     tangent = np.array([1.0, 2.0, 3.0, 0.0, np.pi, 0.0])
     np.testing.assert_allclose(np.abs(rigid.log(rigid.exp(tangent))[3:]), [0, np.pi, 0], atol=1e-7)
@@ -145,10 +109,10 @@ def test_the_mounting_of_an_ipm_agrees_whatever_its_scale_and_sign():
     info = CameraInfo("camera", 1280, 720, K)
     rng = np.random.default_rng(2)
     ipms = np.stack([ipm.ipm_from_extrinsic(info, pose) for pose in cameras()])
-    ipms *= rng.uniform(0.1, 10, (12, 1, 1)) * rng.choice([-1, 1], (12, 1, 1))
     ipms += 1e-4 * rng.normal(size=ipms.shape) * np.abs(ipms)
-    twin = tensors.extrinsic_from_ipm(torch.as_tensor(K).expand(12, 3, 3), torch.as_tensor(ipms))
-    agree(np.stack([ipm.extrinsic_from_ipm(info, one) for one in ipms]), twin)
+    scaled = ipms * rng.uniform(0.1, 10, (12, 1, 1)) * rng.choice([-1, 1], (12, 1, 1))
+    found, again = (np.stack([ipm.extrinsic_from_ipm(info, one) for one in some]) for some in (ipms, scaled))
+    np.testing.assert_allclose(found, again, atol=1e-9)
 
 
 def test_ground_points_and_their_derivatives_agree_below_the_horizon_and_are_nan_above_it():

@@ -181,7 +181,7 @@ def test_the_grey_of_an_image_is_the_same_from_a_jpeg_and_from_its_pixels_as_png
     np.testing.assert_array_equal(read_grey(str(jpeg)), read_grey(str(png)))
 
 
-def test_the_door_writes_a_mounting_and_its_picture(tmp_path, capsys):
+def test_the_command_writes_a_mounting_and_says_how_good_it_is(tmp_path, capsys):
     true = extrinsic(roll_deg=0.5, yaw_deg=-1.0)
     drive = make_drive(tmp_path / "drive", 40.0, true)
     assert drive.trajectory is not None
@@ -192,7 +192,6 @@ def test_the_door_writes_a_mounting_and_its_picture(tmp_path, capsys):
     ) in (0, 3)
     found = read_calibration(output / "calibration_front.yaml")
     np.testing.assert_allclose(found.cam_from_vehicle[:3, :3], true[:3, :3], atol=0.005)
-    assert (output / "ground_front.png").stat().st_size > 0
     shown = capsys.readouterr().out
     assert shown.startswith("front: roll 0.")
     assert "verdict: " in shown

@@ -17,10 +17,11 @@ from v2hdm.association.groups import (
 )
 from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import Rig, collect_sightings
-from v2hdm.association.tracks import Uncertainty, build_tracks
+from v2hdm.association.tracks import build_tracks
 from v2hdm.geometry.quadrilateral import align
 from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.mapping.optimise import initial_rig
+from v2hdm.records import PoseNoise
 
 MAX_RANGE_M = 16.0
 
@@ -66,7 +67,7 @@ def tracks_under(rig, sightings, sigma_rad):
     near = located.range_m <= MAX_RANGE_M
     located = replace(located, valid=located.valid & near, informs=located.informs & near)
     return build_tracks(
-        sightings, located, rig, Uncertainty(sigma_rad, 0.0017, 0.01), AssociationOptions()
+        sightings, located, rig, sigma_rad, PoseNoise(0.01, roll_pitch_rad=0.0017), AssociationOptions()
     ), located
 
 

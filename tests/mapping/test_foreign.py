@@ -9,6 +9,7 @@ from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.errors import MappingError
 from v2hdm.mapping import foreign, recovery
 from v2hdm.mapping.foreign import foreign_stretch
+from v2hdm.verdict.results.solution import _ODDS_LIMIT
 
 FRAMES, IN_VIEW = 90, 8
 
@@ -42,7 +43,7 @@ def is_theirs(group):
 
 def test_images_of_another_drive_are_found_with_their_ends(monkeypatch):
     begin_s, end_s, gain = stretch(monkeypatch, lambda g, f: is_theirs(g) == (30 <= f < 60), BOTH)
-    assert gain > 20
+    assert gain > 2 * _ODDS_LIMIT, "twice what it takes to be named"
     assert (begin_s, end_s) == pytest.approx((3.0, 5.9), abs=0.15)
 
 

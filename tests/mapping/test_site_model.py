@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from v2hdm.association.groups import FusedGroups
-from v2hdm.site.candidates import Candidates, Counts, Dissent, with_dissent
+from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -355,18 +355,47 @@ def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
     many = FusedGroups(candidates.corners_map, np.tile(1e-4 * np.eye(2), (3, 4, 1, 1)), np.full((3, 4), 9))
     longer = 0.1 * (true[1, 0] - true[1].mean(axis=0)) / np.linalg.norm(true[1, 0] - true[1].mean(axis=0))
     # One sighting of a tenth of the information sees the end 10 cm farther, one a metre beyond its reach.
-    dissent = Dissent(
+    found = with_dissent(
+        candidates,
+        many,
         row=np.array([5, 6]),
         group=np.array([1, 2]),
         corner=np.array([0, 0]),
         seen_map=np.stack([candidates.corners_map[1, 0] + longer, candidates.corners_map[2, 0] + [2.0, 0]]),
         covariance_m2=np.tile(9e-4 * np.eye(2), (2, 1, 1)),
     )
-    found = with_dissent(candidates, many, dissent)
     added = found.covariance_m2 - candidates.covariance_m2
     assert np.trace(added[1]) == pytest.approx(0.1 * 0.1**2, rel=0.1)
     np.testing.assert_allclose(added[1][2:, 2:], 0)
     np.testing.assert_allclose(added[[0, 2]], 0)
+
+
+LENGTHS_M = [2.0] * 76 + [1.3] * 6 + [2.26] * 6 + [2.74] * 4
+
+
+@pytest.mark.parametrize(
+    ("squared_at_the_end", "reason"), [(14.0, None), (140.0, "its position is too uncertain")]
+)
+def test_a_dash_cut_at_the_usual_length_is_left_out_where_images_disagree_on_its_end(
+    squared_at_the_end, reason
+):
+    rng = np.random.default_rng(21)
+    true = painted([DASH * [length / 3.0, 1.0] for length in [2.74, *LENGTHS_M]], rng)
+    candidates, degrees = solved(true, rng), np.full((len(true), 4), 14.0)
+    squared = rng.chisquare(14, degrees.shape) * 5 / rng.chisquare(5, degrees.shape)  # heavy tails
+    one_image = np.tile(1e-4 * np.eye(2), (len(true), 4, 1, 1))
+    # Boxes stand on an end of the first, which then is as long as most, and of fourteen of these.
+    for dash, cut_m in enumerate([0.74, *np.linspace(0.2, 1.2, 14)]):
+        end = [1, 2] if np.linalg.norm(true[dash, 1] - true[dash, 0]) > 1 else [2, 3]
+        along = true[dash, end[0]] - true[dash, end[0] - 1]
+        along = along / np.linalg.norm(along)
+        candidates.corners_map[dash, end] -= cut_m * along
+        one_image[dash, end] += 0.1**2 * np.outer(along, along)
+        squared[dash, end] = squared_at_the_end
+    fused = FusedGroups(candidates.corners_map, one_image / 8, np.full((len(true), 4), 8))
+    found = verdict(with_shared_errors(candidates, fused, scatter_of(squared, degrees)))
+    assert found.verdict[0] == reason
+    assert not any(found.verdict[15:77])
 
 
 def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen():

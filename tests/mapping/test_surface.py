@@ -67,7 +67,8 @@ def seen_from(poses, rng, count=400):
 def test_a_moved_pixel_is_the_plane_s_where_the_ground_s_point_is_projected():
     poses, rng = arc(), np.random.default_rng(1)
     cam_from_map, frame, points = seen_from(poses, rng)
-    section = Surface(Paths.of(poses, np.zeros(len(poses), dtype=np.int64)), FALLS, 0 * np.diag(FALLS))
+    level = Surface.level(way(poses))
+    section = replace(level, parameters=np.pad(FALLS, (0, len(level.parameters) - len(FALLS))))
     height = ground_of_arc(points)
     assert np.abs(height).max() > 0.2
     # Between the places of the path a chord is up to 5 mm off the circle.

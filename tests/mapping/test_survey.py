@@ -14,12 +14,18 @@ from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.mapping.bundle import full_model, pose_sigma_of, solve_bundle
+from v2hdm.mapping.bundle import (
+    control_points,
+    full_model,
+    known_lengths,
+    pose_sigma_of,
+    solve_bundle,
+    without_corner,
+)
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SizeOptions, SurveyOptions, check_options
 from v2hdm.mapping.recovery import Inputs
-from v2hdm.mapping.stated import control_points, known_lengths, without_corner
 from v2hdm.records import DIAMOND, LANE_DASH, Trajectory
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.site.candidates import Counts
-from v2hdm.site.suspicion import most_suspicious
+from v2hdm.site.markings import most_suspicious
 
 COUNT = 40
 ALL = np.arange(COUNT)

@@ -11,9 +11,18 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
 from v2hdm.mosaic import blend as module
-from v2hdm.mosaic.blend import WARP_ERROR_PX, Tiling, whole
-from v2hdm.mosaic.sharpness import edge_widths_m, measure_edges, paint_sides
-from v2hdm.mosaic.shots import FEATHER, Canvas, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.mosaic.blend import (
+    FEATHER,
+    WARP_ERROR_PX,
+    Canvas,
+    Shot,
+    Tiling,
+    adjusted_shots,
+    lens_of,
+    recorded_shots,
+    whole,
+)
+from v2hdm.mosaic.result import edge_widths_m, measure_edges, paint_sides
 from v2hdm.records import Calibration, HdMap, Marking
 
 

@@ -14,9 +14,8 @@ from tests.mosaic import scene
 from v2hdm.cli.main import run
 from v2hdm.geometry.geodetic import crs_of, geodetic_from_enu
 from v2hdm.io.drive.of_result import METRICS
-from v2hdm.mosaic.blend import Sheet
+from v2hdm.mosaic.blend import Canvas, Sheet
 from v2hdm.mosaic.result import Picture, geotiff
-from v2hdm.mosaic.shots import Canvas
 
 
 @pytest.fixture(scope="module")

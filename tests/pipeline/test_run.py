@@ -62,8 +62,8 @@ def test_a_good_drive_passes_and_every_file_says_so(result):
     assert "verdict: PASS" in (result / "run.log").read_text()
 
 
-def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(small_drive, tmp_path):
-    drive = blind_copy(small_drive, tmp_path / "north")
+def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(tiny_drive, tmp_path):
+    drive = blind_copy(tiny_drive, tmp_path / "north")
     recorded = read_tum(drive / "poses.tum")
     poses = recorded.map_from_vehicle.copy()
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
@@ -152,8 +152,8 @@ def blind_copy(drive, target):
     ],
     ids=["missing", "truncated", "of another size"],
 )
-def test_a_wrong_image_is_named_and_leaves_nothing_behind(spoil, says, small_drive, tmp_path):
-    drive, output = blind_copy(small_drive, tmp_path / "drive"), tmp_path / "out"
+def test_a_wrong_image_is_named_and_leaves_nothing_behind(spoil, says, tiny_drive, tmp_path):
+    drive, output = blind_copy(tiny_drive, tmp_path / "drive"), tmp_path / "out"
     image = sorted(drive.rglob("*.jpg"))[2]
     spoil(image)
     with pytest.raises(DriveError, match=f"{image.name}.*{says}") as caught:
@@ -162,8 +162,8 @@ def test_a_wrong_image_is_named_and_leaves_nothing_behind(spoil, says, small_dri
     assert not output.exists() or not any(output.iterdir())
 
 
-def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(small_drive, tmp_path):
-    drive = blind_copy(small_drive, tmp_path / "drive")
+def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(tiny_drive, tmp_path):
+    drive = blind_copy(tiny_drive, tmp_path / "drive")
     for image in drive.rglob("*.jpg"):
         cv2.imwrite(str(image), np.full((360, 640, 3), 90, np.uint8))
     outcome = run(run_config(drive, tmp_path / "out"))
@@ -198,8 +198,8 @@ def test_what_cannot_work_is_refused_before_anything_is_read(tmp_path, changes, 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_a_name_has_that_of_its_drive(small_drive, tmp_path):
-    drive = blind_copy(small_drive, tmp_path / "folder")
+def test_a_run_without_a_name_has_that_of_its_drive(tiny_drive, tmp_path):
+    drive = blind_copy(tiny_drive, tmp_path / "folder")
     assert run_name(run_config(drive, tmp_path, name=None)) == "small"
     with description(drive) as content:
         content.pop("name")

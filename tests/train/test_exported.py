@@ -14,8 +14,8 @@ from export.source import read_source
 from models import MarkingNet, NetConfig, Prediction
 from tests.train.small import coco, tiny
 from train.average import mean_checkpoint, scored
-from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
-from train.config import DataConfig
+from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, own_entries, save_checkpoint
+from train.config import DataConfig, LabelError
 from train.exported import read_exported, unfold
 from train.growth import with_classes
 from train.labels import Place, paint_labels, read_labels
@@ -25,7 +25,7 @@ from train.metrics import Tally
 from train.targets import IGNORE, Targets, kind_target
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED, load_catalogue
 from v2hdm.detection.network import Network
-from v2hdm.errors import ConfigError, DetectorError, LabelError
+from v2hdm.errors import ConfigError, DetectorError
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED_FILE = ROOT / "v2hdm" / "detection" / "weights" / "default.onnx"
@@ -411,6 +411,6 @@ def test_a_file_with_wrong_classes_is_refused(tmp_path, exported, own, words):
 
 
 def test_a_checkpoint_holds_its_classes_as_plain_data(tmp_path):
-    state = Checkpoint(config={}, own_classes=load_catalogue(written(tmp_path)).own_entries())
+    state = Checkpoint(config={}, own_classes=own_entries(load_catalogue(written(tmp_path))))
     save_checkpoint(state, tmp_path / "own.pt")
     assert load_checkpoint(tmp_path / "own.pt").catalogue.names == CLASSES

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from models import Prediction
 from tests.train.small import HEIGHT, WIDTH, coco
-from train.config import DataConfig, LossConfig, TrainConfig
+from train.config import DataConfig, LabelError, LossConfig, TrainConfig
 from train.data import RenderStream
 from train.label_hints import with_hints
 from train.labels import JUDGING, LEARNT, VALIDATION, Place, held_out, paint_labels, read_labels
@@ -40,7 +40,7 @@ from train.targets import (
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.cli.compose import register
 from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
-from v2hdm.errors import ConfigError, LabelError
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND
 

@@ -35,6 +35,7 @@ from train.scenes.scenes import TrainingSample, image_line, image_points, random
 from train.scenes.symbols import hollow_diamond, lines_across, with_crossing
 from train.scenes.traffic import traffic
 from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
+from train.scenes.weather import GROUNDS, photo_tile
 from train.scenes.windscreen import before_lens
 from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
 from v2hdm.detection.camera import ASIDE_RAD
@@ -44,7 +45,6 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE, CameraInfo
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
-from v2hdm.simulate.render.textures import GROUNDS, photo_tile
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 

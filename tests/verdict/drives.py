@@ -152,7 +152,6 @@ def estimate(name: str = "front", **values: float) -> GroundEstimate:
         parameters=parameters,
         median_residual=0.35,
         innovations={"heading": 1.2, "position": 1.0},
-        patches=None,
         seconds=3.0,
     )
 

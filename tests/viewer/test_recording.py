@@ -32,13 +32,13 @@ def configured(drive, output):
 
 
 @pytest.fixture(scope="module")
-def result(small_drive, tmp_path_factory):
+def result(tiny_drive, tmp_path_factory):
     pytest.importorskip("rerun", reason="no rerun: pip install 'v2hdm[viewer]'")
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("DISPLAY", raising=False)
         patch.delenv("WAYLAND_DISPLAY", raising=False)
         output = tmp_path_factory.mktemp("outputs")
-        return run(configured(small_drive, output), viewer=RerunViewer("small")).folder
+        return run(configured(tiny_drive, output), viewer=RerunViewer("small")).folder
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +59,8 @@ def only(columns, ending):
     return found
 
 
-def test_every_image_is_in_the_recording_byte_for_byte(recorded, small_drive):
-    drive = read_drive(small_drive)
+def test_every_image_is_in_the_recording_byte_for_byte(recorded, tiny_drive):
+    drive = read_drive(tiny_drive)
     columns = recorded["/map/vehicle/front/image"]
     blobs = [bytes(one[0]) for one in only(columns, "EncodedImage:blob") if one]
     assert sorted(blobs) == sorted(image.path.read_bytes() for image in drive.images)
@@ -68,7 +68,7 @@ def test_every_image_is_in_the_recording_byte_for_byte(recorded, small_drive):
     assert sorted(frames) == list(range(len(drive.images)))
 
 
-def test_detections_lie_in_the_images(recorded, small_drive):
+def test_detections_lie_in_the_images(recorded, tiny_drive):
     columns = recorded["/map/vehicle/front/image/markings"]
     strips = [strip for one in only(columns, "LineStrips2D:strips") for strip in one or ()]
     assert len(strips) > 20
@@ -118,7 +118,7 @@ def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path, mo
     assert not (tmp_path / "outputs").exists()
 
 
-def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result, small_drive):
+def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result, tiny_drive):
     class Seen:
         def __init__(self):
             self.calls: list[str] = []
@@ -136,12 +136,12 @@ def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result, small_
             self.calls.append("closed")
 
     seen = Seen()
-    run(configured(small_drive, result.parent), viewer=seen)
-    assert seen.calls == ["begun", f"{len(read_drive(small_drive).images)} images", "front", "closed"]
+    run(configured(tiny_drive, result.parent), viewer=seen)
+    assert seen.calls == ["begun", f"{len(read_drive(tiny_drive).images)} images", "front", "closed"]
 
 
-def test_images_are_shown_as_they_are_looked_at(small_drive, tmp_path):
-    drive = read_drive(small_drive, DriveConfig(limit=3))
+def test_images_are_shown_as_they_are_looked_at(tiny_drive, tmp_path):
+    drive = read_drive(tiny_drive, DriveConfig(limit=3))
     shown: list[list[int]] = []
 
     class Watching(Unwatched):

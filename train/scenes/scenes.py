@@ -34,14 +34,23 @@ from train.scenes.remains import litter, with_erased
 from train.scenes.symbols import with_crossing, with_hollow, with_words
 from train.scenes.traffic import traffic
 from train.scenes.views import TrainingView, mounted_otherwise, random_view, turned_aside
-from train.scenes.weather import dusk, in_the_dark, low_sun, photographed, rain, sun_flecks
+from train.scenes.weather import (
+    Dapple,
+    dusk,
+    in_the_dark,
+    low_sun,
+    photo_tile,
+    photographed,
+    rain,
+    sun_flecks,
+)
 from train.scenes.windscreen import before_lens
 from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import SEEN_ACROSS, FloatArray
 from v2hdm.simulate.render.renderer import Rendered, Renderer
-from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
+from v2hdm.simulate.render.scene import Backdrop, Bgr, Ground, Light, Scene, Shadow
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
@@ -233,7 +242,7 @@ def random_scene(
             *traffic(for_traffic, hardships.traffic),
         ),
         shadows=shadows + shadows_on_paint(for_shadows, road.paints, hardships.shadows_on_paint),
-        dapples=dapples + sun_flecks(for_weather, hardships.sun_flecks),
+        shades=dapples + sun_flecks(for_weather, hardships.sun_flecks),
         light=light,
         backdrop=_backdrop(rng),
     )
@@ -271,7 +280,7 @@ def _ground(rng: np.random.Generator, port: bool, difficulty: float) -> Ground:
     slabs = (concrete and rng.random() < 0.75) or rng.random() < 0.08
     return Ground(
         albedo_bgr=(blue, green, red),
-        texture=texture,
+        texture=texture if texture in ("concrete", "asphalt") else photo_tile(texture),
         contrast=float(rng.uniform(0.2, 0.6) if texture == "grass" else rng.uniform(0.04, 0.32)),
         stains=float(rng.uniform(0.03, 0.1 + 0.22 * difficulty)),
         slab_m=(float(rng.uniform(2, 9)), float(rng.uniform(2, 9))) if slabs else None,

@@ -1,18 +1,89 @@
-"""Light and weather that photographs have: rain, low sun, dusk, spots of sun; and photographed grounds."""
+"""Light and weather that photographs have: rain, low sun, dusk, shade of leaves; and photographed grounds."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from train.scenes.windscreen import LOW_SUN_SINE, RAINED_FRACTION, is_dusk
+from v2hdm.records import FloatArray
+from v2hdm.simulate.render.ground import GroundField, inward_lines, on_ground_px, texture_shift
 from v2hdm.simulate.render.renderer import Optics
-from v2hdm.simulate.render.scene import Dapple, Ground, Light
-from v2hdm.simulate.render.textures import GROUNDS
+from v2hdm.simulate.render.scene import Float32, Ground, Light, Tile, noise_tile, sample, smoothstep
+from v2hdm.simulate.render.view import View, bands_of, outlines
+
+_TILE_PX = 512
+_GROUNDS = Path(__file__).parent / "grounds"
+GROUNDS = tuple(sorted(path.stem for path in _GROUNDS.glob("*.jpg")))
+"""Photographs of asphalt and concrete that come with the training; see their README."""
 
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10)[:6])
 """Of the sizes that the renderer keeps tiles for, those of gaps in near leaves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dapple:
+    """The broken shade of foliage: ``shaded`` fraction of the ground, flecks of about ``scale_m``.
+
+    ``region_map`` (N, 2) bounds it to a convex polygon; None means everywhere. It is a shade of a scene.
+    """
+
+    shaded: float = 0.6
+    scale_m: float = 1.0
+    transmission: float = 0.1
+    region_map: FloatArray | None = None
+    seed: int = 0
+
+    def __call__(self, view: View, field: GroundField, out: Float32) -> None:
+        """Lower the sun's visibility ``out`` (H, W)."""
+        tile = noise_tile(15, 40.0 * self.scale_m, 1.1, finest_px=3.0)
+        level = float(np.quantile(tile.values[::8, ::8], self.shaded))
+        parts = [(slice(None), slice(None))]
+        if self.region_map is not None:
+            (shape,) = outlines(view, [on_ground_px(view, self.region_map)])
+            found, count = (np.empty((0, 4)), 0) if shape is None else bands_of(view, shape, field.first_row)
+            rows = found[:count] - np.array([field.first_row, field.first_row, 0, 0])
+            parts = [(slice(top, end), slice(left, right)) for top, end, left, right in rows.tolist()]
+        for part in parts:
+            x, y, footprint = field.x_m[part], field.y_m[part], field.footprint_m[part]
+            lit = smoothstep(sample(tile, x, y, texture_shift(self.seed)), level - 0.12, level + 0.12)
+            amplitude = _fade(tile, footprint, 8.0)
+            lit = lit * amplitude + (np.float32(1.0) - amplitude) * np.float32(1.0 - self.shaded)
+            dark = (np.float32(1.0) - lit) * np.float32(1.0 - self.transmission)
+            if self.region_map is not None:
+                lines = inward_lines(np.asarray(self.region_map, dtype=np.float64))
+                least = np.min([x * a + y * b - d for a, b, d in lines], axis=0)
+                dark *= np.clip(least * np.float32(2.0) + np.float32(0.5), 0, 1)
+            out[part] *= np.float32(1.0) - dark
+
+
+def _fade(tile: Tile, footprint_m: Float32, finest_px: float) -> Float32:
+    """Amplitude (H, W) left to a tile whose finest wavelength is ``finest_px`` tile pixels."""
+    finest_m = finest_px * tile.side_m / tile.values.shape[0]
+    return np.asarray(np.float32(1.0) / (np.float32(1.0) + (footprint_m * np.float32(1.0 / finest_m)) ** 2))
+
+
+@cache
+def photo_tile(name: str, side_m: float = 3.0) -> Tile:
+    """A photographed surface, mirrored to be seamless: of :data:`GROUNDS`, or scikit-image's.
+
+    The latter are ``gravel``, ``grass`` and ``brick``.
+    """
+    if name in GROUNDS:
+        whole = np.asarray(cv2.imread(str(_GROUNDS / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    else:
+        import skimage.data
+
+        whole = getattr(skimage.data, name)()
+    photo = cv2.resize(whole, (_TILE_PX // 2, _TILE_PX // 2), interpolation=cv2.INTER_AREA)
+    values = photo.astype(np.float32)
+    values = (values - values.mean()) / values.std()
+    mirrored = np.vstack([np.hstack([values, values[:, ::-1]]), np.hstack([values, values[:, ::-1]])[::-1]])
+    return Tile(np.ascontiguousarray(mirrored), side_m)
 
 
 def rain(rng: np.random.Generator, ground: Ground, light: Light, share: float) -> tuple[Ground, Light]:
@@ -90,7 +161,9 @@ def photographed(rng: np.random.Generator, ground: Ground, share: float) -> Grou
     """This ground, or in a ``share`` of cases, if it is asphalt or concrete, with a photographed grain."""
     if rng.random() >= share or ground.texture not in ("asphalt", "concrete"):
         return ground
-    return replace(ground, texture=str(rng.choice(GROUNDS)), contrast=float(rng.uniform(0.03, 0.2)))
+    return replace(
+        ground, texture=photo_tile(str(rng.choice(GROUNDS))), contrast=float(rng.uniform(0.03, 0.2))
+    )
 
 
 def _bgr(colour: np.ndarray) -> tuple[float, float, float]:

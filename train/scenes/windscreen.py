@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render.ground import intersect_ground
-from v2hdm.simulate.render.scene import Light, Scene
-from v2hdm.simulate.render.textures import Float32
+from v2hdm.simulate.render.scene import Float32, Light, Scene
 from v2hdm.simulate.render.view import View
 
 Hidden = NDArray[np.bool_]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
+from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -94,7 +94,7 @@ def check_options(options: SolveOptions) -> None:
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
     if unknown:
         raise AdjustError(f"unknown pose state '{unknown[0]}': choose from {', '.join(POSE_STATES)}")
-    for name, choices in (("loss", LOSSES), ("solver", SOLVERS), ("engine", ENGINES)):
+    for name, choices in (("loss", LOSSES), ("engine", ENGINES)):
         chosen = getattr(options, name)
         if chosen not in choices:
             raise AdjustError(f"unknown {name} '{chosen}': choose from {', '.join(choices)}")

@@ -83,23 +83,19 @@ class CornerFactor:
         return out
 
 
-def factorise_corners(
-    arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, Tensor], damping: float
-) -> CornerFactor:
+def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, Tensor]) -> CornerFactor:
     """Factorise V.
 
     Args:
         arrays: the problem.
         blocks: (N, 2, 2) J'J of the observations and the survey by corner.
         by_length: derivatives (M, 2) of the lengths' residuals by their first and their second corners.
-        damping: added to the diagonal, relative to it.
 
     Raises:
         AdjustError: corners that lengths join cannot be solved for together.
     """
-    grow = 1 + damping
     xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
-    lower = cholesky_2x2(xx * grow + CORNER_FLOOR, yx, yy * grow + CORNER_FLOOR)
+    lower = cholesky_2x2(xx + CORNER_FLOOR, yx, yy + CORNER_FLOOR)
     units = arrays.unit_bounds[0]
     size, groups = torch.diff(units), []
     for corners in torch.unique(size[size > 1]).tolist():
@@ -109,7 +105,7 @@ def factorise_corners(
         matrix[:, k, :, k, :] = blocks[group.index].transpose(0, 1)
         _add_lengths(arrays, group, by_length, matrix)
         matrix = matrix.view(len(matrix), 2 * corners, 2 * corners)
-        matrix.diagonal(dim1=1, dim2=2).mul_(grow).add_(CORNER_FLOOR)
+        matrix.diagonal(dim1=1, dim2=2).add_(CORNER_FLOOR)
         factor, failed = torch.linalg.cholesky_ex(matrix)
         if bool(failed.any()):
             raise AdjustError(INSEPARABLE)

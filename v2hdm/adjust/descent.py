@@ -24,8 +24,6 @@ _ITERATIONS_PER_WHITENING = 12
 # Evaluations that a whitening takes as long as.
 RENEWAL = 2.0
 RENEWAL_WITH_STATES = 10.0
-_MAX_LM_DAMPING = 1e8
-_MIN_LM_DAMPING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,6 @@ def descend(
     engine: Engine,
     estimate: Estimate,
     robust: Loss,
-    solver: str,
     tolerance: float,
     max_refreshes: int,
     max_evaluations: int,
@@ -133,7 +130,7 @@ def descend(
     whitening = opening or open_descent(engine, estimate, robust)
     del opening
     plan, renewal = whitening.plan, RENEWAL_WITH_STATES if engine.arrays.states else RENEWAL
-    evaluations, refreshes, damping, progressing, slow = 0, 0, 0.0, True, False
+    evaluations, refreshes, progressing, slow = 0, 0, True, False
     while True:
         scale = whitening.robust.scale
         final = scale <= robust.scale
@@ -142,17 +139,14 @@ def descend(
         gap = predicted_gap(cost, gradient)
         refreshes += 1
         ended = (
-            (final and gap <= tolerance and damping == 0)
-            # Each step of Levenberg-Marquardt has a whitening of its own.
-            or (refreshes > max_refreshes and solver != "lm")
+            (final and gap <= tolerance)
+            or refreshes > max_refreshes
             or evaluations >= max_evaluations
             or not progressing
         )
         whitened, reached, made = torch.zeros_like(gradient), cost, None
         if ended:
-            made = whitening if damping == 0 else None
-        elif solver == "lm":
-            whitened, reached, damping = _newton_step(objective, cost, gradient, damping)
+            made = whitening
         else:
             inner = tolerance if final else _ANNEALING_TOLERANCE
             # One that follows a slow one was made near enough: what slows it is the loss, not the distance.
@@ -169,13 +163,13 @@ def descend(
             at = engine, plan, point.estimate, used, point.terms
             return Descent(*at, gap, evaluations, progressing, singular, made)
         estimate = point.estimate
-        progressing = float(reached) < float(cost) or not final or 0 < damping < _MAX_LM_DAMPING
+        progressing = float(reached) < float(cost) or not final
         # The old factor and what led away from it go before the new one comes.
         del whitening, objective, whitened, gradient, point
         if not final:
             narrowed = annealed_scale(engine, estimate, robust.scale)
             scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
-        whitening = factorise(engine, plan, estimate, Loss(robust.name, scale), damping)
+        whitening = factorise(engine, plan, estimate, Loss(robust.name, scale))
 
 
 def open_descent(engine: Engine, estimate: Estimate, robust: Loss) -> Whitening:
@@ -184,13 +178,3 @@ def open_descent(engine: Engine, estimate: Estimate, robust: Loss) -> Whitening:
     if robust.name != "none":
         scale = annealed_scale(engine, estimate, scale)
     return factorise(engine, engine.plan(), estimate, Loss(robust.name, scale))
-
-
-def _newton_step(
-    objective: Objective, cost: Tensor, gradient: Tensor, damping: float
-) -> tuple[Tensor, Tensor, float]:
-    """One damped Gauss-Newton step of Levenberg-Marquardt; a rejected one raises the damping."""
-    reached, _ = objective(-gradient)
-    if float(reached) <= float(cost):
-        return -gradient, reached, damping / 10 if damping > _MIN_LM_DAMPING else 0.0
-    return torch.zeros_like(gradient), cost, min(max(10 * damping, _MIN_LM_DAMPING), _MAX_LM_DAMPING)

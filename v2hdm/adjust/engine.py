@@ -122,9 +122,7 @@ class Engine(ABC):
         """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
 
     @abstractmethod
-    def eliminate(
-        self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
-    ) -> Linearised:
+    def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> Linearised:
         """Linearise, and subtract the eliminated corners from the reduced system.
 
         Raises:

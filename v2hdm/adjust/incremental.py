@@ -158,8 +158,7 @@ class IncrementalMap:
         Raises:
             AdjustError: it has two sightings of a corner in one image.
         """
-        cameras = np.unique(sighted.observations.camera)
-        problem = self._problem([sighted], cameras)
+        problem, _ = self._problem([sighted])
         arrays = make_arrays(problem, (), "cpu")
         engine = make_engine(self._options.engine, arrays)
         corners, fixed = engine.back_project(torch.from_numpy(problem.cam_from_vehicle))
@@ -236,8 +235,7 @@ class IncrementalMap:
         if not self._sighted:
             raise AdjustError("there is no marking to adjust")
         every = list(self._sighted.values())
-        cameras = np.unique(np.concatenate([one.observations.camera for one in every]))
-        problem = self._problem(every, cameras)
+        problem, cameras = self._problem(every)
         options = replace(self._options, coarse=self._options.coarse and self._earlier is None)
         solution = _sound(solve(problem, options), "the map")
         information = solution.covariance.camera_information()
@@ -253,13 +251,13 @@ class IncrementalMap:
 
     def _linearised(self, earlier: _Quadratic, marking: int, sighted: Sighted) -> tuple[_Own, _Settled]:
         """A marking, and what it says of the cameras, where ``earlier`` and it agree."""
-        cameras = np.unique(sighted.observations.camera)
+        problem, cameras = self._problem([sighted])
         rows, mean = earlier.rows(cameras), earlier.mean
         marginal = np.linalg.inv(np.linalg.inv(earlier.information)[np.ix_(rows, rows)])
         marginal = (marginal + marginal.T) / 2
         base = earlier.base[np.searchsorted(earlier.cameras, cameras)]
         problem = replace(
-            self._problem([sighted], cameras),
+            problem,
             centre_vehicle=None,
             centre_sigma_m=None,
             clock_sigma_s=np.inf,
@@ -288,35 +286,16 @@ class IncrementalMap:
         own = _Own(rows, information, vector)
         return own, _Settled(everywhere, solution.corners_map, gain, own)
 
-    def _problem(self, sighted: Sequence[Sighted], cameras: IntArray) -> Problem:
-        """Some markings as a problem of the cameras and frames that saw them."""
-        drive, starts = self._drive, np.cumsum([0, *(one.corner_count for one in sighted)])
+    def _problem(self, sighted: Sequence[Sighted]) -> tuple[Problem, IntArray]:
+        """Some markings as a problem of the cameras and frames that saw them, and which these cameras are."""
+        starts = np.cumsum([0, *(one.corner_count for one in sighted)])
         seen = _stacked([one.observations for one in sighted])
         corner = seen.corner + np.repeat(starts[:-1], [len(one.observations.corner) for one in sighted])
-        frames, frame = np.unique(seen.frame, return_inverse=True)
-
-        def of(values: FloatArray | None, rows: IntArray) -> FloatArray | None:
-            return None if values is None else values[rows]
-
-        return replace(
-            drive,
-            intrinsic=drive.intrinsic[cameras],
-            cam_from_vehicle=self.cam_from_vehicle[cameras],
-            map_from_vehicle=drive.map_from_vehicle[frames],
-            observations=replace(
-                seen, camera=np.searchsorted(cameras, seen.camera), frame=frame, corner=corner
-            ),
-            corner_count=int(starts[-1]),
-            centre_vehicle=of(drive.centre_vehicle, cameras),
-            centre_sigma_m=of(drive.centre_sigma_m, cameras),
-            corners_start=None,
-            visit=None if drive.visit is None else drive.visit[frames],
-            twist_vehicle=of(drive.twist_vehicle, frames),
-            read_out_s=of(drive.read_out_s, cameras),
-            control=_known([one.control for one in sighted], starts),
-            lengths=_known([one.lengths for one in sighted], starts),
-            camera_prior=None,
-        )
+        drive = replace(self._drive, cam_from_vehicle=self.cam_from_vehicle)
+        problem, cameras, _ = drive.seen_by(replace(seen, corner=corner))
+        control = _known([one.control for one in sighted], starts)
+        lengths = _known([one.lengths for one in sighted], starts)
+        return replace(problem, control=control, lengths=lengths), cameras
 
 
 def _scale(information: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ the camera's *centre in the vehicle frame*, which a survey measures, and not on 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,6 @@ READ_OUT_SIGMA_S = 0.03
 phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
-SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
 ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
 
 
@@ -228,6 +227,22 @@ class Problem:
     camera_prior: CameraPrior | None = None
     visit: IntArray | None = None
 
+    def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
+        """With the cameras and frames of some ``observations`` alone, and which of its own these are.
+
+        What is known of corners is left out: they are those of the observations.
+        """
+        cameras, camera = np.unique(observations.camera, return_inverse=True)
+        frames, frame = np.unique(observations.frame, return_inverse=True)
+        of_cameras = "intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s"
+        of_frames = "map_from_vehicle", "twist_vehicle", "visit"
+        rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
+        own = {name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None}
+        seen = replace(observations, camera=camera, frame=frame)
+        own |= {"corners_start": None, "control": None, "lengths": None, "camera_prior": None}
+        count = int(observations.corner.max(initial=-1)) + 1
+        return replace(self, observations=seen, corner_count=count, **own), cameras, frames
+
     @property
     def visit_of_frame(self) -> IntArray:
         """The visit (J,) that each frame is of."""
@@ -258,12 +273,10 @@ class SolveOptions:
         loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
         loss_scale: residual, in standard deviations, from which the loss departs from least squares.
         gate_probability: share of sound observations that the verdict on outliers may cost.
-        solver: ``lbfgs``, or ``lm`` (Schur-complement Levenberg-Marquardt) to cross-check.
         coarse: where the start is far off, or the problem large, first solve a subset of steep rays, which
             converges from ten degrees away.
         gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
-        max_refreshes: how often the problem is whitened anew at most; ``lm`` does so at each step, and is
-            limited by its evaluations alone.
+        max_refreshes: how often the problem is whitened anew at most.
         max_evaluations: of cost and gradient, over all refreshes.
         engine: who evaluates and linearises, of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU,
             ``torch`` by autograd anywhere; ``auto`` is numba on the CPU, torch elsewhere.
@@ -276,7 +289,6 @@ class SolveOptions:
     loss: str = "cauchy"
     loss_scale: float = 2.0
     gate_probability: float = 1e-4
-    solver: str = "lbfgs"
     coarse: bool = True
     gap_tolerance: float = 1e-11
     max_refreshes: int = 20

@@ -219,21 +219,21 @@ class ReducedSystem:
         places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
         self.matrix.values.index_add_(0, places.flatten(), values.flatten())
 
-    def factorise(self, priors: PriorBlocks, damping: float) -> tuple[TiledCholesky, float] | None:
+    def factorise(self, priors: PriorBlocks, jitter: float) -> tuple[TiledCholesky, float] | None:
         """Put it together and factorise; the factor takes its place.
 
-        ``damping`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
+        ``jitter`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
         share of U's diagonal; None where S cannot be factorised.
         """
         self._add_frames(priors)
         diagonal = [*self._diagonal.view(self.plan.tile_count, self.plan.size), self._add_cameras(priors)]
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
-            self.matrix.tiles[key].diagonal().add_(values, alpha=damping)
+            self.matrix.tiles[key].diagonal().add_(values, alpha=jitter)
         factor = factorise_tiles(self.matrix)
         if factor is None:
             return None
-        return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())
+        return factor, float((factor.pivots() / (1 + jitter) / torch.cat(diagonal)).min())
 
     def _add_cameras(self, priors: PriorBlocks) -> Tensor:
         """Add the cameras' own information and priors; returns its diagonal."""

@@ -11,13 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from v2hdm.adjust.problem import KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.tensors import exp
+from v2hdm.geometry.rigid import exp
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
@@ -194,7 +193,7 @@ def predicted_squared(
         if seen.row_share is not None:
             late_s = late_s + solution.read_out_s[camera] * seen.row_share[held_out]
         moved = fitted.twist_vehicle[frame - first] * late_s[:, None]
-        vehicle_from_map = exp(torch.as_tensor(-moved)).numpy() @ vehicle_from_map
+        vehicle_from_map = exp(-moved) @ vehicle_from_map
     cam_from_map = solution.cam_from_vehicle[camera] @ vehicle_from_map
     points_map = solution.corners_map[np.searchsorted(corners, seen.corner[held_out])]
     ground = np.column_stack([points_map, np.zeros(len(points_map)), np.ones(len(points_map))])

@@ -22,7 +22,7 @@ from v2hdm.adjust.start import coarse_extrinsics, is_near, is_worth_a_look
 from v2hdm.adjust.validation import as_of_point, classify, noise_scale, variance_factors
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.tensors import exp
+from v2hdm.geometry.rigid import exp
 from v2hdm.records import FloatArray
 
 
@@ -63,7 +63,6 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
         engine,
         start,
         robust,
-        options.solver,
         options.gap_tolerance,
         options.max_refreshes,
         options.max_evaluations,
@@ -145,9 +144,7 @@ def _report(
     if options.read_out:
         clock_s, read_out_s = clock_s[:, :-1], read_out_s + clock_s[:, -1]
     if arrays.states:
-        off = exp(frame_tangent(arrays, estimate.frame_state))
-        recorded = torch.as_tensor(map_from_vehicle, dtype=off.dtype, device=off.device)
-        map_from_vehicle = (recorded @ off).cpu().numpy()
+        map_from_vehicle = map_from_vehicle @ exp(frame_tangent(arrays, estimate.frame_state).cpu().numpy())
     return Solution(
         status=_status(descent, options, bool(behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),

@@ -62,9 +62,7 @@ def coarse_extrinsics(engine: Engine, cam_from_vehicle: Tensor) -> tuple[Tensor,
         opening = open_descent(part, start, _LOSS)
         if min_sine > _MIN_DEPRESSION_SINES[-1] and is_near(opening):
             continue
-        descent = descend(
-            part, start, _LOSS, "lbfgs", _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS, opening
-        )
+        descent = descend(part, start, _LOSS, _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS, opening)
         cam_from_vehicle = descent.estimate.cam_from_vehicle
         evaluations += descent.evaluations
     return cam_from_vehicle, evaluations

@@ -117,12 +117,8 @@ def whitened_gradient(
     return torch.cat([factor.solve(rest[:, None])[:, 0], corners.flatten()])
 
 
-def factorise(
-    engine: Engine, plan: Plan, estimate: Estimate, robust: Loss, damping: float = 0.0
-) -> Whitening:
+def factorise(engine: Engine, plan: Plan, estimate: Estimate, robust: Loss) -> Whitening:
     """Whitening at ``estimate``, under the weights that the loss gives there.
-
-    ``damping`` is added to the diagonal of the Hessian, relative to it (Levenberg-Marquardt).
 
     Raises:
         AdjustError: the normal equations cannot be factorised.
@@ -130,8 +126,8 @@ def factorise(
     spread, priors = engine.spread(estimate), engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:
         system = ReducedSystem(engine.arrays, plan, spread)
-        linearised = engine.eliminate(system, estimate, robust, damping)
-        factorised = system.factorise(priors, damping + jitter)
+        linearised = engine.eliminate(system, estimate, robust)
+        factorised = system.factorise(priors, jitter)
         if factorised is None:
             continue
         factor, smallest_pivot = factorised

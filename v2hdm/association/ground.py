@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, Sightings, Symbols, frames_of
@@ -209,26 +208,17 @@ def easy_views(
         group = np.repeat(whole, [len(n) for n in near])
         view = np.flatnonzero(own)[np.concatenate([np.asarray(n, dtype=np.int64) for n in near])]
         vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
-        seen = _sees(camera, rig.cam_from_vehicle[c], vehicle_from_map, corners_map[group], within_m)
+        cam_from_vehicle, corners = rig.cam_from_vehicle[c], corners_map[group]
+        corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners)
+        if within_m is None:
+            seen = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
+        else:
+            seen = (np.linalg.norm(corners_vehicle - centre, axis=2) <= within_m).all(axis=1)
+        pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners)
+        limit = np.array([camera.info.width, camera.info.height]) - BORDER_PX
+        with np.errstate(invalid="ignore"):
+            seen &= ((pixel > BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
         groups.append(group[seen])
         images.append(views.image[view[seen]])
     empty = [np.zeros(0, dtype=np.int64)]
     return np.concatenate(groups or empty), np.concatenate(images or empty)
-
-
-def _sees(
-    camera: Camera,
-    cam_from_vehicle: FloatArray,
-    vehicle_from_map: FloatArray,
-    corners_map: FloatArray,
-    within_m: float | None,
-) -> NDArray[np.bool_]:
-    """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
-    corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners_map)
-    away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
-    near = inside_convex(camera.roi_vehicle, corners_vehicle) if within_m is None else away_m <= within_m
-    pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
-    limit = np.array([camera.info.width, camera.info.height]) - BORDER_PX
-    with np.errstate(invalid="ignore"):
-        on_image = ((pixel > BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
-    return np.asarray(near.all(axis=1) & on_image)

@@ -216,15 +216,14 @@ class Surface:
         paths: of the visits.
         parameters: (B,) slopes a of the cross-section, left ones first, then c, across within along.
         covariance: (B, B) of them.
-        knots: the spline's first along the way, m, the way between two, m, and how many functions they
-            make; None where there is the cross-section alone.
+        knots: the spline's first along the way, m, the way between two, m, and how many functions they make.
         datum_m: what is added to all heights.
     """
 
     paths: Paths
     parameters: FloatArray
     covariance: FloatArray
-    knots: tuple[float, float, int] | None = None
+    knots: tuple[float, float, int]
     datum_m: float = 0.0
     _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
@@ -233,28 +232,23 @@ class Surface:
         object.__setattr__(self, "_stands", tuple(one @ self.parameters for one in self._footprints()))
 
     @classmethod
-    def level(cls, paths: Paths, spline: bool = True) -> Surface:
-        """A plane, to begin with; without a ``spline`` it can only become a cross-section."""
-        knots, size = None, _HINGES
-        if spline:
-            begin_m, end_m = (paths.station_m[[0, -1]] + [-_AHEAD_M, _AHEAD_M]).tolist()
-            step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
-            knots = begin_m, step_m, int(np.ceil((end_m - begin_m) / step_m)) + 3
-            size += knots[2] * _ACROSS
-        return cls(paths, np.zeros(size), np.zeros((size, size)), knots)
+    def level(cls, paths: Paths) -> Surface:
+        """A plane, to begin with."""
+        begin_m, end_m = (paths.station_m[[0, -1]] + [-_AHEAD_M, _AHEAD_M]).tolist()
+        step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
+        along = int(np.ceil((end_m - begin_m) / step_m)) + 3
+        size = _HINGES + along * _ACROSS
+        return cls(paths, np.zeros(size), np.zeros((size, size)), (begin_m, step_m, along))
 
     def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
         """The derivative (K, B) by the parameters of heights at stations (K,), to the left (K,)."""
-        hinges = csr_array(_hinges(left_m))
-        if self.knots is None:
-            return hinges
         i, by_way = _cubic(station_m, *self.knots)
         j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
         index = (i[:, :, None] * _ACROSS + j[:, None, :]).reshape(-1)
         value = (by_way[:, :, None] * by_side[:, None, :]).reshape(-1)
         bounds = 16 * np.arange(len(station_m) + 1)
         spline = csr_array((value, index, bounds), (len(station_m), self.knots[2] * _ACROSS))
-        return csr_array(hstack([hinges, spline]))
+        return csr_array(hstack([csr_array(_hinges(left_m)), spline]))
 
     def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
         """Height, slope along the heading and to the left (F, B each) under each frame by the parameters."""
@@ -348,10 +342,8 @@ class Surface:
             odds = np.log(own.diagonal()).sum() - np.log(lower.diagonal()).sum() + fit @ fit / 2
             return float(np.sum((sizes - usual) ** 2) / (2 * _SIZES**2) - odds)
 
-        best = usual
-        if self.knots is not None:
-            search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
-            best = minimize(cost, usual, method="Nelder-Mead", options=search).x
+        search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
+        best = minimize(cost, usual, method="Nelder-Mead", options=search).x
         covariance = np.asarray(np.linalg.inv(whole + self._smoothness(best)), dtype=np.float64)
         parameters = covariance @ towards
         moved = parameters - self.parameters
@@ -361,9 +353,6 @@ class Surface:
 
     def _smoothness(self, sizes: FloatArray) -> FloatArray:
         """The prior's information (B, B), by the logarithms of the sizes (3,) of second differences."""
-        slopes = np.full(_HINGES, _SLOPE_SIGMA**-2)
-        if self.knots is None:
-            return np.diag(slopes)
         _, step_m, along = self.knots
         ways = [[np.eye(n), np.diff(np.eye(n), axis=0) / h, np.diff(np.eye(n), 2, axis=0) / h**2]
                 for n, h in ((along, step_m), (_ACROSS, _ACROSS_M))]  # fmt: skip
@@ -371,16 +360,11 @@ class Surface:
         spline = np.eye(along * _ACROSS) / _RIDGE_M**2
         for size, order in zip(np.exp(-2 * sizes).tolist(), (2, 1, 0), strict=True):
             spline += size * np.kron(grams[0][order], grams[1][2 - order])
-        return np.asarray(block_diag(np.diag(slopes), spline))
+        return np.asarray(block_diag(_SLOPE_SIGMA**-2 * np.eye(_HINGES), spline))
 
     def _recorded(self, recorded: Recorded) -> tuple[FloatArray, FloatArray, float]:
-        """Information (B, B) of what was recorded on the path, that times its values (B,), the mean height.
-
-        A cross-section says nothing of the path, nor the path of it.
-        """
+        """Information (B, B) of what was recorded on the path, that times its values, and the mean height."""
         size = len(self.parameters)
-        if self.knots is None:
-            return np.zeros((size, size)), np.zeros(size), 0.0
         frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
         height, slope = recorded.at(self.paths.position_map[frame])
         ahead, station = self.paths.heading[frame], self.paths.station_m[self.paths.place[frame]]
@@ -431,13 +415,9 @@ class Surface:
     def flattened_px(
         self, intrinsic: FloatArray, cam_from_map: FloatArray, frame: IntArray, pixels: FloatArray
     ) -> FloatArray:
-        """Where images would show on the plane what they show at pinhole pixels (K, 2) of the ground.
+        """Where images would show on the plane what they show at pinhole ``pixels`` (K, 2) of the ground.
 
-        Args:
-            intrinsic: (K, 3, 3).
-            cam_from_map: (K, 4, 4).
-            frame: (K,).
-            pixels: (K, 2).
+        Each is of a camera ``intrinsic`` (K, 3, 3) at ``cam_from_map`` (K, 4, 4), taken at ``frame`` (K,).
         """
         turn = cam_from_map[:, :3, :3]
         cam = np.linalg.solve(intrinsic, np.column_stack([pixels, np.ones(len(pixels))])[..., None])

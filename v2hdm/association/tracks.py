@@ -7,7 +7,7 @@ grows with the motion between the images, and only later compared across gaps, l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -15,26 +15,14 @@ from scipy.optimize import linear_sum_assignment
 from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.options import AssociationOptions
-from v2hdm.association.sightings import NO_SYMBOLS, Rig, Sightings
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
 _REFUSED = 1e9  # cost of a pair that the assignment must not make
 _POSITION_FLOOR_M = 0.02
 """Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """The errors that gates allow for.
-
-    ``direction_rad`` of an extrinsic, ``jitter_rad`` of roll and pitch from frame to frame, ``position_m``.
-    """
-
-    direction_rad: float
-    jitter_rad: float
-    position_m: float
 
 
 @dataclass
@@ -58,64 +46,22 @@ def build_tracks(
     sightings: Sightings,
     located: Located,
     rig: Rig,
-    uncertainty: Uncertainty,
+    direction_rad: float,
+    noise: PoseNoise,
     options: AssociationOptions,
 ) -> Association:
     """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
 
-    A sighting continues at most one track and a track takes at most one sighting of an image. A
-    sighting that continues none starts its own. Sightings with fewer than two valid corners on the
-    ground belong to no track. No track outlives its visit: each visit is linked by itself.
+    ``direction_rad`` is how far an extrinsic is off, ``noise`` how far poses are. A sighting continues at
+    most one track and a track takes at most one sighting of an image. A sighting that continues none starts
+    its own. Sightings with fewer than two valid corners on the ground belong to no track. No track outlives
+    its visit.
     """
-    visit = sightings.visit[sightings.frame]
-    rows = [np.flatnonzero(visit == own) for own in np.unique(visit)]
-    linked = [_link(*_of_visit(sightings, located, rig, own), uncertainty, options) for own in rows]
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
-    # Tracks are numbered camera by camera, and of each visit by visit.
-    counts = np.array([count for *_, count in linked], dtype=np.int64).reshape(-1, len(sightings.cameras))
-    before = np.cumsum(counts.T.flatten()).reshape(counts.T.shape).T - counts
-    for own, (number, turn, _), first in zip(rows, linked, before, strict=True):
-        group[own] = np.where(number >= 0, number + first[sightings.camera[own]], -1)
-        shift[own] = turn
-    return Association(group, shift, int(counts.sum()))
-
-
-def _of_visit(
-    sightings: Sightings, located: Located, rig: Rig, rows: IntArray
-) -> tuple[Sightings, Located, FloatArray]:
-    """The ``rows`` of one visit and its frames alone: sightings, where they lie, and its poses."""
-    own = sightings.subset(rows)
-    frames = slice(int(own.frame.min()), int(own.frame.max()) + 1)
-    own = replace(
-        own,
-        frame=own.frame - frames.start,
-        stamp_s=own.stamp_s[frames],
-        map_from_vehicle=own.map_from_vehicle[frames],
-        visit=own.visit[frames],
-        symbols=NO_SYMBOLS,
-    )
-    place = Located(**{name: values[rows] for name, values in vars(located).items()})
-    return own, place, rig.map_from_vehicle[frames]
-
-
-def _link(
-    sightings: Sightings,
-    located: Located,
-    map_from_vehicle: FloatArray,
-    uncertainty: Uncertainty,
-    options: AssociationOptions,
-) -> tuple[IntArray, IntArray, list[int]]:
-    """Link the sightings of one visit, whose frames have the poses ``map_from_vehicle``.
-
-    Returns the track's number (S,) among those of the camera, -1 in none; shifts; and tracks by camera.
-    """
-    number = np.full(len(sightings), -1, dtype=np.int64)
-    shift = np.zeros(len(sightings), dtype=np.int64)
-    linker = _Linker(sightings, located, map_from_vehicle, uncertainty, options)
-    counts = []
+    linker = _Linker(sightings, located, rig.map_from_vehicle, direction_rad, noise, options)
+    count = 0
     for camera in range(len(sightings.cameras)):
-        count = 0
         rows_of_camera = np.flatnonzero((sightings.camera == camera) & (located.valid.sum(axis=1) >= 2))
         images = np.flatnonzero(np.diff(sightings.image[rows_of_camera], prepend=-1) != 0)
         active: list[_Track] = []
@@ -132,9 +78,8 @@ def _link(
                     track = _Track(count, row, located.corners_map[row].copy(), located.valid[row].copy())
                     active.append(track)
                     count += 1
-                number[row] = track.number
-        counts.append(count)
-    return number, shift, counts
+                group[row] = track.number
+    return Association(group, shift, count)
 
 
 class _Linker:
@@ -145,24 +90,28 @@ class _Linker:
         sightings: Sightings,
         located: Located,
         map_from_vehicle: FloatArray,
-        uncertainty: Uncertainty,
+        direction_rad: float,
+        noise: PoseNoise,
         options: AssociationOptions,
     ) -> None:
         self._sightings, self._located = sightings, located
-        self._uncertainty, self._options = uncertainty, options
+        self._direction_rad, self._options = direction_rad, options
         steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
         self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
         self._ray_map = mean_corners(located.ray_map, located.valid)
         self._range_m = np.linalg.norm(self._ray_map, axis=1)
-        self._noise_m2 = _noise_covariances(located, self._ray_map, uncertainty)
+        self._noise_m2 = _noise_covariances(located, self._ray_map, noise)
         self._centre_map = mean_corners(located.corners_map, located.valid)
         self._size_m = diameters(located.corners_map, located.valid)
 
     def is_alive(self, track: _Track, row: int) -> bool:
         """Whether ``track`` may still be continued by the sighting at ``row``."""
         now, last = self._sightings.frame[[row, track.row]]
-        return bool(self._odometer_m[now] - self._odometer_m[last] <= self._options.max_gap_m)
+        gap_m = self._odometer_m[now] - self._odometer_m[last]
+        return bool(
+            self._sightings.visit[now] == self._sightings.visit[last] and gap_m <= self._options.max_gap_m
+        )
 
     def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
         """For each row that continues a track: the track and the shift of the row's corners."""
@@ -175,7 +124,8 @@ class _Linker:
         t, d = self._near(last, mean_corners(corners, valid), size_m, rows)
         own = rows[d]
         found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
-        cost = self._mahalanobis2(found.offset, last[t], own)
+        covariance = self._noise_m2[last[t]] + self._noise_m2[own] + self._drift_covariance(last[t], own)
+        cost = np.sum(found.offset * np.linalg.solve(covariance, found.offset[..., None])[..., 0], axis=-1)
         tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], LEAST_TOLERANCE_M)
         shape = found.deformation_m / tolerance_m
         accepted = (cost <= self._options.gate_sigmas**2) & (shape <= 1.0)
@@ -197,12 +147,6 @@ class _Linker:
         pair = np.argwhere(alike & (apart_m <= reach_m))
         return pair[:, 0], pair[:, 1]
 
-    def _mahalanobis2(self, offset: FloatArray, last: IntArray, rows: IntArray) -> FloatArray:
-        """Squared normalised displacements (P,) between tracks' ``last`` sightings and ``rows``."""
-        covariance = self._noise_m2[last] + self._noise_m2[rows] + self._drift_covariance(last, rows)
-        solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
-        return np.asarray(np.sum(offset * solved, axis=-1))
-
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
         """The covariance that a wrong extrinsic adds between the images of two sightings (P, 2, 2).
 
@@ -213,22 +157,22 @@ class _Linker:
         moved_m = np.abs(self._odometer_m[frame[rows]] - self._odometer_m[frame[last]])
         turned = np.abs(self._heading_rad[frame[rows]] - self._heading_rad[frame[last]])
         height_m, range_m = self._located.height_m[rows], self._range_m[rows]
-        direction = self._uncertainty.direction_rad
+        direction = self._direction_rad
         along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
         across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
         return _ray_covariance(self._ray_map[rows], along_m, across_m)
 
 
-def _noise_covariances(located: Located, ray: FloatArray, uncertainty: Uncertainty) -> FloatArray:
+def _noise_covariances(located: Located, ray: FloatArray, noise: PoseNoise) -> FloatArray:
     """Covariance (S, 2, 2) of a sighting's mean position, at the end of ``ray``: pixels, jitter, position."""
     range_m, height_m = np.linalg.norm(ray, axis=1), located.height_m
-    jitter_m = uncertainty.jitter_rad * (range_m**2 + height_m**2) / height_m
+    jitter_m = noise.roll_pitch_rad * (range_m**2 + height_m**2) / height_m
     weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
     pixels = np.sum(
         np.where(located.valid[..., None, None], located.covariance_m2, 0.0) * weight[..., None, None], axis=1
     )
-    spread = _ray_covariance(ray, jitter_m, uncertainty.jitter_rad * range_m)
-    position_m2 = uncertainty.position_m**2 + _POSITION_FLOOR_M**2
+    spread = _ray_covariance(ray, jitter_m, noise.roll_pitch_rad * range_m)
+    position_m2 = noise.position_m**2 + _POSITION_FLOOR_M**2
     return np.asarray(pixels + spread + position_m2 * np.eye(2))
 
 

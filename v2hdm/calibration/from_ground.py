@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from v2hdm.ground import GroundEstimate, estimate_cameras
-from v2hdm.ground.show import draw_matched_ground, lines
+from v2hdm.geometry.mounting import mounting_words
+from v2hdm.ground import GroundEstimate, GroundStatus, Reading, estimate_cameras
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
-from v2hdm.io.safe.pixels import png
 from v2hdm.records import Calibration, Drive
 from v2hdm.report.outputs import write_json
 from v2hdm.verdict import Verdict, check_drive
+
+# Each parameter's name, and the factor and unit that people read it in.
+_NAMES = {
+    "clock_s": ("clock", 1e3, "ms"),
+    "focal_scale": ("focal length", 1e2, "%"),
+    "distortion_k1": ("distortion k1", 1.0, ""),
+    "grade": ("grade of the poses", 1e2, "%"),
+    "up_m": ("centre up", 1e2, "cm"),
+    "forward_m": ("centre forward", 1e2, "cm"),
+    "left_m": ("centre left", 1e2, "cm"),
+}
+
+_WHY = {
+    GroundStatus.NO_MATCH: "the ground does not match between images: check poses, clock and guess",
+    GroundStatus.NO_TEXTURE: "the ground is too dark or too even to be found again: drive in better light",
+    GroundStatus.TOO_LITTLE: "too little ground is seen by two images: drive further, or widen roi_vehicle",
+}
 
 
 @dataclass(frozen=True)
@@ -61,18 +77,37 @@ def calibrate_from_ground(
 
 def summary_lines(found: GroundCalibration) -> list[str]:
     """Every camera's mounting and the verdict, for a terminal."""
-    cameras = [line for estimate in found.estimates.values() for line in lines(estimate)]
+    cameras = [line for estimate in found.estimates.values() for line in _lines(estimate)]
     return [*cameras, found.verdict.lines[0], *(finding.line for finding in found.verdict.raised)]
 
 
+def _lines(estimate: GroundEstimate) -> Iterator[str]:
+    """The estimate for a terminal: a line of figures, and one for each quantity that is not observable."""
+    calibration = estimate.calibration
+    if calibration is None or calibration.covariance is None:
+        reading = estimate.reading
+        other = "" if reading is Reading.AS_GIVEN else f"; it does with the poses read as: {reading.value}"
+        yield f"{estimate.camera}: {_WHY[estimate.status]}{other}"
+        return
+    angles, place = mounting_words(calibration.cam_from_vehicle, calibration.covariance)
+    yield f"{estimate.camera}: {', '.join((*angles, place[2]))}"
+    found = []
+    for parameter in estimate.parameters.values():
+        if parameter.observable:
+            name, factor, unit = _NAMES[parameter.name]
+            value, sigma = factor * parameter.value, factor * parameter.sigma
+            found.append(f"{name} {value:+.2g} +- {sigma:.2g} {unit}".rstrip())
+    if found:
+        yield f"  beside it: {', '.join(found)}"
+    for parameter in estimate.parameters.values():
+        if not parameter.observable:
+            yield f"  cannot tell {_NAMES[parameter.name][0]}: {parameter.why_not}"
+
+
 def write_ground_calibration(found: GroundCalibration, folder: Path) -> None:
-    """Write the verdict, and the calibration and matched ground of each camera that has one."""
+    """Write the verdict, and the calibration of each camera that has one."""
     verdict = found.verdict.as_json()
     write_json(folder / "verdict.json", verdict)
     about = Provenance.today(found.drive.name, verdict)
     for name, calibration in found.calibrations.items():
-        picture = draw_matched_ground(found.drive, found.estimates[name])
-        if picture is not None:
-            path = folder / f"calibration_{name}.yaml"
-            write_calibration(calibration, path, verdict=verdict, about=about)
-            (folder / f"ground_{name}.png").write_bytes(png(picture))
+        write_calibration(calibration, folder / f"calibration_{name}.yaml", verdict=verdict, about=about)

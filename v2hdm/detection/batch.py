@@ -69,8 +69,7 @@ def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolA
 def read_image(image: Image, camera: Camera) -> np.ndarray:
     """Decode an image file of a drive to (H, W, 3) uint8 BGR; grey cameras are taken, too.
 
-    Raises:
-        DriveError: the file is missing, truncated, not 8-bit or not of the camera's size.
+    Raises DriveError where the file is missing, truncated, not 8-bit or not of the camera's size.
     """
     pixels = read_bgr(image.path)
     expected = (camera.info.height, camera.info.width)
@@ -91,12 +90,9 @@ def detect_all(
     """Detect in every image of a drive, in the drive's order.
 
     The result does not depend on the number of ``workers``: processes, one thread each; 1 stays in this
-    process. ``progress(done, total)`` is called after each image.
-
-    Raises:
-        DriveError: an image is missing, damaged or of the wrong size.
-        DetectorError: the model cannot be used.
-        WorkerError: a process died.
+    process. ``progress(done, total)`` is called after each image. Raises DriveError where an image is
+    missing, damaged or of the wrong size, DetectorError where the model cannot be used, WorkerError where a
+    process died.
     """
     options = replace(options) if options else DetectorOptions()
     drive = with_own_vehicle(drive, Detector.load(options=options))  # a bad model is refused here, once
@@ -120,10 +116,8 @@ def detect_images(
 ) -> None:
     """Detect in some images of a drive whose cameras know their own vehicle.
 
-    ``images`` are indices; ``take`` is called with the detections of each, in their order.
-
-    Raises:
-        V2hdmError: as :func:`detect_all`.
+    ``images`` are indices; ``take`` is called with the detections of each, in their order. Raises V2hdmError:
+    as :func:`detect_all`.
     """
     if options.device != "cpu":
         workers = min(workers, _WORKERS_A_GPU)
@@ -172,8 +166,7 @@ def _work(index: int) -> ImageDetections:
 def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
     """The detections of image ``index`` of a drive whose cameras know their own vehicle.
 
-    Raises:
-        DriveError: the image is missing, damaged or of the wrong size.
+    Raises DriveError where the image is missing, damaged or of the wrong size.
     """
     image = drive.images[index]
     camera = drive.cameras[image.camera]

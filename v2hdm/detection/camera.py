@@ -317,8 +317,7 @@ def camera_from_calibration(
 ) -> Camera:
     """A camera whose IPM is the one of a finished calibration; ``mounting_sigma`` is that of a guessed one.
 
-    Raises:
-        MapFileError: the calibration cannot be that of a camera that looks at the ground.
+    Raises MapFileError where the calibration cannot be that of a camera that looks at the ground.
     """
     info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
     problem = _problem(calibration)

@@ -49,8 +49,7 @@ class Detector:
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
         """Load a model: ``path``, else ``options.model``, else the one that is shipped.
 
-        Raises:
-            DetectorError: the model cannot be used, or the shipped files do not belong together.
+        Raises DetectorError where the model cannot be used, or the shipped files do not belong together.
         """
         options = options or DetectorOptions()
         check_weights()
@@ -62,8 +61,7 @@ class Detector:
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
 
-        Raises:
-            DetectorError: the image is not of that form or not of the camera's size.
+        Raises DetectorError where the image is not of that form or not of the camera's size.
         """
         output = self.run_network(image_bgr, camera)
         with lap("propose"):
@@ -80,8 +78,7 @@ class Detector:
     def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
         """Run the network on one image; what shows the vehicle itself is no paint.
 
-        Raises:
-            DetectorError: the image is not of the right form or not of the camera's size.
+        Raises DetectorError where the image is not of the right form or not of the camera's size.
         """
         road_camera = self.road_camera(camera)
         _check_image(image_bgr, camera)

@@ -21,8 +21,15 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.coverage import add_paint, blurred_coverage, pixel_weights
-from v2hdm.detection.lattice import KNOTS, Lattice, lay_grid, lay_lattice
+from v2hdm.detection.lattice import (
+    KNOTS,
+    Lattice,
+    add_paint,
+    blurred_coverage,
+    lay_grid,
+    lay_lattice,
+    pixel_weights,
+)
 from v2hdm.detection.patch import LensFrames, Patches
 from v2hdm.geometry.quadrilateral import Quad, following, is_convex_px
 from v2hdm.records import BoolArray, FloatArray

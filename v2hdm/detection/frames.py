@@ -34,8 +34,7 @@ _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 def read_bgr(path: Path) -> np.ndarray:
     """Decode an image file, in colour or grey, to (H, W, 3) uint8 BGR.
 
-    Raises:
-        DriveError: the file is missing, truncated, damaged or not of 8 bits.
+    Raises DriveError where the file is missing, truncated, damaged or not of 8 bits.
     """
     pixels = read_pixels(path, _AS_STORED)
     if pixels.dtype != np.uint8:
@@ -67,8 +66,7 @@ class Frame:
 def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
     """Image files, each read when its turn comes.
 
-    Raises:
-        DriveError: a file is missing, damaged or not of 8 bits.
+    Raises DriveError where a file is missing, damaged or not of 8 bits.
     """
     names = [path.stem for path in paths]
     unique = len(set(names)) == len(names)
@@ -90,8 +88,7 @@ def list_images(folder: Path) -> list[Path]:
 def video_frames(path: Path) -> Iterator[Frame]:
     """Every frame of a video file; a warning reports one that ends early.
 
-    Raises:
-        DriveError: OpenCV cannot read it, or it has no frame.
+    Raises DriveError where OpenCV cannot read it, or it has no frame.
     """
     refused = f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
     with _capture(str(path), refused) as capture:
@@ -111,10 +108,8 @@ def video_frames(path: Path) -> Iterator[Frame]:
 def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
     """Frames of a live camera, by the operating system's index, until it fails.
 
-    ``size`` is the width and height to ask the camera for; it may give others.
-
-    Raises:
-        DriveError: it does not open, or gives no more frames.
+    ``size`` is the width and height to ask the camera for; it may give others. Raises DriveError where it
+    does not open, or gives no more frames.
     """
     refused = f"camera {number}: does not open; is it plugged in and used by no one else?"
     with _capture(min(number, _MOST_CAMERAS), refused) as capture:
@@ -167,11 +162,9 @@ class NewestFrames(Iterator[Frame]):
 def arriving_frames(folder: Path) -> Iterator[Frame]:
     """The newest image of a folder that somebody writes to, each time that one is asked for; never ends.
 
-    Its time is when it was written. Images that were there before the newest one at the start do not count
-    as dropped. One that cannot be read a second after it was written is left out with a warning.
-
-    Raises:
-        DriveError: the folder cannot be read.
+    Its time is when it was written. Images that were there before the newest one at the start do not count as
+    dropped. One that cannot be read a second after it was written is left out with a warning. Raises
+    DriveError where the folder cannot be read.
     """
     known, index = {path.name for path in list_images(folder)[:-1]}, 0
     while True:

@@ -155,9 +155,8 @@ class Network:
     def __init__(self, path: Path | None = None, threads: int = 1, device: str = "cpu"):
         """Load a model file, to be run on ``cpu`` or ``cuda``.
 
-        Raises:
-            DetectorError: there is no such file, it is not an ONNX model or not one of ours, or the device is
-                not there.
+        Raises DetectorError where there is no such file, it is not an ONNX model or not one of ours, or the
+        device is not there.
         """
         self.path = NETWORK_FILE if path is None else Path(path)
         self._session = open_session(self.path, threads, device)
@@ -166,8 +165,8 @@ class Network:
     def run(self, image_bgr: np.ndarray) -> RawOutput:
         """Look at an image (H, W, 3) uint8 of any size.
 
-        Raises:
-            DetectorError: the network refused the image, or its output is not what its label promises.
+        Raises DetectorError where the network refused the image, or its output is not what its label
+        promises.
         """
         height, width = image_bgr.shape[:2]
         below, right = -height % self.info.multiple, -width % self.info.multiple
@@ -293,8 +292,7 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
 def check_device(device: str) -> None:
     """Refuse a device that this onnxruntime was built without.
 
-    Raises:
-        DetectorError: says what to install.
+    Raises DetectorError that says what to install.
     """
     provider = _PROVIDERS[device][0]
     if provider not in onnxruntime.get_available_providers():
@@ -307,8 +305,7 @@ def check_device(device: str) -> None:
 def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
     """A model file ready to run on so many threads, on ``cpu`` or ``cuda``.
 
-    Raises:
-        DetectorError: there is no such file, it is not an ONNX model, or the device is not there.
+    Raises DetectorError where there is no such file, it is not an ONNX model, or the device is not there.
     """
     check_device(device)
     if not path.is_file():
@@ -339,8 +336,7 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
 def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
     """The classes that a model file describes: the shipped ones, and after them those of its user.
 
-    Raises:
-        ConfigError: one of them is wrong.
+    Raises ConfigError where one of them is wrong.
     """
     return SHIPPED.with_own(metadata.get("own_classes", {}), "its classes")
 

@@ -56,8 +56,7 @@ class DetectorOptions:
     def __post_init__(self) -> None:
         """Refuse values that cannot work.
 
-        Raises:
-            ConfigError: a value is out of range.
+        Raises ConfigError where a value is out of range.
         """
         check_settings(self, _RANGES, "detector.")
         if self.device not in DEVICES:

@@ -392,10 +392,8 @@ def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: tuple[
     probability = output.class_probability(rows + box[0].start - 1, columns + box[1].start - 1)
     scores = probability.mean(axis=1) * as_probability(level[mask]).mean()
     signed = _signed(mask, level)
-    top, left = max(int(rows.min()) - 1, 0), max(int(columns.min()) - 1, 0)
-    near = signed[top : int(rows.max()) + 2, left : int(columns.max()) + 2]
     origin_px = _origin_px(output, box[0].start, box[1].start)
-    outline_px = origin_px + output.stride * (np.array([left, top]) + zero_crossings(near))
+    outline_px = origin_px + output.stride * _outlines(signed, mask.astype(np.int16), 1)[0]
     named = dict(zip(output.classes, scores.tolist(), strict=True))
     return Blob(named, signed, origin_px, output.stride, outline_px)
 
@@ -419,16 +417,6 @@ def _lead(output: NetworkOutput, mine: BoolArray, box: tuple[slice, slice]) -> n
 def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:
     """A level (h, w) that is positive in the mask only: holes filled, other blobs in the same box emptied."""
     return np.asarray(np.where(mask, np.maximum(level, 1e-3), np.minimum(level, -1e-3)))
-
-
-def zero_crossings(level: np.ndarray) -> FloatArray:
-    """Where a field (h, w) changes sign between neighbours: points (N, 2) as (column, row), interpolated."""
-    points = []
-    for field, order in ((level, [1, 0]), (level.T, [0, 1])):
-        i, j = np.nonzero((field[:-1] > 0) != (field[1:] > 0))
-        fraction = field[i, j] / (field[i, j] - field[i + 1, j])
-        points.append(np.column_stack([i + fraction, j])[:, order])
-    return np.concatenate(points).astype(np.float64)
 
 
 def outline_polygon(blob: Blob) -> FloatArray:

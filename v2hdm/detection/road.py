@@ -127,11 +127,8 @@ class RoadDetector:
         """A detector for the camera of a calibration YAML that ``v2hdm map`` wrote.
 
         ``model`` is an ONNX file, None the shipped one; ``linear_response`` says that grey values are
-        proportional to radiance, not sRGB-coded.
-
-        Raises:
-            MapFileError: the calibration is missing, damaged or cannot be right.
-            DetectorError: the model cannot be used.
+        proportional to radiance, not sRGB-coded. Raises MapFileError where the calibration is missing,
+        damaged or cannot be right, DetectorError where the model cannot be used.
         """
         return cls.calibrated(Detector.load(model, options), Path(calibration), linear_response)
 
@@ -147,8 +144,7 @@ class RoadDetector:
     def detect(self, image_bgr: np.ndarray) -> Road:
         """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
 
-        Raises:
-            DetectorError: the image is not of that form or not of the camera's size.
+        Raises DetectorError where the image is not of that form or not of the camera's size.
         """
         markings, lanes = self.detector.detect(image_bgr, self.camera)
         with lap("metres"):

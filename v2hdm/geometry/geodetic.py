@@ -100,9 +100,7 @@ class Grid:
         system, datum = _system(crs, where, error), datum_of(crs, where, error)
         if origin is None:
             raise error(f"{where}: {crs} needs a place on the earth, and the map has none; give {LOCAL}")
-        zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
-        etrs = origin.datum.upper().startswith("ETRS")
-        fit = f"EPSG:{(25800 if etrs else 32600 if origin.latitude_deg >= 0 else 32700) + zone}"
+        fit = utm_of(origin)
         if (code := system.to_authority(min_confidence=100)) is None:
             raise error(f"{where}: '{crs}' has no code by which other programs know it; give {fit}")
         if system.is_compound or not (system.is_projected or system.is_geographic):
@@ -158,11 +156,28 @@ class Grid:
         return geodetic_from_grid(self.crs, positions, where, error)[:, [1, 0, 2]]
 
 
-def map_projection(origin: GeodeticOrigin) -> str:
-    """The map frame as PROJ text: a transverse Mercator projection about its origin, scaled to its height.
+def utm_of(origin: GeodeticOrigin) -> str:
+    """The UTM zone of an origin as an EPSG code."""
+    zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
+    north, etrs = origin.latitude_deg >= 0, origin.datum.upper().startswith("ETRS")
+    return f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
 
-    It agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it.
+
+_ENGINEERING = (
+    'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
+    'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
+)
+
+
+def crs_of(origin: GeodeticOrigin | None) -> str:
+    """The coordinate system of the map frame, as PROJ or WKT text.
+
+    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
+    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
+    frame is an engineering system: metres that belong nowhere on the earth.
     """
+    if origin is None:
+        return _ENGINEERING
     scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
     return (
         f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
@@ -264,34 +279,3 @@ def _geodetic_from_ecef(points: FloatArray) -> FloatArray:
     on_ellipsoid = out_m - _SEMI_MAJOR_M * np.cos(parametric), z - minor_m * np.sin(parametric)
     height_m = on_ellipsoid[0] * np.cos(lat) + on_ellipsoid[1] * np.sin(lat)
     return np.column_stack([np.degrees(lat), np.degrees(np.arctan2(y, x)), height_m])
-
-
-def utm_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> tuple[str, FloatArray]:
-    """The UTM zone of an origin as an EPSG code, and eastings and northings (N, 2) of points (N, 3) in it.
-
-    Raises MapFileError where pyproj is not installed.
-    """
-    pyproj = need("pyproj", "map", "coordinates of a UTM zone", MapFileError)
-    zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
-    north, etrs = origin.latitude_deg >= 0, origin.datum.upper().startswith("ETRS")
-    code = f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
-    to_grid = pyproj.Transformer.from_crs(pyproj.CRS(code).geodetic_crs, code, always_xy=True)
-    return code, np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
-
-
-_ENGINEERING = (
-    'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
-    'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
-)
-
-
-def crs_of(origin: GeodeticOrigin | None) -> str:
-    """The coordinate system of the map frame, as PROJ or WKT text.
-
-    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
-    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
-    frame is an engineering system: metres that belong nowhere on the earth.
-    """
-    if origin is None:
-        return _ENGINEERING
-    return map_projection(origin)

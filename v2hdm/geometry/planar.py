@@ -1,4 +1,4 @@
-"""Polygons in a plane: their area, the points inside them, and the part that two of them share."""
+"""Polygons in a plane (their area, points inside, the part that two of them share), and polylines."""
 
 from __future__ import annotations
 
@@ -68,6 +68,11 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
         if depth[k] >= 0:
             kept.append(polygon[k])
     return np.array(kept).reshape(-1, polygon.shape[1])
+
+
+def length_along(line: FloatArray) -> FloatArray:
+    """How far along a polyline (N, D) each of its vertices (N,) lies."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:

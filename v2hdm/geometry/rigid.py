@@ -163,24 +163,6 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     return np.asarray(np.where(quaternion[:, 3:] < 0, -quaternion, quaternion))
 
 
-def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4) at ``fraction`` (N,) of the shorter way from ``first`` to ``second``.
-
-    Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985.
-    """
-    cosine = np.sum(first * second, axis=1, keepdims=True)
-    second = np.where(cosine < 0, -second, second)
-    # atan2 of chord and sum keeps full precision for angles near zero, where arccos does not.
-    chord, total = (np.linalg.norm(way, axis=1, keepdims=True) for way in (second - first, second + first))
-    angle = 2 * np.arctan2(chord, total)
-    t = fraction[:, None]
-    # sin(t a) / sin(a) as a ratio of sincs, which is t at a = 0.
-    sinc = np.sinc(angle / np.pi)
-    mixed = first * (1 - t) * np.sinc((1 - t) * angle / np.pi) / sinc
-    mixed += second * t * np.sinc(t * angle / np.pi) / sinc
-    return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
-
-
 def rotation_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:
     """Rotation matrices (N, 3, 3) Rz(yaw) Ry(pitch) Rx(roll): REP-103's fixed-axis convention."""
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in (roll_rad, pitch_rad, yaw_rad))

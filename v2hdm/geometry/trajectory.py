@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.rigid import make_transform, quaternion_from_rotation, rotation_from_quaternion, slerp
+from v2hdm.geometry.rigid import exp, inverse, log, make_transform
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, Trajectory
 
 
@@ -32,9 +32,10 @@ def interpolate(
     fraction = np.clip(np.where(inside, linear, np.round(linear)), 0.0, 1.0)
 
     first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
-    turns = [quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second)]
+    turn = log(inverse(first) @ second)
+    turn[:, :3] = 0.0
     points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    return make_transform(rotation_from_quaternion(slerp(turns[0], turns[1], fraction)), points), inside
+    return make_transform((first @ exp(fraction[:, None] * turn))[:, :3, :3], points), inside
 
 
 def in_order(image: Image) -> tuple[int, float, str]:

@@ -19,12 +19,11 @@ from v2hdm.ground.results import (
     GroundEstimate,
     GroundOptions,
     GroundStatus,
-    MatchedGround,
     Parameter,
     Reading,
 )
 from v2hdm.ground.start import Readings, contradicts, start_pairs, try_readings
-from v2hdm.records import Calibration, Drive, FloatArray, IntArray, PoseNoise
+from v2hdm.records import Calibration, Drive, IntArray, PoseNoise
 from v2hdm.workers import share_out
 
 STEEP_RAD = np.deg2rad(10)
@@ -110,13 +109,11 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
 
 @dataclass(frozen=True)
 class _Solved:
-    """The last round's matches, what the drive states of them, the solution and its poses of all images."""
+    """The last round's matches, what the drive states of them, and the solution."""
 
-    pairs: IntArray
     matched: Round
     stated: Stated
     adjusted: Adjusted
-    poses: FloatArray
     clock: Parameter | None
 
 
@@ -157,7 +154,7 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
     if free is not None:
         sigma = float(np.sqrt(adjusted.covariance[6, 6]))
         clock = Parameter("clock_s", stated.clock_s, sigma, observable=True)
-    return _Solved(pairs, matched, stated, adjusted, poses, clock)
+    return _Solved(matched, stated, adjusted, clock)
 
 
 def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> GroundEstimate:
@@ -175,13 +172,6 @@ def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> 
         parameters=_free_parameters(options.free, seen, solved, factor),
         median_residual=float(np.median(adjusted.residual)),
         innovations=_innovations(adjusted, solved.stated.drive.pose_noise),
-        patches=MatchedGround(
-            solved.stated.motion.image[solved.pairs],
-            solved.poses[solved.pairs],
-            seen.pair,
-            seen.first_px,
-            seen.second_px,
-        ),
     )
 
 
@@ -196,7 +186,6 @@ def _nothing(camera: str, readings: Readings) -> GroundEstimate:
         parameters={},
         median_residual=float("nan"),
         innovations={},
-        patches=None,
         seconds=0.0,
     )
 

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.records import Calibration, Camera, Drive, FloatArray, IntArray
+from v2hdm.records import Calibration, Camera, Drive
 
 GROUND_IPM = "ground"
 """Name of the IPM that the ground gives, beside those of the drive."""
@@ -90,22 +90,6 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class MatchedGround:
-    """Patches of ground found in both images of pairs, as raw pixels.
-
-    ``pair_images`` (P, 2) are indices into ``Drive.images``; ``pair`` (N,) is each match's row of it;
-    ``pair_poses`` (P, 2, 4, 4) are the ``map_from_vehicle`` of both with their estimated errors taken in.
-    ``first_px`` and ``second_px`` (N, 2) are where the patch lies in the two images.
-    """
-
-    pair_images: IntArray
-    pair_poses: FloatArray
-    pair: IntArray
-    first_px: FloatArray
-    second_px: FloatArray
-
-
-@dataclass(frozen=True)
 class GroundEstimate:
     """The mounting of one camera and the errors of a drive's statements, from bare ground.
 
@@ -123,7 +107,6 @@ class GroundEstimate:
     parameters: Mapping[str, Parameter]
     median_residual: float
     innovations: Mapping[str, float]
-    patches: MatchedGround | None
     seconds: float
 
 

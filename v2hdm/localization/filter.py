@@ -9,7 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from v2hdm.geometry.ipm import homography_jacobian, pinhole_px_from_ground, project_ground
+from v2hdm.geometry.ipm import (
+    apply_in_front,
+    ground_from_pinhole_px,
+    homography_jacobian,
+    pinhole_px_from_ground,
+    project_ground,
+)
 from v2hdm.geometry.least_squares import Normal, gauss_newton
 from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse, rotation_from_euler
@@ -146,11 +152,8 @@ class Seen:
 
     def on_ground(self, pose: FloatArray) -> FloatArray:
         """Where on the ground the corners (4, 2) lie; nan above the horizon."""
-        map_from_cam = pose_of(pose) @ inverse(self.cam_from_vehicle)
-        pixels = np.column_stack([self.corners_px, np.ones(4)])
-        rays = np.linalg.solve(self.intrinsic, pixels.T).T @ map_from_cam[:3, :3].T
-        down = np.where(rays[:, 2:] < 0, rays[:, 2:], np.nan)
-        return np.asarray((map_from_cam[:3, 3] - rays * map_from_cam[2, 3] / down)[:, :2])
+        cam_from_map = self.cam_from_vehicle @ inverse(pose_of(pose))
+        return apply_in_front(ground_from_pinhole_px(self.intrinsic, cam_from_map), self.corners_px)
 
 
 @dataclass(frozen=True)

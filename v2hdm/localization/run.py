@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.association.sightings import Sightings, collect_sightings
+from v2hdm.association.ground import easy_views, views_of
+from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
@@ -165,13 +165,16 @@ def localize(
         state, found = locate(state, _seen(drive, sightings, frame, names, calibrations), markings)
         states.append(state)
         matched.append(len(found))
+    # The cameras' common turn about the vertical is that of their mean.
+    turns = [(one.cam_from_vehicle[:3, 2], one.covariance) for one in calibrations.values()]
+    yaw_m2 = [0.0 if c is None else float(up @ c[3:, 3:] @ up) for up, c in turns]
     return Localised(
         stamp_s=sightings.stamp_s,
         recorded=sightings.map_from_vehicle,
         states=tuple(states),
         matched=np.array(matched),
         in_view=_in_view(drive, sightings, hd_map, calibrations),
-        shared=np.array([markings.shared_m2, markings.shared_m2, _yaw_variance(calibrations)]),
+        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_m2)]),
         detections=len(sightings),
     )
 
@@ -192,12 +195,6 @@ def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive
         )
 
 
-def _yaw_variance(calibrations: Mapping[str, Calibration]) -> float:
-    """Variance, rad^2, of the cameras' common turn about the vertical: that of their mean."""
-    known = [(one.cam_from_vehicle[:3, 2], one.covariance) for one in calibrations.values()]
-    return float(np.mean([0.0 if c is None else float(up @ c[3:, 3:] @ up) for up, c in known]))
-
-
 def _seen(
     drive: Drive, sightings: Sightings, frame: int, names: list[str], calibrations: Mapping[str, Calibration]
 ) -> list[Seen]:
@@ -216,28 +213,43 @@ def _in_view(
     drive: Drive, sightings: Sightings, hd_map: HdMap, calibrations: Mapping[str, Calibration]
 ) -> BoolArray:
     """In which frames (F,) a whole marking of the map is near and within an image, by the recorded poses."""
-    corners = np.stack([marking.corners_map for marking in hd_map.markings])
-    out = np.zeros(len(sightings.stamp_s), dtype=bool)
-    times = {stamp: frame for frame, stamp in enumerate(sightings.stamp_s.tolist())}
-    for image in drive.images:
-        if image.camera not in calibrations:
-            continue
-        info = drive.cameras[image.camera].info
-        cam_from_map = calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(image.map_from_vehicle)
-        pixels, depth_m = project_ground(info.intrinsic, cam_from_map, corners.reshape(-1, 2))
-        inside = (pixels >= 0) & (pixels < [info.width, info.height])
-        near = inside.all(axis=1) & (depth_m > 0) & (depth_m < _IN_VIEW_M)
-        out[times[image.taken_s]] |= bool(near.reshape(-1, 4).all(axis=1).any())
-    return out
+    cameras = [drive.cameras[name] for name in sightings.cameras]
+    extrinsics = np.stack([calibrations[name].cam_from_vehicle for name in sightings.cameras])
+    rig = Rig(np.stack([one.info.intrinsic for one in cameras]), extrinsics, sightings.map_from_vehicle)
+    views = views_of(drive, sightings.cameras)
+    corners_map = np.stack([marking.corners_map for marking in hd_map.markings])
+    _, image = easy_views(views, rig, cameras, corners_map, _IN_VIEW_M)
+    shown = views.frame[np.isin(views.image, image)]
+    return np.isin(np.arange(len(sightings.stamp_s)), shown)
 
 
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
-    """Write figures, poses and the picture of the errors into a folder."""
+    """Write figures, poses and the picture of the errors into a folder.
+
+    Its bands are two standard deviations of estimate and recorded pose together; frames in which the vehicle
+    does not know where it is are crosses.
+    """
     write_json(folder / "localization.json", found.figures())
     write_tum(found.poses, folder / "localized.tum")
     noise = drive.pose_noise
     sigma = np.hypot(found.sigma, [noise.position_m, noise.position_m, noise.heading_rad])
-    save_errors(folder / "errors.png", found, sigma)
+    time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
+    with style.figure(folder / "errors.png", 9, 6) as figure:
+        axes = figure.subplots(3, 1, sharex=True)
+        for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
+            band = 2 * factor * sigma[:, k]
+            axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
+            axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
+            if not known.all():
+                axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+            limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
+            limit = max(limit, 2 * float(np.median(band)))
+            axis.set_ylim(-limit, limit)
+            axis.set_ylabel(f"{name}, {unit}")
+            axis.grid(alpha=0.3)
+        axes[0].legend(loc="upper right", ncols=3, fontsize=8)
+        axes[0].set_title("Localised by the map's markings, less the recorded pose")
+        axes[-1].set_xlabel("time, s")
 
 
 def summary_lines(found: Localised) -> list[str]:
@@ -254,28 +266,3 @@ def summary_lines(found: Localised) -> list[str]:
             "above cannot be relied on: is it of this site, as painted today, and is the first pose right?"
         )
     return lines
-
-
-def save_errors(path: Path, found: Localised, sigma: FloatArray) -> None:
-    """Draw the errors beside the recorded poses as PNG.
-
-    Bands are two standard deviations (F, 3) of estimate and recorded pose together; frames in which the
-    vehicle does not know where it is are crosses.
-    """
-    time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
-    with style.figure(path, 9, 6) as figure:
-        axes = figure.subplots(3, 1, sharex=True)
-        for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
-            band = 2 * factor * sigma[:, k]
-            axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
-            axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
-            if not known.all():
-                axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
-            limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
-            limit = max(limit, 2 * float(np.median(band)))
-            axis.set_ylim(-limit, limit)
-            axis.set_ylabel(f"{name}, {unit}")
-            axis.grid(alpha=0.3)
-        axes[0].legend(loc="upper right", ncols=3, fontsize=8)
-        axes[0].set_title("Localised by the map's markings, less the recorded pose")
-        axes[-1].set_xlabel("time, s")

@@ -1,6 +1,6 @@
-"""How the vehicle moves, from its recorded poses.
+"""One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
 
-One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
+Sizes that a user states for classes, and corners that a survey has measured, are constraints on corners.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from v2hdm.adjust import (
     MODELS,
@@ -31,10 +32,10 @@ from v2hdm.association.groups import Association, fuse_groups, group_kinds, know
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
+from v2hdm.io.maps.surveyed import match
 from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.mapping.stated import control_points, known_lengths
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
+from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
 
 def vehicle_twists(
@@ -204,10 +205,6 @@ def solve_bundle(
             "at a lower speed or raise the image rate."
         )
     knots, corners_start = lanes or (None, None)
-    camera, frame = sightings.camera[row], sightings.frame[row]
-    if knots is not None:
-        camera, frame = np.append(camera, knots.camera), np.append(frame, knots.frame)
-    used = _Used(*np.unique(camera, return_inverse=True), *np.unique(frame, return_inverse=True))
     own_corner = association.corner_order()[row, corner]
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
@@ -223,15 +220,13 @@ def solve_bundle(
     first = int(corner_index.max(initial=-1)) + 1
     if knots is not None:
         observations = _joined(observations, knots.observations(first))
-    observations = replace(observations, camera=used.camera, frame=used.frame)
-    names = [sightings.cameras[c] for c in used.cameras]
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
-    problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
     if knots is not None:
         held = knots.held(first)
         axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
         control = held if control is None else _joined(replace(control, along=axes), held)
         corners_start = np.concatenate([corners_start, held.points_map])
+    problem, used, frames = drive_problem(sightings, rig, cameras, model).seen_by(observations)
     problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
     if knots is not None:
@@ -242,18 +237,14 @@ def solve_bundle(
         factor = line_variance_factor(squared, knots.count / len(squared) + of_poses)
         knots = replace(knots, variance_factor=knots.variance_factor * factor)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
-    cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
-    map_from_vehicle[used.frames] = solution.map_from_vehicle
+    cam_from_vehicle[used], map_from_vehicle[frames] = solution.cam_from_vehicle, solution.map_from_vehicle
     adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
     if rig.read_out_s is not None:
         read_out_s = rig.read_out_s.copy()
-        read_out_s[used.cameras] = solution.read_out_s
+        read_out_s[used] = solution.read_out_s
         adjusted = replace(adjusted, read_out_s=read_out_s)
-    index = {n: c for c, n in enumerate(names)}
-    return Bundle(
-        adjusted, model, problem, solution, association, row, group, corner, corner_index, index, used.frames,
-        knots,
-    )  # fmt: skip
+    index, seen = {sightings.cameras[c]: k for k, c in enumerate(used.tolist())}, (row, group, corner)
+    return Bundle(adjusted, model, problem, solution, association, *seen, corner_index, index, frames, knots)
 
 
 _OF_OBSERVATIONS = "residual_px", "mahalanobis2", "verdict"
@@ -266,55 +257,29 @@ def _joined(one: _Rows, other: _Rows) -> _Rows:
     return type(one)(*(np.concatenate(pair) for pair in pairs))
 
 
-@dataclass(frozen=True)
-class _Used:
-    """The cameras (C,) and frames (J,) of a problem, and which of them each observation (K,) has."""
-
-    cameras: IntArray
-    camera: IntArray
-    frames: IntArray
-    frame: IntArray
-
-
-def _problem(
-    sightings: Sightings,
-    rig: Rig,
-    used: _Used,
-    cameras: Sequence[Camera],
-    observations: Observations,
-    model: Model,
-) -> Problem:
-    """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
+def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
+    """All cameras and frames of a drive and their priors, without any observation."""
+    none, stated = np.zeros(0, dtype=np.int64), [cameras[name] for name in sightings.cameras]
     # Camera centres are surveyed, or else implied by the starting extrinsic.
-    centre = camera_centre(rig.cam_from_vehicle[used.cameras])
+    centre = camera_centre(rig.cam_from_vehicle)
     sigma = np.full_like(centre, _UNSURVEYED_CENTRE_SIGMA_M)
-    for c, camera in enumerate(cameras):
+    for c, camera in enumerate(stated):
         if camera.centre_prior is not None:
             centre[c], sigma[c] = camera.centre_prior.centre_vehicle, camera.centre_prior.sigma_m
-    intrinsic = rig.intrinsic[used.cameras]
-    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     return Problem(
-        intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
-        cam_from_vehicle=rig.cam_from_vehicle[used.cameras],
-        map_from_vehicle=sightings.map_from_vehicle[used.frames],
-        observations=observations,
-        corner_count=int(observations.corner.max(initial=-1)) + 1,
+        intrinsic=np.column_stack([rig.intrinsic[:, 0, 0], rig.intrinsic[:, 1, 1], rig.intrinsic[:, :2, 2]]),
+        cam_from_vehicle=rig.cam_from_vehicle,
+        map_from_vehicle=sightings.map_from_vehicle,
+        observations=Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)),
+        corner_count=0,
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
-        twist_vehicle=twists[used.frames],
-        visit=sightings.visit[used.frames],
+        twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit),
+        visit=sightings.visit,
         clock_sigma_s=model.clock_sigma_s,
-        read_out_s=read_outs_s(cameras),
+        read_out_s=read_outs_s(stated),
     )
-
-
-def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
-    """All cameras and frames of a drive and their priors, without any observation."""
-    none = np.zeros(0, dtype=np.int64)
-    used = _Used(np.arange(len(sightings.cameras)), none, np.arange(len(sightings.map_from_vehicle)), none)
-    nothing = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
-    return _problem(sightings, rig, used, [cameras[name] for name in sightings.cameras], nothing, model)
 
 
 def _constraints(
@@ -354,3 +319,80 @@ def _observed_corners(
     number[kept] = np.arange(np.count_nonzero(kept))
     known = kept[flat]
     return row[known], group[known], corner[known], number.reshape(-1, 4)
+
+
+_DIAGONALS = (((0, 2),), ((1, 3),))
+_SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
+"""Pairs of corners that are as far apart as a marking is long, or wide; the map decides which."""
+
+
+def known_lengths(
+    sizes: SizeOptions, kind: Sequence[str], corners_map: FloatArray, corner_index: IntArray
+) -> KnownLengths | None:
+    """The distances between corners that stated sizes imply, None if there are none.
+
+    Of a diamond the size is that of its diagonals, of all others that of its sides. A marking that is not of
+    its class's size is another thing, or cut off; nothing is known of it. ``kind`` (G,) is the class of every
+    group, ``corners_map`` (G, 4, 2) rough positions, nan where unknown, and ``corner_index`` (G, 4) the
+    corners' numbers in the adjustment, -1 for none.
+    """
+    found: list[tuple[int, int, float]] = []
+    for name, size in sizes.by_class_m.items():
+        spans = _DIAGONALS if name == DIAMOND else _SIDES
+        for group in np.flatnonzero(np.array(kind) == name):
+            corners = corners_map[group]
+            apart = [[np.linalg.norm(corners[a] - corners[b]) for a, b in span] for span in spans]
+            seen = np.array([np.mean(distances) for distances in apart])
+            wanted = np.array(size) if seen[0] >= seen[1] else np.array(size)[::-1]
+            # Also false where a corner is nowhere: then it is not known which of the two is the longer one.
+            if not (np.abs(seen - wanted) <= sizes.tolerance * wanted).all():
+                continue
+            for span, metres in zip(spans, wanted, strict=True):
+                ends = corner_index[group][np.array(span)]
+                found += [(a, b, metres) for a, b in ends[(ends >= 0).all(axis=1)].tolist()]
+    if not found:
+        return None
+    first, second, length_m = (np.array(column) for column in zip(*found, strict=True))
+    return KnownLengths(first, second, length_m, np.full(len(found), sizes.sigma_m))
+
+
+def control_points(
+    survey: SurveyOptions, corners_map: FloatArray, corner_index: IntArray, poses: PoseSigma
+) -> ControlPoints | None:
+    """The corners that surveyed points belong to, None if there are none; points out of reach are left out.
+
+    ``corners_map`` and ``corner_index`` are as of :func:`known_lengths`. ``poses`` is how far the recorded
+    poses are off; neighbouring corners share their drift.
+    """
+    points = np.array([one.position_map for one in survey.control], dtype=np.float64).reshape(-1, 2)
+    sigma_m = np.array([one.sigma_m for one in survey.control], dtype=np.float64).reshape(-1, 2)
+    known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
+    if not len(points) or not known.any():
+        return None
+    off_m, _ = KDTree(corners_map[known]).query(points)
+    near = np.flatnonzero(off_m <= survey.reach_m)
+    covariance = _covariance(points[near], sigma_m[near], poses)
+    found = match(points[near], corners_map[known], survey.reach_m, covariance)
+    used = near[found >= 0]
+    if not len(used):
+        return None
+    return ControlPoints(corner_index[known][found[found >= 0]], points[used], sigma_m[used])
+
+
+def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> FloatArray:
+    """Joint covariance (2N, 2N), m^2, of corners minus points (N, 2), before the survey has moved the map."""
+    drift, apart_m = poses.position_drift, np.linalg.norm(points[:, None] - points, axis=-1)
+    shared = drift.sigma**2 * np.exp(-apart_m / drift.over_m)
+    own = (poses.position_m**2 - drift.sigma**2) * np.eye(len(points))
+    return np.kron(shared + own, np.eye(2)) + np.diag(sigma_m.ravel() ** 2)
+
+
+def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:
+    """The name of the control point at ``point_map`` (2,), which is one of those of the survey."""
+    return next(one.id for one in survey.control if np.array_equal(one.position_map, point_map))
+
+
+def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list[str]:
+    """The names of the control points that ``control`` makes no use of."""
+    used = set() if control is None else set(map(tuple, control.points_map.tolist()))
+    return [one.id for one in survey.control if tuple(one.position_map) not in used]

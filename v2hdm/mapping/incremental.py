@@ -23,9 +23,8 @@ from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
-from v2hdm.mapping.bundle import Model, drive_problem
+from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
@@ -43,17 +42,6 @@ _RECORD_GROWTH = 1.6
 """How many times as large the map is whenever its markings are kept for the figure of its growth."""
 
 _LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
-
-
-@dataclass(frozen=True)
-class Grown:
-    """The map so far: its markings as groups of sightings.
-
-    ``rig`` holds the extrinsics, and the poses as they were last solved for.
-    """
-
-    association: Association
-    rig: Rig
 
 
 @dataclass
@@ -118,8 +106,10 @@ class IncrementalMapper:
         self.growth.append(tuple(whole))
         self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
-    def run(self, progress: Callable[[str], None]) -> Grown:
+    def run(self, progress: Callable[[str], None]) -> tuple[Association, Rig]:
         """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
+
+        Returns the markings as groups of sightings, and the rig that they lead to.
 
         Raises:
             MappingError: nothing can be solved for.
@@ -134,7 +124,7 @@ class IncrementalMapper:
             self._begin(rig, len(self._places))
             due *= _LINK_GROWTH
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
-        return Grown(association, self._present_rig())
+        return association, self._present_rig()
 
     def _begin(self, rig: Rig, known: int) -> None:
         """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from v2hdm.adjust import ControlPoints, Observations, Solution
 from v2hdm.association.sightings import Rig, frames_of
 from v2hdm.association.surface import Surface
+from v2hdm.geometry.planar import length_along
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
@@ -139,7 +140,7 @@ class _Course:
 
     @classmethod
     def of(cls, lanes: Sequence[Lane]) -> _Course:
-        arcs = [_arc_m(one.points_map) for one in lanes]
+        arcs = [length_along(one.points_map) for one in lanes]
         length_m = np.array([arc[-1] for arc in arcs])
         begin_m = np.cumsum(length_m + 1.0) - length_m
         arc_m = np.concatenate([arc + begin for arc, begin in zip(arcs, begin_m, strict=True)])
@@ -161,11 +162,6 @@ class _Course:
         at_m = np.clip(at_m, 0.0, self.length_m[lane])
         ahead, behind = (self.at(lane, at_m + sign * _SPACING_M / 2) for sign in (1, -1))
         return np.asarray((ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True))
-
-
-def _arc_m(points_map: FloatArray) -> FloatArray:
-    """How far along a polyline each vertex (N,) lies."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_map, axis=0), axis=1))])
 
 
 def _pairs(

@@ -25,13 +25,12 @@ from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
-from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.bundle import without_corner
 from v2hdm.mapping.lanes import draw_lanes
-from v2hdm.mapping.optimise import silent
+from v2hdm.mapping.optimise import Optimised, silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.mapping.stated import without_corner
 from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.changes import Base, update_map
@@ -323,8 +322,8 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
         # A spline has the recorded heights within it.
-        hd_map = with_heights(hd_map, None if surface.knots else drive.road, surface.height_m)
-        hd_map = replace(hd_map, ground=surface.strips() if surface.knots else ())
+        hd_map = with_heights(hd_map, None, surface.height_m)
+        hd_map = replace(hd_map, ground=surface.strips())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
         name="Opt",
@@ -371,12 +370,12 @@ def _brought_up_to_date(
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
-    hd_map, changes, names = update_map(base, made.hd_map, observer, mapped, over_m)
+    hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
     hd_map = replace(hd_map, ground=made.hd_map.ground)
     corners, residuals = StatedCorners(hd_map.markings), made.residuals
     if residuals is not None:
-        residuals = residuals.renamed(names.id, names.corner)
-    suspicions = [replace(one, marking=int(names.id[one.marking - 1])) for one in made.suspicions]
+        residuals = residuals.renamed(*names)
+    suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
     return replace(
         made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals, suspicions=suspicions
     )

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from v2hdm.adjust import (
     PoseSigma,
@@ -25,12 +24,20 @@ from v2hdm.adjust import (
     select_model,
 )
 from v2hdm.association.ground import Located, Views, locate
-from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
+from v2hdm.association.groups import (
+    Association,
+    attach,
+    fuse_groups,
+    group_kinds,
+    in_view,
+    merge_groups,
+    same_groups,
+)
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.surface import Paths, Recorded, Surface
-from v2hdm.association.tracks import Uncertainty, build_tracks
+from v2hdm.association.tracks import build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.tensors import extrinsic_from_ipm
+from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -42,11 +49,23 @@ from v2hdm.mapping.bundle import (
     solve_bundle,
     vehicle_twists,
 )
-from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.lanes import Knots
-from v2hdm.mapping.options import AUTO, CROSS_SECTION, SURFACE, MappingOptions
-from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, Road, largest_noise
+from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
+from v2hdm.records import (
+    BoolArray,
+    Calibration,
+    Camera,
+    FloatArray,
+    IntArray,
+    Marking,
+    PoseNoise,
+    Road,
+    largest_noise,
+)
+from v2hdm.site.candidates import Candidates, Exclusion, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.markings import Support, Suspicion, classify, most_suspicious, with_relative_sigma
+from v2hdm.site.parallax import PointViews, measure_parallax
 
 _log = logging.getLogger(__name__)
 
@@ -72,6 +91,26 @@ _SETTLED_M = 2e-3
 
 def silent(step: str) -> None:
     """Ignore progress."""
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """The outcome of the joint optimisation.
+
+    ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``. Reprojection
+    errors are root mean squares over the points seen of the accepted markings, under the optimised and the
+    initial extrinsics.
+    ``suspicions`` are of the most suspicious markings, the worst first.
+    """
+
+    bundle: Bundle
+    groups: IntArray
+    markings: tuple[Marking, ...]
+    excluded: tuple[Exclusion, ...]
+    calibrations: Mapping[str, Calibration]
+    reprojection_rmse_px: float
+    initial_reprojection_rmse_px: float
+    suspicions: Sequence[Suspicion] = ()
 
 
 class Optimiser:
@@ -114,7 +153,11 @@ class Optimiser:
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
         progress("coarse solve")
-        bundle = self._solve_steep(tracks)
+        located = self._locate(self.initial_rig)
+        sine = np.where(located.valid, located.sine_depression, np.nan)
+        with np.errstate(invalid="ignore"):
+            steep = located.valid & (sine >= min(_STEEP_SINE, float(np.nanmedian(sine))))
+        bundle = self._solve(tracks, steep, self.initial_rig, coarse=True)
         for number in range(1, self._options.rounds + 1):
             progress(f"joint solve {number}")
             association = self._associate(bundle.rig)
@@ -151,11 +194,72 @@ class Optimiser:
             for _ in range(_LANE_ROUNDS):
                 lanes = final.knots or knots, final.markings_map
                 final = self._solve(final.association, usable, final.rig, lanes=lanes)
-        return conclude(
-            Evidence(self.sightings, self._views, self._cameras, final, bundle, inlier, usable),
-            self.initial_rig,
-            self._pose_noise.roll_pitch_rad,
-            self._options.acceptance,
+        return self._conclude(final, bundle, inlier, usable)
+
+    def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
+        """Classify the candidates of ``final``, which was solved over the accepted observations only.
+
+        ``ungated`` was over all, of which ``inlier`` (K,) were accepted; ``usable`` (S, 4) says the same per
+        corner.
+
+        Raises:
+            MappingError: no candidate is accepted.
+        """
+        seen = Support(
+            kind=group_kinds(final.association, self.sightings),
+            sightings=self.sightings,
+            rig=final.rig,
+            views=self._views,
+            cameras=tuple(self._cameras.values()),
+            row=ungated.row,
+            group=ungated.group,
+            accepted=inlier,
+        )
+        located = locate(self.sightings, final.rig)
+        located.informs[:] &= usable
+        fused = fuse_groups(final.association, located, jitter_rad=0.0)
+        solved = _solved_candidates(final, ungated)
+        solved = with_shared_errors(solved, fused, _scatter(final))
+        row, own = ungated.row, ungated.own_corner
+        out = np.flatnonzero(~inlier & self.sightings.valid[row, own])
+        place = ungated.group[out], ungated.corner[out]
+        row, own = row[out], own[out]
+        dissent = located.corners_map[row, own], located.covariance_m2[row, own]
+        solved = with_dissent(solved, fused, row, *place, *dissent)
+        noise = final.model.variance_factor, final.model.pose_sigma
+        corners = PointViews.of_corners(final.association, self.sightings, located, *noise)
+        parallax = measure_parallax(corners, final.association.count)
+        classified = classify(solved, seen, parallax, self._options.acceptance)
+        scale = max(1.0, final.solution.chi2_per_dof)
+        covariance = final.solution.extrinsic_covariance * scale
+        index, names = final.camera_index, self.sightings.cameras
+        markings = with_relative_sigma(
+            classified.markings(),
+            final.corner_index[classified.accepted],
+            lambda pairs: scale * final.solution.corner_covariance(pairs),
+        )
+        squared = np.bincount(final.group, final.solution.mahalanobis2, len(classified.kind)).astype(
+            np.float64
+        )
+        used = np.isin(final.group, classified.accepted) & self.sightings.valid[final.row, final.own_corner]
+        at_start = _residuals_under(self.initial_rig, self.sightings, final, self._pose_noise.roll_pitch_rad)
+        return Optimised(
+            bundle=final,
+            groups=classified.accepted,
+            markings=markings,
+            excluded=classified.exclusions(),
+            # A camera that saw no marking keeps its start and has no covariance.
+            calibrations={
+                name: Calibration(
+                    info=self._cameras[name].info,
+                    cam_from_vehicle=final.rig.cam_from_vehicle[c],
+                    covariance=covariance[index[name]] if name in index else None,
+                )
+                for c, name in enumerate(names)
+            },
+            reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
+            initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
+            suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
         )
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
@@ -208,16 +312,16 @@ class Optimiser:
             solve,
             coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
-        grown = mapper.run(progress)
+        association, rig = mapper.run(progress)
         self.growth = tuple(mapper.growth)
-        association = self._with_all_that_fit(grown.association, grown.rig)
-        bundle = self._solve(association, self._usable(association, grown.rig), grown.rig)
+        association = self._with_all_that_fit(association, rig)
+        bundle = self._solve(association, self._usable(association, rig), rig)
         self._reweigh(bundle)
         return self._weigh_poses(self._fit_ground(bundle, progress))
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None]) -> Bundle:
         """The solve over the ground that the drive shows, if it is not to be a plane."""
-        if self._options.ground not in (CROSS_SECTION, SURFACE):
+        if self._options.ground != SURFACE:
             return bundle
         progress("surface of the ground")
         surface = self._ground(bundle, None)
@@ -235,8 +339,7 @@ class Optimiser:
     def _ground(self, bundle: Bundle, surface: Surface | None) -> Surface:
         """``surface``, or else the level, along the path that ``bundle`` found."""
         paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.visit)
-        spline = self._options.ground != CROSS_SECTION
-        return Surface.level(paths, spline) if surface is None else replace(surface, paths=paths)
+        return Surface.level(paths) if surface is None else replace(surface, paths=paths)
 
     def _better_ground(self, bundle: Bundle, surface: Surface) -> tuple[Surface, float, float]:
         """The likeliest ground from ``surface`` under ``bundle``, its gain, and the step of its heights."""
@@ -263,9 +366,8 @@ class Optimiser:
         return in_view(association, locate(self.sightings, rig), self.sightings, rig, jitter_rad)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
-        noise = self._pose_noise
-        uncertainty = Uncertainty(direction_rad, noise.roll_pitch_rad, noise.position_m)
-        return build_tracks(self.sightings, located, rig, uncertainty, self._options.association)
+        options = self._options.association
+        return build_tracks(self.sightings, located, rig, direction_rad, self._pose_noise, options)
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""
@@ -291,14 +393,6 @@ class Optimiser:
         jitter_rad = self._pose_noise.roll_pitch_rad
         fused = fuse_groups(association, self._locate(rig), jitter_rad)
         return attach(association, self.sightings, locate(self.sightings, rig), rig, fused, jitter_rad)
-
-    def _solve_steep(self, tracks: Association) -> Bundle:
-        located = self._locate(self.initial_rig)
-        sine = np.where(located.valid, located.sine_depression, np.nan)
-        threshold = min(_STEEP_SINE, float(np.nanmedian(sine)))
-        with np.errstate(invalid="ignore"):
-            steep = located.valid & (sine >= threshold)
-        return self._solve(tracks, steep, self.initial_rig, coarse=True)
 
     def _solve(
         self,
@@ -381,9 +475,8 @@ def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """The extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
-    ipm = np.stack([camera.ipm[camera.initial_ipm] for camera in cameras.values()])
-    start = extrinsic_from_ipm(torch.tensor(intrinsic), torch.tensor(ipm)).numpy()
-    return Rig(intrinsic, start, map_from_vehicle)
+    start = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in cameras.values()]
+    return Rig(intrinsic, np.stack(start), map_from_vehicle)
 
 
 def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate: bool) -> Rig:
@@ -394,3 +487,55 @@ def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate:
     twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     read_out_s = np.zeros(len(rig.intrinsic)) if stated_s is None else stated_s
     return replace(rig, read_out_s=read_out_s, twist_vehicle=twists)
+
+
+def _scatter(bundle: Bundle) -> FloatArray:
+    """How many times as large as usual the variance of each corner's (G, 4) images is."""
+    corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
+    freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
+    squared, degrees = np.zeros(size), np.full(size, -2.0)
+    np.add.at(squared, corner, bundle.solution.mahalanobis2)
+    np.add.at(degrees, corner, freedom)
+    return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))
+
+
+def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
+    """The corners of every group of ``bundle``; one that has lost them all lies where ``ungated`` had it.
+
+    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than stated
+    make the map less certain than the noise model claims.
+    """
+    known = bundle.corner_index >= 0
+    covariance = np.full((len(known), 8, 8), np.nan)
+    scale = max(1.0, bundle.solution.chi2_per_dof)
+    for count in range(1, 5):
+        groups = np.flatnonzero(known.sum(axis=1) == count)
+        if not len(groups):
+            continue
+        corner = np.nonzero(known[groups])[1].reshape(-1, count)
+        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
+        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
+        blocks = scale * bundle.solution.corner_covariance(indices)
+        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
+    before = ungated.corners_map
+    count = np.maximum(np.isfinite(before[..., 0]).sum(axis=1), 1)
+    about = np.nansum(before, axis=1) / count[:, None]
+    return Candidates.seen(bundle.corners_map, covariance, about)
+
+
+def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:
+    """Residuals (K, 2), px, of the bundle's observations when ``rig`` and its own best corners hold."""
+    fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
+    camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
+    points = fused.corners_map[bundle.group, bundle.corner]
+    own = bundle.row, bundle.own_corner
+    cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
+    pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
+    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[own])
+
+
+def _root_mean_square(residual_px: FloatArray) -> float:
+    """Root mean square length of residuals (K, 2); those that cannot be projected are left out."""
+    squared = np.sum(residual_px**2, axis=1)
+    finite = squared[np.isfinite(squared)]
+    return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")

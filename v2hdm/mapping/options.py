@@ -17,9 +17,8 @@ MODES = (BATCH, INCREMENTAL)
 """Values of ``mapping.mode``."""
 
 PLANE = "plane"
-CROSS_SECTION = "cross_section"
 SURFACE = "surface"
-GROUNDS = (PLANE, CROSS_SECTION, SURFACE, AUTO)
+GROUNDS = (PLANE, SURFACE, AUTO)
 """Values of ``mapping.ground``."""
 
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
@@ -128,10 +127,9 @@ class MappingOptions:
     states.
     ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
     and in the end solved as ``batch`` does.
-    ``ground`` is ``plane``, once the recorded road is laid flat; ``cross_section``, which rises or falls with
-    the distance from the vehicle's own path, alike along the route, as a road with a crown does; ``surface``,
-    which does so and is a smooth spline beside; or ``auto``, the plane unless the drive contradicts it and a
-    surface predicts held-out observations better.
+    ``ground`` is ``plane``, once the recorded road is laid flat; ``surface``, which rises or falls with the
+    distance from the vehicle's own path, as a road with a crown does, and is a smooth spline beside; or
+    ``auto``, the plane unless the drive contradicts it and a surface predicts held-out observations better.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
@@ -174,11 +172,12 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     if options.lanes.model not in (AFTER, JOINT):
         raise ConfigError(f"mapping.lanes.model is '{options.lanes.model}'; choose {AFTER} or {JOINT}.")
     check_settings(options, _RANGES, "mapping.")
-    _check_sizes(options, kinds)
-    _check_survey(options)
-
-
-def _check_survey(options: MappingOptions) -> None:
+    for kind, size in options.known_sizes.by_class_m.items():
+        key = f"mapping.known_sizes.by_class_m.{kind}"
+        if kinds is not None and kind not in kinds:
+            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
+        if len(size) != 2 or not 0 < size[1] <= size[0]:
+            raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
     for number, point in enumerate(options.survey.points_map):
         if len(point) != 2:
             raise ConfigError(f"mapping.survey.points_map[{number}] is {list(point)}; give x and y in m.")
@@ -192,12 +191,3 @@ def _check_survey(options: MappingOptions) -> None:
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
         raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")
-
-
-def _check_sizes(options: MappingOptions, kinds: Sequence[str] | None) -> None:
-    for kind, size in options.known_sizes.by_class_m.items():
-        key = f"mapping.known_sizes.by_class_m.{kind}"
-        if kinds is not None and kind not in kinds:
-            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
-        if len(size) != 2 or not 0 < size[1] <= size[0]:
-            raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")

@@ -13,7 +13,7 @@ from v2hdm.adjust import ScoreTest
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 from v2hdm.site.candidates import Exclusion
-from v2hdm.site.suspicion import Suspicion
+from v2hdm.site.markings import Suspicion
 
 
 @dataclass(frozen=True)

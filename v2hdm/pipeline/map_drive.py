@@ -85,23 +85,15 @@ def map_drive(
         context: takes the place of the last three.
 
     Returns:
-        The map in the frame ``map`` (east, north, up; m), calibrations, trajectory and verdict. The verdict
-        is data: a FAIL raises nothing.
+        Map (east, north, up; m), calibrations, trajectory, and the verdict as data: a FAIL raises nothing.
 
     Raises:
-        DriveError: the drive cannot be read.
-        MapFileError: ``base`` or ``corrections`` cannot be used.
-        DetectorError: the detector cannot be used.
-        ConfigError: ``accuracy_goal_cm`` or another setting is out of range.
+        DriveError, MapFileError, DetectorError, ConfigError: an argument cannot be used.
         MappingError: there is nothing to map, although no check of the drive has failed.
 
     >>> result = map_drive(port, accuracy_goal_cm=10.0, workers=1)
-    >>> result.verdict.status.value
-    'PASS'
-    >>> {marking.kind for marking in result.map.markings} <= {"diamond", "lane_dash", "stop_line"}
-    True
-    >>> result.calibrations["front"].cam_from_vehicle.shape
-    (4, 4)
+    >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
+    ('PASS', (4, 4))
     """
     kept = StageCache(None if cache is None else Path(cache))
     context = context or Context(kept, progress, workers=workers)
@@ -109,28 +101,47 @@ def map_drive(
     if corrections is not None:
         stated = read_corrections(Path(corrections))
         options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
-    settings = detector.options if isinstance(detector, Detector) else detector
-    settings = settings or DetectorOptions.for_mapping()
     sources = [drive] if isinstance(drive, Source) else list(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
-    context.accept(read.whole)
-    earlier = None if base is None else read_base(Path(base))
-    if earlier is not None:
-        check_together(earlier, read.whole, str(base))
-    survey = take_survey(read.whole, options)
+    earlier, survey = _earlier(base, read.whole, context), take_survey(read.whole, options)
     with context.timed("check"):
         checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
     paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
     about = describe_run(name or read.whole.name, read.whole, paths, reading)
     described, seconds = checked.drive_as_described, context.seconds
-    unjudged = Result(about, read.drives, read.contents, described, seconds, options.device)
+    begun = Result(about, read.drives, read.contents, described, seconds, options.device)
+    return _mapped(begun, checked, detector, survey, earlier, accuracy_goal_cm, context)
+
+
+def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:
+    """The earlier map, which must be of the drive's frame; the context has looked at the drive before."""
+    context.accept(drive)
+    if base is None:
+        return None
+    earlier = read_base(Path(base))
+    check_together(earlier, drive, str(base))
+    return earlier
+
+
+def _mapped(
+    begun: Result,
+    checked: Inspection,
+    detector: Detector | DetectorOptions | None,
+    survey: Survey,
+    earlier: Base | None,
+    goal_cm: float,
+    context: Context,
+) -> Result:
+    """The result of a drive that was read and checked."""
+    settings = detector.options if isinstance(detector, Detector) else detector
+    settings = settings or DetectorOptions.for_mapping()
     try:
         with closing(context.viewer):
-            with compiled_meanwhile(options.device):
-                detections = _detect(checked.drive, read.contents, settings, context)
+            with compiled_meanwhile(survey.mapping.device):
+                detections = _detect(checked.drive, begun.contents, settings, context)
             with context.timed("map"):
-                key = read.contents.key(checked.drive)
+                key = begun.contents.key(checked.drive)
                 sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
             with context.timed("wear"):
                 sets = _with_wear(sets, checked.drive, earlier, context)
@@ -139,8 +150,8 @@ def map_drive(
             raise
         failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
         verdict = Verdict.of([*checked.findings, failed])
-        return replace(unjudged, verdict=verdict, figures={"results": {}})
-    return _judge(unjudged, checked, detections, sets, survey, accuracy_goal_cm, context)
+        return replace(begun, verdict=verdict, figures={"results": {}})
+    return _judge(begun, checked, detections, sets, survey, goal_cm, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:

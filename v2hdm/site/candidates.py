@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import polygamma, psi
 
 from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.quadrilateral import block_diagonal
@@ -101,60 +103,98 @@ class Exclusion:
     reason: str
 
 
-@dataclass(frozen=True)
-class Dissent:
-    """R corners that the joint solution rejected: candidate ``group`` (R,) and its ``corner`` (R,).
-
-    A sighting ``row`` (R,) saw it at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
-    """
-
-    row: IntArray
-    group: IntArray
-    corner: IntArray
-    seen_map: FloatArray
-    covariance_m2: FloatArray
-
-
-def with_dissent(candidates: Candidates, fused: FusedGroups, dissent: Dissent) -> Candidates:
+def with_dissent(
+    candidates: Candidates,
+    fused: FusedGroups,
+    row: IntArray,
+    group: IntArray,
+    corner: IntArray,
+    seen_map: FloatArray,
+    covariance_m2: FloatArray,
+) -> Candidates:
     """The candidates (G,), less certain where sightings contradict what ``fused`` ones agree on.
+
+    The joint solution rejected R corners: the ``corner`` (R,) of candidate ``group`` (R,), which sighting
+    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
 
     Most images may see where bright paint ends, and the nearest ones a worn end beyond it. Either is right in
     proportion to its information, not to a power of it: images of one view err alike. A mixture of two places
     has the variance p (1 - p) of their distance squared; p is small. Corners of one sighting go together.
     """
-    off = dissent.seen_map - candidates.corners_map[dissent.group, dissent.corner]
+    off = seen_map - candidates.corners_map[group, corner]
     away_m = np.linalg.norm(off, axis=1)
     # x' C^-1 x is the information along the line between both places, times its length squared.
-    agreed = fused.covariance_m2[dissent.group, dissent.corner]
-    usable = fused.valid[dissent.group, dissent.corner] & (away_m < 3 * _OTHER_EDGE_M)
-    usable &= np.isfinite(dissent.covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
+    agreed = fused.covariance_m2[group, corner]
+    usable = fused.valid[group, corner] & (away_m < 3 * _OTHER_EDGE_M)
+    usable &= np.isfinite(covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
     off, away_m, agreed = off[usable], away_m[usable], agreed[usable]
     one, all_others = (
-        np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off)
-        for each in (dissent.covariance_m2[usable], agreed)
+        np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off) for each in (covariance_m2[usable], agreed)
     )
     share = one / (one + all_others) * np.exp(-0.5 * (away_m / _OTHER_EDGE_M) ** 2)
-    sightings, number = np.unique(
-        np.stack([dissent.group, dissent.row])[:, usable], axis=1, return_inverse=True
-    )
+    sightings, number = np.unique(np.stack([group, row])[:, usable], axis=1, return_inverse=True)
     moved = np.zeros((sightings.shape[1], 4, 2))
-    moved[number.ravel(), dissent.corner[usable]] = np.sqrt(share)[:, None] * off
+    moved[number.ravel(), corner[usable]] = np.sqrt(share)[:, None] * off
     covariance, ways = candidates.covariance_m2.copy(), moved.reshape(-1, 8)
     np.add.at(covariance, sightings[0], ways[:, :, None] * ways[:, None, :])
     return Candidates(candidates.corners_map, covariance)
 
 
-def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates:
+def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: FloatArray) -> Candidates:
     """The solved candidates (G,), with the errors that all images of a corner share.
 
     A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
     are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
-    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says.
+    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says. Where the
+    images of a corner scatter more than others do, by ``scatter`` (G, 4), they know as much less of it.
     """
-    single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
-    unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]
-    shared = np.where(unseen, 0.0, CORRELATION * single)
+    seen = np.maximum(fused.seen, 1)
+    share = scatter - 1 + CORRELATION * seen * scatter
+    unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))
+    shared = np.where(unseen[..., None, None], 0.0, share[..., None, None] * fused.covariance_m2)
     # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
-    no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
+    no_point = (fused.seen == 0) & ~unseen
     shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
+
+
+_LARGEST = 1e9
+"""Variance of residuals, in squared sigmas, beyond which (and below whose inverse) all are alike."""
+
+_PRIOR_FREEDOM = (1.0, 1e4)
+"""Between these is the freedom of the prior of a variance: from tails as heavy as Cauchy's to none."""
+
+_LEAST_TO_COMPARE = 3  # variances from which they have a spread
+
+
+def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, float]:
+    """Scale and freedom of the inverse-gamma prior of variances (M,), each estimated with ``freedom`` (M,).
+
+    By moments of their logarithms (Smyth, Linear models and empirical Bayes methods, 2004, section 6.2); of
+    fewer than three nothing is known, and none is too large.
+    """
+    if len(variance) < _LEAST_TO_COMPARE:
+        return _LARGEST, _PRIOR_FREEDOM[1]
+    off = np.log(variance_within(variance)) - psi(freedom / 2) + np.log(freedom / 2)
+    beyond = off.var(ddof=1) - polygamma(1, freedom / 2).mean()
+    low, high = _PRIOR_FREEDOM
+    beyond = float(np.clip(beyond, polygamma(1, high / 2) * 1.001, polygamma(1, low / 2) * 0.999))
+    prior = float(brentq(lambda count: polygamma(1, count / 2) - beyond, low, high))
+    return float(np.exp(off.mean() + psi(prior / 2) - np.log(prior / 2))), prior
+
+
+def variance_within(variance: FloatArray) -> FloatArray:
+    """Variances without those that no comparison can do with."""
+    return np.clip(np.nan_to_num(variance, nan=_LARGEST), 1 / _LARGEST, _LARGEST)
+
+
+def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
+    """How many times as large as usual the variance of corners' (G, 4) images is, at least once.
+
+    By sums of their ``squared`` residuals (G, 4), in sigmas, over ``freedom`` (G, 4) degrees: each variance
+    is a mean of its own and of what those of all corners say.
+    """
+    known = freedom > 0
+    scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])
+    after = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))
+    return np.asarray(np.where(known, np.maximum(after / scale, 1.0), 1.0))

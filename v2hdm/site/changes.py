@@ -74,22 +74,17 @@ def fused_markings(
         if both is not None:
             by_old[pair.old] = fused(old[pair.old], new[pair.new], pair.turn, both, shift)
         else:
-            by_old[pair.old] = _repainted(old[pair.old], moved, pair.turn)
+            # It was painted elsewhere: where the new map has it, under the old one's id.
+            order = SHIFTS[pair.turn]
+            rows, covariance = (2 * order[:, None] + np.arange(2)).ravel(), moved.covariance_m2
+            by_old[pair.old] = replace(
+                moved,
+                corners_map=moved.corners_map[order],
+                covariance_m2=None if covariance is None else covariance[np.ix_(rows, rows)],
+                heights_m=old[pair.old].heights_m,
+                id=old[pair.old].id,
+            )
     return by_old, by_new
-
-
-def _repainted(old: Marking, new: Marking, turn: int) -> Marking:
-    """A marking that was painted elsewhere: where the new map has it, under the old one's id."""
-    order = SHIFTS[turn]
-    rows = (2 * order[:, None] + np.arange(2)).ravel()
-    covariance = new.covariance_m2
-    return replace(
-        new,
-        corners_map=new.corners_map[order],
-        covariance_m2=None if covariance is None else covariance[np.ix_(rows, rows)],
-        heights_m=old.heights_m,
-        id=old.id,
-    )
 
 
 _DRIFT_OVER_M = 30.0
@@ -117,21 +112,13 @@ class Base:
     left_out: tuple[tuple[str, FloatArray, int], ...] = ()
 
 
-@dataclass(frozen=True)
-class Names:
-    """The ids in an updated map of the M markings of the drive's own map.
-
-    ``id`` (M,) is 0 for one that it does not have, ``corner`` (M, 4) where each corner stands in its order.
-    """
-
-    id: IntArray
-    corner: IntArray
-
-
 def update_map(
     base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
-) -> tuple[HdMap, Changes, Names]:
-    """Bring the ``base`` map up to date; returns it, what changed, and what ``made``'s markings are called.
+) -> tuple[HdMap, Changes, IntArray, IntArray]:
+    """Bring the ``base`` map up to date; returns it and what changed.
+
+    Lastly the ids in it of the M markings of ``made`` (M,), 0 for one that it does not have, and where each
+    corner (M, 4) stands in its order.
 
     Args:
         base: the earlier map.
@@ -159,7 +146,14 @@ def update_map(
         if len(base.poses)
         else Watched.never(len(new)),
     )
-    _check_site(decision, now, len(old))
+    paired = np.zeros(len(old), dtype=bool)
+    paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
+    looked = (now.views >= _LOOKED) | paired
+    if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
+        raise MappingError(
+            f"map.base: this drive finds {paired.sum()} of {looked.sum()} markings again that it should have "
+            "seen; is the map of this site and frame? Map the drive by itself to see"
+        )
     by_old, by_new = fused_markings(old, new, decision)
     # Ids that no feature of the map has or ever had.
     known = [one.id or 0 for some in (old, base.hd_map.lanes, base.hd_map.symbols) for one in some]
@@ -174,16 +168,16 @@ def update_map(
         drift_over_m=max(of_old.over_m, of_new.over_m),
         largest_id=number() - 1,
     )
-    names = Names(np.zeros(len(new), dtype=np.int64), np.tile(np.arange(4), (len(new), 1)))
+    number_of, corner_of = np.zeros(len(new), dtype=np.int64), np.tile(np.arange(4), (len(new), 1))
     for k, one in fresh.items():
-        names.id[k] = one.id or 0
+        number_of[k] = one.id or 0
     for pair in decision.pairs:
-        names.id[pair.new] = by_old[pair.old].id or 0
-        names.corner[pair.new] = np.argsort(SHIFTS[pair.turn])
+        number_of[pair.new] = by_old[pair.old].id or 0
+        corner_of[pair.new] = np.argsort(SHIFTS[pair.turn])
     same = sum(pair.moved <= _LIKELY for pair in decision.pairs)
     shift_m = decision.shift.off_map.mean(axis=0) if len(decision.shift.old) else np.zeros(2)
     changes = _changes(decision, old, by_old, fresh, now, before)
-    return updated, Changes(tuple(changes), same, shift_m), names
+    return updated, Changes(tuple(changes), same, shift_m), number_of, corner_of
 
 
 def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Looks:
@@ -205,18 +199,6 @@ def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Look
             if one.kind == kind and off_m < diagonals_m.max() / 2:
                 found[k] = max(found[k], sightings)
     return Looks(np.maximum(np.bincount(seen, minlength=len(places)), found), found)
-
-
-def _check_site(decision: Decision, now: Looks, count: int) -> None:
-    """Refuse a map of which the drive finds nearly nothing where it looked."""
-    paired = np.zeros(count, dtype=bool)
-    paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
-    looked = (now.views >= _LOOKED) | paired
-    if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
-        raise MappingError(
-            f"map.base: this drive finds {paired.sum()} of {looked.sum()} markings again that it should have "
-            "seen; is the map of this site and frame? Map the drive by itself to see"
-        )
 
 
 def _changes(

@@ -13,15 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from v2hdm.geometry.quadrilateral import SHIFTS, align
 from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
+from v2hdm.site.shapes import rigid_motions
 
 _MOVED_SIGMA_M = 0.5
 """Sigma of how far a marking is painted from where it was, m a coordinate: a new line of the same bay."""
@@ -190,20 +190,10 @@ def _candidates(
     order = (2 * SHIFTS[turn][..., None] + np.arange(2)).reshape(-1, 8)
     rows = np.arange(len(second))[:, None, None]
     noise = of_old.own_m2[first] + of_new.own_m2[second][rows, order[:, :, None], order[:, None, :]]
-    basis, arm_m = _bases(before)
-    return _Candidates(first, second, turn, (turned - before).reshape(-1, 8), noise, basis, arm_m)
-
-
-def _bases(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal rows (P, 8, 8): shifts along x and y, the turn about the centre, five deformations."""
-    arms = corners - corners.mean(axis=1, keepdims=True)
-    turning = np.stack([-arms[..., 1], arms[..., 0]], axis=-1).reshape(-1, 8)
-    arm_m = np.linalg.norm(turning, axis=1)
-    columns = np.concatenate(
-        [np.broadcast_to(SHIFT / 2, (len(corners), 8, 2)), (turning / arm_m[:, None])[..., None]], axis=2
-    )
-    rest = np.linalg.qr(columns, mode="complete")[0][:, :, 3:]
-    return np.swapaxes(np.concatenate([columns, rest], axis=2), 1, 2), arm_m
+    motions = rigid_motions(before)
+    basis = np.swapaxes(np.linalg.qr(motions, mode="complete")[0], 1, 2)
+    off = (turned - before).reshape(-1, 8)
+    return _Candidates(first, second, turn, off, noise, basis, np.linalg.norm(motions[..., 2], axis=1))
 
 
 def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntArray) -> Shift:
@@ -262,18 +252,12 @@ def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
     better = np.flatnonzero(score > 0)
     if not len(better):
         return better
-    olds, news = candidates.old[better], candidates.new[better]
-    count = int(olds.max()) + 1
-    size = count + int(news.max()) + 1
-    graph = coo_array((np.ones(len(better)), (olds, count + news)), shape=(size, size))
-    _, group = connected_components(graph, directed=False)
-    chosen = []
-    for one in np.unique(group[olds]):
-        own = better[group[olds] == one]
-        a, rows = np.unique(candidates.old[own], return_inverse=True)
-        b, columns = np.unique(candidates.new[own], return_inverse=True)
-        gain, taken = np.zeros((len(a), len(b))), np.zeros((len(a), len(b)), dtype=bool)
-        gain[rows, columns] = score[own]
-        taken[linear_sum_assignment(-gain)] = True
-        chosen.append(own[taken[rows, columns]])
-    return np.sort(np.concatenate(chosen))
+    old, row = np.unique(candidates.old[better], return_inverse=True)
+    new, column = np.unique(candidates.new[better], return_inverse=True)
+    # An old marking that stays alone takes a column of its own.
+    alone, most = np.arange(len(old)), 1.0 + score[better].max()
+    cost = np.append(most - score[better], np.full(len(old), most))
+    places = np.append(row, alone), np.append(column, len(new) + alone)
+    graph = coo_array((cost, places), shape=(len(old), len(new) + len(old))).tocsr()
+    _, partner = min_weight_full_bipartite_matching(graph)
+    return np.asarray(better[partner[row] == column], dtype=np.int64)

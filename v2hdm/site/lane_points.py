@@ -302,11 +302,17 @@ def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
     points, tangent = cloud.points_map[seeds], cloud.tangent[seeds]
     # Pairs of seed and point of the cloud that may ever lie in its neighbourhood.
     reach_m = float(np.hypot(options.half_length_m, 2 * options.half_width_m))
-    near = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
-    pairs = near["i"].astype(np.int64), near["j"].astype(np.int64)
+    apart = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
+    pairs = apart["i"].astype(np.int64), apart["j"].astype(np.int64)
     for _ in range(_ITERATIONS):
         points, tangent = _shift(points, tangent, cloud, pairs, options)
-    images, dash = _support(points, tangent, cloud, pairs, options)
+    along, across, cosine = _coordinates(points, tangent, cloud, pairs)
+    near = (np.abs(along) <= options.node_spacing_m) & (np.abs(across) <= 0.5 * options.half_width_m)
+    near &= cosine >= _SAME_DIRECTION
+    seed, point = pairs[0][near], pairs[1][near]
+    shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
+    images, total = np.bincount(shown, minlength=len(points)), np.bincount(seed, minlength=len(points))
+    dash = np.bincount(seed, cloud.dash[point].astype(float), len(points)) / np.maximum(total, 1)
     supported = np.flatnonzero(images >= options.min_images)
     kept = supported[_thin(points[supported], tangent[supported], images[supported], options)]
     return Nodes(points[kept], tangent[kept], images[kept], dash[kept])
@@ -353,25 +359,6 @@ def _shift(
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     turned = tangent + slope[:, None] * normal
     return points + offset[:, None] * normal, turned / np.linalg.norm(turned, axis=1, keepdims=True)
-
-
-def _support(
-    points: FloatArray,
-    tangent: FloatArray,
-    cloud: LaneCloud,
-    pairs: tuple[IntArray, IntArray],
-    options: LaneOptions,
-) -> tuple[IntArray, FloatArray]:
-    """Distinct images (N,) around each node, and the share (N,) of points seen as a dash."""
-    along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= options.node_spacing_m) & (np.abs(across) <= 0.5 * options.half_width_m)
-    near &= cosine >= _SAME_DIRECTION
-    seed, point = pairs[0][near], pairs[1][near]
-    shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
-    images = np.bincount(shown, minlength=len(points))
-    total = np.maximum(np.bincount(seed, minlength=len(points)), 1)
-    dash = np.bincount(seed, weights=cloud.dash[point].astype(float), minlength=len(points)) / total
-    return images.astype(np.int64), dash
 
 
 def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: LaneOptions) -> IntArray:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.geometry.planar import length_along
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
@@ -39,7 +40,7 @@ class Path:
     @property
     def length_m(self) -> float:
         """Length along the polyline."""
-        return float(np.sum(np.linalg.norm(np.diff(self.points_map, axis=0), axis=1)))
+        return float(length_along(self.points_map)[-1])
 
     def turned(self, turn: bool) -> Path:
         """The same from its other end if it is to ``turn``, else as it is."""
@@ -309,6 +310,6 @@ def _resample(points: FloatArray, spacing_m: float) -> FloatArray:
     # Binomial smoothing takes out the nodes' own lateral noise.
     inner = 0.25 * points[:-2] + 0.5 * points[1:-1] + 0.25 * points[2:]
     points = np.concatenate([points[:1], inner, points[-1:]])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = length_along(points)
     at = np.linspace(0.0, along[-1], max(round(float(along[-1]) / spacing_m), 1) + 1)
     return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])

@@ -22,6 +22,7 @@ from v2hdm.association.groups import near_pairs, squared_distances
 from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
@@ -73,9 +74,7 @@ def _mixed(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
 
 def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points within an outline (4, 2), and beside its four edges."""
-    s, t = (grid.ravel()[:, None] for grid in np.meshgrid(_INSIDE, _INSIDE))
-    a, b, c, d = corners
-    inside = (1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d
+    inside = Quad(corners).at(*(grid.ravel() for grid in np.meshgrid(_INSIDE, _INSIDE)))
     beside = []
     for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         side = second - first
@@ -98,7 +97,12 @@ def learn_paint(
         own = np.stack([one.corners_map for one in markings if one.kind == kind])
         own = own[np.linspace(0, len(own) - 1, min(len(own), _MOST_LEARNED)).astype(int)]
         painted = observer.contrasts(own)
-        across = _ASIDE_M * _across(own)[:, None]
+        # Across the longest extent, side or diagonal, of each.
+        every = own[:, [1, 2, 2, 3]] - own[:, [0, 1, 0, 1]]
+        extent_m = np.linalg.norm(every, axis=2)
+        rows, longest = np.arange(len(every)), np.argmax(extent_m, axis=1)
+        along = every[rows, longest] / extent_m[rows, longest, None]
+        across = _ASIDE_M * np.column_stack([-along[:, 1], along[:, 0]])[:, None]
         aside = np.concatenate([own - across, own + across])
         clear = paint.query(aside.reshape(-1, 2))[0].reshape(-1, 4).min(axis=1) > _CLEAR_M
         bare = observer.contrasts(aside[clear]) if clear.any() else np.zeros(0)
@@ -106,15 +110,6 @@ def learn_paint(
         if min(len(values) for values in samples) >= _LEAST_LEARNED:
             out[kind] = Paint(_robust(samples[0]), _robust(samples[1]))
     return out
-
-
-def _across(corners: FloatArray) -> FloatArray:
-    """Unit directions (N, 2) across the longest extent, side or diagonal, of outlines (N, 4, 2)."""
-    every = corners[:, [1, 2, 2, 3]] - corners[:, [0, 1, 0, 1]]
-    longest = np.argmax(np.linalg.norm(every, axis=2), axis=1)
-    along = every[np.arange(len(every)), longest]
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    return np.column_stack([-along[:, 1], along[:, 0]])
 
 
 def _robust(values: FloatArray) -> tuple[float, float]:

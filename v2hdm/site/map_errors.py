@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from v2hdm.geometry.planar import length_along
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
 _UNKNOWN_SIGMA_M = 0.02
@@ -231,18 +232,14 @@ def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
 def _apart(points: FloatArray, line: FloatArray) -> FloatArray:
     """Distances (N,) of points (N, 2) from a polyline (M, 2)."""
     place = _stations(points, line)
-    along = _along(line)
+    along = length_along(line)
     foot = np.column_stack([np.interp(place, along, line[:, k]) for k in (0, 1)])
     return np.asarray(np.linalg.norm(points - foot, axis=1))
 
 
-def _along(line: FloatArray) -> FloatArray:
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-
-
 def _stations(points: FloatArray, line: FloatArray) -> FloatArray:
     """How far along a polyline (M, 2) the feet of points (N, 2) lie, m: beside its nearest vertex."""
-    along, nearest = _along(line), cKDTree(line).query(points)[1]
+    along, nearest = length_along(line), cKDTree(line).query(points)[1]
     best = np.full(len(points), np.inf)
     station = np.asarray(along[nearest], dtype=np.float64)
     for first in (nearest - 1, nearest):
@@ -261,7 +258,7 @@ def _renewed(lane: Lane, pieces: Sequence[Lane]) -> Lane:
     """The earlier line with its course replaced where new lines lie on it."""
     if not pieces:
         return lane
-    along, heights = _along(lane.points_map), lane.heights_m
+    along, heights = length_along(lane.points_map), lane.heights_m
     points: list[FloatArray] = []
     up: list[FloatArray] = []
     reached = -1.0

@@ -1,6 +1,7 @@
 """Which candidates become markings of the map, and why the others do not.
 
-How sure a marking is beside its neighbours, whatever drift or survey moves all of them alike.
+How sure a marking is beside its neighbours, whatever drift or survey moves all of them alike, and how
+suspicious: unlike the others of its class in shape, in residuals, or in dispute.
 """
 
 from __future__ import annotations
@@ -10,16 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.stats import beta, f
 
 from v2hdm.association.ground import Views, easy_views, images_with_symbol
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Candidates, Counts, Exclusion
+from v2hdm.site.candidates import Candidates, Counts, Exclusion, variance_prior, variance_within
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
-from v2hdm.site.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
+from v2hdm.site.posterior import CLUTTER, CORNERS_OF_IMAGE, PART_OF_SYMBOL, Posterior, posterior
 
 OF_SYMBOL = "part of a symbol, such as an arrow"
 TOO_UNCERTAIN = "its position is too uncertain"
@@ -240,3 +242,49 @@ def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
             first.append(own)
             second.append(int(others[np.argmin(np.abs(distance_m - _NEIGHBOUR_M))]))
     return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
+
+
+_LISTED = 10  # markings that are listed: as many as a user looks at
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """How unlikely the marking of id ``marking`` is, were it like the others of its class.
+
+    P-values: ``p_shape`` of how far it is from the shape of its class under the posterior predictive (1 where
+    the class has none), ``p_residuals`` of its accepted observations, ``p_sightings`` of the share
+    ``disputed`` of its observations that the joint solution rejected.
+    """
+
+    marking: int
+    p_shape: float
+    p_residuals: float
+    p_sightings: float
+    disputed: float
+
+    @property
+    def p(self) -> float:
+        """The least of three p-values, as many times as there are tests (Bonferroni)."""
+        return min(1.0, 3 * min(self.p_shape, self.p_residuals, self.p_sightings))
+
+
+def most_suspicious(
+    accepted: IntArray, misfit: FloatArray, squared: FloatArray, counts: Counts
+) -> Sequence[Suspicion]:
+    """The most suspicious of the ``accepted`` (M,) of G candidates, the worst first.
+
+    ``misfit`` (G,) are p-values of shapes, ``squared`` (G,) the sums of squared residuals, in sigmas.
+    """
+    seen, agreed = counts.observations[accepted], counts.agreeing[accepted]
+    freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two an observation, less those of four corners
+    # Beside its freedom a variance has an inverse-gamma prior, so that it follows Fisher's F distribution.
+    variance = squared[accepted] / freedom
+    scale, prior = variance_prior(variance, freedom)
+    residuals = f.sf(variance_within(variance) / scale, freedom, prior)
+    # The tail of a binomial distribution, continued to parts of an image.
+    rate = (seen - agreed).sum() / max(seen.sum(), 1)
+    disputes, images = (seen - agreed) / CORNERS_OF_IMAGE, seen / CORNERS_OF_IMAGE
+    sightings = np.where(disputes > 0, beta.cdf(rate, np.maximum(disputes, 1e-9), images - disputes + 1), 1.0)
+    rows = zip(misfit[accepted], residuals, sightings, (seen - agreed) / np.maximum(seen, 1), strict=True)
+    found = [Suspicion(number, *map(float, row)) for number, row in enumerate(rows, start=1)]
+    return sorted(found, key=lambda one: one.p)[:_LISTED]

@@ -43,7 +43,8 @@ _KINDS = len(_PRIOR_COUNT)
 _SIZE_SIGMA_M = 1.0
 """Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
 
-_LENGTH_SIGMA_M = 0.3  # sigma, m, of the length of paint that is rolled by the metre: a tenth of a dash's
+_LENGTH_SIGMA_M = 0.3
+"""Sigma, m, of the length of paint rolled by the metre, before the drive says: a tenth of a dash's."""
 
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
@@ -138,7 +139,9 @@ def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posteri
 def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     """The posterior of the candidates of one class, which together say what its markings are like."""
     share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
-    weight, probability = _weight_before(candidates, counts), np.zeros((len(candidates), _KINDS))
+    # Before anything is known of the class, what agreeing images show whole is taken for a marking.
+    taken = candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations)
+    weight, probability = np.asarray(taken, dtype=np.float64), np.zeros((len(candidates), _KINDS))
     for _ in range(_PASSES):
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         hypotheses = _hypotheses(candidates, shapes, share, paint, weight, probability[:, OTHER_LENGTH])
@@ -160,13 +163,6 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     # A paint error has the tails of Student's t distribution, its square those of Fisher's.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
     return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
-
-
-def _weight_before(candidates: Candidates, counts: Counts) -> FloatArray:
-    """Which candidates (N,) are taken for markings before anything is known of their class."""
-    return np.asarray(
-        candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations), dtype=np.float64
-    )
 
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
@@ -307,21 +303,9 @@ def _hypotheses(
     ) -> None:
         off = (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
         residual = (laid.directions @ off)[..., 0]
-        prior, paint_m2 = float(np.log(part * share[kind])), paint.sigma_m**2
-        out.append(
-            _Hypothesis(
-                kind,
-                prior,
-                candidates,
-                laid.directions,
-                residual,
-                scatter,
-                misplaced,
-                paint_m2,
-                one_way,
-                beside,
-            )
-        )
+        errors = scatter, misplaced, paint.sigma_m**2, one_way, beside
+        prior = float(np.log(part * share[kind]))
+        out.append(_Hypothesis(kind, prior, candidates, laid.directions, residual, *errors))
 
     total, anything = sum(shape.share for shape in shapes), np.zeros(len(candidates))
     for shape in shapes:
@@ -338,8 +322,8 @@ def _hypotheses(
             # Of what is no marking any end is as likely ragged as not.
             anything = np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0)
             shorter = (ends[0][0] + ends[1][0]) / 2
-            longer = scatter + _LENGTH_SIGMA_M**2 * _outer(shorter)
-            again = _repeated(candidates, laid, shorter, shape.sigma_m, other_length)
+            spread_m, again = _other_lengths(candidates, laid, shorter, shape.sigma_m, other_length)
+            longer = scatter + spread_m**2 * _outer(shorter)
             add(OTHER_LENGTH, part, laid, longer, beside=again)
             other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
             lengths = [(1 - other, scatter), (other, longer)]
@@ -362,7 +346,10 @@ def _hypotheses(
         for moved in _CORNERS_MOVED:
             block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
             add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
-    own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else _as_seen(candidates)
+    centre = candidates.corners_map.mean(axis=1)
+    turns, shifts = np.tile(np.eye(2), (len(centre), 1, 1)), np.zeros(len(centre), dtype=np.int64)
+    own = Laid(parallelograms(candidates.corners_map) + centre[:, None], turns, centre, shifts)
+    own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own
     any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
     add(OWN_SHAPE, 1.0, own, any_size)
     add(PART_OF_SYMBOL, 1.0, own, any_size, beside=anything)
@@ -390,37 +377,29 @@ def _worn_evidence(
     return list(np.where(whole, np.log(odds), 0.0))
 
 
-def _repeated(
+def _other_lengths(
     candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
-) -> FloatArray:
-    """Log likelihood ratio (N,) of a length, as others have it, beside that of a length of its own.
+) -> tuple[float, FloatArray]:
+    """Sigma, m, of other lengths, and the log likelihood ratio (N,) of one as others have it.
 
-    ``shorter`` (N, 8) moves corners so that paint gets shorter by 1 m; of paint that has the length of its
-    own with the probabilities ``weight`` (N,) each may be repeated (a Dirichlet process).
+    That is beside a length of its own: of paint that has another length with the probabilities ``weight``
+    (N,) each may be repeated (a Dirichlet process). ``shorter`` (N, 8) moves corners so that paint gets
+    shorter by 1 m.
     """
     off_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     own_m2 = _along(candidates.covariance_m2, shorter, shorter)
-    alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + _LENGTH_SIGMA_M**2))
+    squared = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + weight @ np.maximum(off_m**2 - own_m2, 0.0)
+    spread_m = float(np.sqrt(squared / (_REPEATED_COUNT + weight.sum())))
+    alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + spread_m**2))
     apart = np.sqrt(own_m2 + own_m2[:, None] + 2 * sigma_m**2)
     alike = weight * (1 - np.eye(len(weight))) * norm.pdf(off_m, off_m[:, None], apart)
     drawn = (_REPEATED_COUNT * alone + alike.sum(axis=1)) / (_REPEATED_COUNT + weight.sum() - weight)
-    return np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
+    return spread_m, np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
 
 
 def _along(covariance: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
     """Covariances (N,) of what moves along two directions (N, 8) each."""
     return np.asarray(np.einsum("ni,nij,nj->n", first, covariance, second))
-
-
-def _as_seen(candidates: Candidates) -> Laid:
-    """Every candidate's own parallelogram."""
-    centre = candidates.corners_map.mean(axis=1)
-    corners = parallelograms(candidates.corners_map) + centre[:, None]
-    unturned, unshifted = (
-        np.tile(np.eye(2), (len(candidates), 1, 1)),
-        np.zeros(len(candidates), dtype=np.int64),
-    )
-    return Laid(corners, unturned, centre, unshifted)
 
 
 def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:

@@ -84,7 +84,7 @@ class Laid:
     def directions(self) -> FloatArray:
         """Orthonormal directions (N, 5, 8)."""
         return np.asarray(
-            np.swapaxes(np.linalg.qr(_rigid(self.corners_map), mode="complete")[0][:, :, 3:], 1, 2)
+            np.swapaxes(np.linalg.qr(rigid_motions(self.corners_map), mode="complete")[0][:, :, 3:], 1, 2)
         )
 
     def in_frame_of_shape(self, corners_map: FloatArray) -> FloatArray:
@@ -138,7 +138,7 @@ def _lay(
     for _ in range(_GAUSS_NEWTON_STEPS):
         placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]
         off = (corners - placed).reshape(-1, 8, 1)
-        rigid = _rigid(placed)
+        rigid = rigid_motions(placed)
         normal = np.swapaxes(rigid, 1, 2) @ information @ rigid
         step = np.linalg.solve(normal, np.swapaxes(rigid, 1, 2) @ information @ off)[..., 0]
         turn, centre = turn + step[:, 2], centre + step[:, :2]
@@ -154,7 +154,7 @@ def _turned(angle: FloatArray) -> FloatArray:
     return np.stack([np.stack([cosine, -sine], axis=-1), np.stack([sine, cosine], axis=-1)], axis=-2)
 
 
-def _rigid(corners: FloatArray) -> FloatArray:
+def rigid_motions(corners: FloatArray) -> FloatArray:
     """Derivatives (N, 8, 3) of corners (N, 4, 2) by a shift and a turn about their centre."""
     arms = corners - corners.mean(axis=1, keepdims=True)
     turning = np.stack([-arms[..., 1], arms[..., 0]], axis=-1).reshape(-1, 8, 1)

@@ -73,9 +73,13 @@ def map_symbols(
             continue
         eyes = _Eyes(camera, frame, rig, infos, jitter_rad)
         outline = _fused_outline([shapes[n] for n in own], image.ravel(), eyes)
-        if outline is None or _holds_any(outline, places):
+        if outline is None:
             continue
-        weight = eyes.sigma_m(outline.mean(axis=0))[image.ravel()] ** -2
+        middle, size_m = outline.mean(axis=0), np.ptp(outline, axis=0).max()
+        ring, near = (outline - middle).astype(np.float32), np.linalg.norm(places - middle, axis=1) < size_m
+        if any(cv2.pointPolygonTest(ring, one.tolist(), False) >= 0 for one in places[near] - middle):
+            continue
+        weight = eyes.sigma_m(middle)[image.ravel()] ** -2
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
         # The border may cut one end in some images, and a shadow hide it: then the other tells.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
@@ -84,7 +88,7 @@ def map_symbols(
             sigma_m = _sigma_m([shapes[n] for n in own], weight)
             found.append(Symbol(kind, outline, len(camera), sigma_m))
         else:
-            left_out.append(Exclusion(kind, outline.mean(axis=0), len(camera), objections[0] or ""))
+            left_out.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
     return tuple(found), tuple(left_out)
 
 
@@ -215,13 +219,6 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
 def _share(painted: BoolArray, weight: FloatArray) -> FloatArray:
     """The share (h, w) of the weight of images (I, h, w) that has paint; 0 where none sees anything."""
     return np.asarray((weight * painted).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12))
-
-
-def _holds_any(outline: FloatArray, places: FloatArray) -> bool:
-    """Whether one of some points (P, 2) lies within an outline."""
-    ring = (outline - outline.mean(axis=0)).astype(np.float32)
-    near = places[np.linalg.norm(places - outline.mean(axis=0), axis=1) < np.ptp(outline, axis=0).max()]
-    return any(cv2.pointPolygonTest(ring, (p - outline.mean(axis=0)).tolist(), False) >= 0 for p in near)
 
 
 def _sigma_m(shapes: Sequence[FloatArray], weight: FloatArray) -> float:

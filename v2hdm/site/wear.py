@@ -21,6 +21,7 @@ from scipy.stats import norm
 
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, FloatArray, HdMap, Image, PaintLeft
 
@@ -62,9 +63,8 @@ class Cells:
             for m, least, most in zip((length, width), (3, 2), _MOST_CELLS, strict=True)
         )
         across = np.concatenate([-_BESIDE_M[::-1] / width, across, 1 + _BESIDE_M / width])
-        s, t = (grid[..., None] for grid in np.meshgrid(along, across, indexing="ij"))
-        a, b, c, d = corners_map
-        return cls((1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d, [])
+        s, t = np.meshgrid(along, across, indexing="ij")
+        return cls(Quad(corners_map).at(s.ravel(), t.ravel()).reshape(*s.shape, 2), [])
 
     def add(self, light: FloatArray) -> None:
         """Take the light (along, across) of one image."""

@@ -21,7 +21,7 @@ from tests.report.page.folder import (
 )
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
-from v2hdm.geometry.geodetic import geodetic_from_enu, utm_from_geodetic
+from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
 from v2hdm.io.maps.evidence import COLUMNS
@@ -221,7 +221,7 @@ HAMBURG = GeodeticOrigin(53.5, 9.9, 12.0)
 
 def in_grid(x, y):
     """UTM's easting and northing of a place in a map with that origin."""
-    return utm_from_geodetic(HAMBURG, geodetic_from_enu(HAMBURG, np.array([[x, y, 0.0]])))[1][0, :2]
+    return Grid("EPSG:32632", HAMBURG).positions(np.array([[x, y, 0.0]]))[0, :2]
 
 
 def write_tif(path, centre, dtype="uint8", count=3, crs="EPSG:32632"):

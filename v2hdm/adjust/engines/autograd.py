@@ -212,9 +212,7 @@ class TorchEngine(Engine):
         root = weight.clamp(min=WEIGHT_FLOOR).sqrt()[:, None, None]
         return by_pair * root, by_corner * root
 
-    def eliminate(
-        self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
-    ) -> TorchLinearised:
+    def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> TorchLinearised:
         """Linearise, and subtract the eliminated corners from the reduced system."""
         arrays, poses = self.arrays, self.poses(estimate).flatten(0, 1)
         own = poses.new_zeros(arrays.pair_count, 6, 6)
@@ -224,7 +222,7 @@ class TorchEngine(Engine):
             own.index_add_(0, run.pair, by_pair.mT @ by_pair)
             blocks[run.corners] += run.sum_by_corner(by_corner.mT @ by_corner)
             coupling[run.observations] = by_corner.mT @ by_pair
-        factor = factorise_corners(arrays, blocks, self._by_length(estimate), damping)
+        factor = factorise_corners(arrays, blocks, self._by_length(estimate))
         own = own.view(arrays.camera_count, -1, 6, 6)
         tip = own.new_zeros(system.tip, system.tip)
         for n, run in enumerate(arrays.runs(_BLOCK if arrays.states else None)):

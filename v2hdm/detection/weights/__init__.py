@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -34,36 +33,21 @@ COMMANDS: Mapping[str, str] = {
 }
 """The command that makes each file, from a training or for the network that is there."""
 
-_being_fitted = False
-
 
 def check_weights(folder: Path = FOLDER) -> None:
     """Refuse fitted files that do not belong together. Files are read once per process.
 
-    Raises:
-        DetectorError: a file is missing, is not the one of the manifest, or goes with another network.
+    Raises DetectorError where a file is missing, is not the one of the manifest, or goes with another
+    network.
     """
-    problem = None if _being_fitted else _problem(folder)
-    if problem is not None:
+    if (problem := _problem(folder)) is not None:
         raise DetectorError(problem)
-
-
-@contextmanager
-def being_fitted() -> Iterator[None]:
-    """Within, :func:`check_weights` lets pass: the fits to a new network need that network's detector."""
-    global _being_fitted
-    before, _being_fitted = _being_fitted, True
-    try:
-        yield
-    finally:
-        _being_fitted = before
 
 
 def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
     """One line for the user of a network that the judge was not fitted to; None for the shipped one.
 
-    Raises:
-        DetectorError: there is no such file.
+    Raises DetectorError where there is no such file.
     """
     path = Path(model)
     if not path.is_file():
@@ -79,8 +63,7 @@ def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
 def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
     """The content of ``manifest.json``: ``commit``, and ``files`` by name.
 
-    Raises:
-        DetectorError: it is missing or damaged.
+    Raises DetectorError where it is missing or damaged.
     """
     path = folder / MANIFEST_FILE.name
     try:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.geometry.geodetic import map_projection
+from v2hdm.geometry.geodetic import crs_of
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, FloatArray, HdMap
@@ -72,7 +72,7 @@ def write_opendrive(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None
     about = {"revMajor": "1", "revMinor": "7", "name": path.stem, "date": stamp, "vendor": "v2hdm"}
     header = ET.SubElement(root, "header", about | bounds)
     if hd_map.origin is not None:
-        ET.SubElement(header, "geoReference").text = map_projection(hd_map.origin)
+        ET.SubElement(header, "geoReference").text = crs_of(hd_map.origin)
     objects = [_write_road(root, number, road) for number, road in enumerate(roads, start=1)]
     for one in features:
         if one.closed:

@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError
 from v2hdm.extras import need
-from v2hdm.geometry.geodetic import Grid, map_projection
+from v2hdm.geometry.geodetic import Grid, crs_of
 from v2hdm.io.maps.features import POINTS, features_of
 from v2hdm.io.maps.geopackage import LOCAL_CRS, layer_style
 from v2hdm.io.maps.reading import LAYERS
@@ -34,7 +34,7 @@ def write_qgis(
     pyproj = need("pyproj", "map", "the format qgis", ConfigError)
     features, where = features_of(hd_map), grid or Grid("local", hd_map.origin)
     placed = hd_map.origin is not None and (grid is None or not grid.is_local)
-    ground = map_projection(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
+    ground = crs_of(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
     layers_crs = LOCAL_CRS if not placed else "EPSG:4326" if grid is None else grid.crs
     canvas_crs = ground if grid is None else layers_crs
     system = pyproj.CRS.from_user_input(canvas_crs)

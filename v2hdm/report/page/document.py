@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -53,7 +52,7 @@ def document(facts: Facts) -> SimpleNamespace:
         cameras=tables.camera_pages(facts, overlays(facts)),
         ground=ground_page(facts.folder),
         residuals=charts.residual_charts(facts, residuals) if residuals else {},
-        excluded=charts.bar_chart("excluded", Counter(one.reason for one in facts.excluded).most_common()),
+        excluded=tables.reason_table(facts),
         contents=tables.content_table(facts),
         methods=tables.method_table(facts),
         drive=tables.pair_table(metrics.get("drive") or {}),

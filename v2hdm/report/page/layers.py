@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.extras import need
-from v2hdm.geometry.geodetic import crs_of, geodetic_from_enu, utm_from_geodetic
+from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -230,8 +230,9 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
     if hd_map is None or hd_map.origin is None:
         return []
     x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(*_extent(facts), 7).T))
-    earth = geodetic_from_enu(hd_map.origin, np.column_stack([x, y, np.zeros_like(x)]))
-    code, grid = utm_from_geodetic(hd_map.origin, earth)
+    places_map, code = np.column_stack([x, y, np.zeros_like(x)]), utm_of(hd_map.origin)
+    earth = geodetic_from_enu(hd_map.origin, places_map)
+    grid = Grid(code, hd_map.origin).positions(places_map)[:, :2]
     scale = float(np.abs([x, y]).max())
     terms = np.column_stack([(x / scale) ** a * (y / scale) ** b for a in range(4) for b in range(4 - a)])
     return [

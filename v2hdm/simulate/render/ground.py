@@ -10,26 +10,26 @@ from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render import kernels
-from v2hdm.simulate.render.scene import Dapple, Ground, GroundMarks, Paint, Shadow
-from v2hdm.simulate.render.textures import (
+from v2hdm.simulate.render.scene import (
     Float32,
+    Ground,
+    GroundMarks,
+    Paint,
+    Shade,
+    Shadow,
     Tile,
-    fade,
     noise_tile,
-    photo_tile,
     sample,
     scale_of,
     smoothstep,
 )  # fmt: skip
 from v2hdm.simulate.render.view import (
-    Outline,
     View,
     bands_of,
     edges_of,
     following_row,
     in_view,
     outlines,
-    windows,
 )  # fmt: skip
 
 _FARTHEST_M = 400.0
@@ -55,11 +55,6 @@ class GroundField:
     def planes(self) -> tuple[Float32, Float32, Float32]:
         """``x_m``, ``y_m`` and ``footprint_m``."""
         return self.x_m, self.y_m, self.footprint_m
-
-    def rows(self, window: tuple[slice, slice]) -> tuple[slice, slice]:
-        """A window of the image as a window of these arrays."""
-        vertical, horizontal = window
-        return slice(vertical.start - self.first_row, vertical.stop - self.first_row), horizontal
 
 
 def intersect_ground(view: View) -> GroundField | None:
@@ -89,13 +84,13 @@ def _plane(view: View, row: NDArray[np.float64], rows: slice) -> Float32:
     return out
 
 
-def fine_tile(texture: str) -> Tile:
-    """The millimetre to decimetre grain of a ground texture."""
+def fine_tile(texture: str | Tile) -> Tile:
+    """The millimetre to decimetre grain of a ground texture: concrete, asphalt, or a tile of one's own."""
+    if isinstance(texture, Tile):
+        return texture
     if texture == "concrete":
         return noise_tile(11, 4.0, 0.6, finest_px=0.8)
-    if texture == "asphalt":
-        return noise_tile(12, 4.0, 0.1, finest_px=0.7, skew=0.5)
-    return photo_tile(texture, 3.0)
+    return noise_tile(12, 4.0, 0.1, finest_px=0.7, skew=0.5)
 
 
 MEDIUM_TILE = noise_tile(13, 19.0, 1.0)
@@ -105,7 +100,7 @@ WET_TILE = noise_tile(19, 47.0, 1.9, finest_px=3.0)
 
 def tone(ground: Ground, field: GroundField) -> Float32:
     """Relative reflectance (H, W) of the bare, dry ground, about 1."""
-    shift = _shift(ground.seed)
+    shift = texture_shift(ground.seed)
     fine = fine_tile(ground.texture)
     scales = np.array([scale_of(fine, shift), scale_of(MEDIUM_TILE, shift)], dtype=np.float32)
     amplitudes = np.array([ground.contrast, 0.6 * ground.stains, 0.8 * ground.stains], dtype=np.float32)
@@ -162,12 +157,12 @@ def wetness(ground: Ground, field: GroundField) -> Float32:
     if ground.wet_fraction <= 0:
         return np.empty((0, 0), dtype=np.float32)
     level = float(np.quantile(WET_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
-    values = _sample_smooth(WET_TILE, field, _shift(ground.seed + 1))
+    values = _sample_smooth(WET_TILE, field, texture_shift(ground.seed + 1))
     return smoothstep(values, level - 0.1, level + 0.3)
 
 
 def sun_visibility(
-    shadows: tuple[Shadow, ...], dapples: tuple[Dapple, ...], view: View, field: GroundField
+    shadows: tuple[Shadow, ...], shades: tuple[Shade, ...], view: View, field: GroundField
 ) -> Float32:
     """Fraction (H, W) of the sun's light that reaches the ground."""
     out = np.ones_like(field.x_m)
@@ -178,9 +173,11 @@ def sun_visibility(
     ]
     for shadow, shape in zip(near, outlines(view, [_penumbra_px(one, view) for one in near]), strict=True):
         if shape is not None:
-            _cast(shadow, shape, view, field, out)
-    for dapple in dapples:
-        _dapple(dapple, view, field, out)
+            lines, first = inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64)), field.first_row
+            look = np.float32(shadow.softness_m), np.float32(1.0 - shadow.transmission)
+            kernels.cast_shadow(*bands_of(view, shape, first), first, lines, *look, field.planes, out)
+    for shade in shades:
+        shade(view, field, out)
     return out
 
 
@@ -189,20 +186,15 @@ def _penumbra_px(shadow: Shadow, view: View) -> FloatArray:
     polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
     away = polygon - polygon.mean(axis=0)
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    return _on_ground_px(view, polygon + 0.5 * shadow.softness_m * away)
+    return on_ground_px(view, polygon + 0.5 * shadow.softness_m * away)
 
 
-def _on_ground_px(view: View, polygon_map: FloatArray) -> FloatArray:
+def on_ground_px(view: View, polygon_map: FloatArray) -> FloatArray:
+    """A polygon (N, 2) on the ground as homogeneous pinhole pixels (N, 3)."""
     return view.homogeneous_px(np.column_stack([polygon_map, np.zeros(len(polygon_map))]))
 
 
-def _cast(shadow: Shadow, shape: Outline, view: View, field: GroundField, out: Float32) -> None:
-    lines, first = _inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64)), field.first_row
-    softness_m, darkness = np.float32(shadow.softness_m), np.float32(1.0 - shadow.transmission)
-    kernels.cast_shadow(*bands_of(view, shape, first), first, lines, softness_m, darkness, field.planes, out)
-
-
-def _inward_lines(polygon: NDArray[np.float64]) -> Float32:
+def inward_lines(polygon: NDArray[np.float64]) -> Float32:
     """Lines (N, 3) of a convex polygon's sides: x n - d is the distance of a point inwards, n first."""
     following = following_row(polygon)
     edge = following - polygon
@@ -213,29 +205,8 @@ def _inward_lines(polygon: NDArray[np.float64]) -> Float32:
     return np.column_stack([normal, along]).astype(np.float32)
 
 
-def _dapple(dapple: Dapple, view: View, field: GroundField, out: Float32) -> None:
-    tile = noise_tile(15, 40.0 * dapple.scale_m, 1.1, finest_px=3.0)
-    level = float(np.quantile(tile.values[::8, ::8], dapple.shaded))
-    if dapple.region_map is None:
-        parts = [(slice(None), slice(None))]
-        region = None
-    else:
-        region = np.asarray(dapple.region_map, dtype=np.float64)
-        (shape,) = outlines(view, [_on_ground_px(view, region)])
-        parts = [] if shape is None else [field.rows(w) for w in windows(view, shape, field.first_row)]
-    for part in parts:
-        x, y, footprint = field.x_m[part], field.y_m[part], field.footprint_m[part]
-        lit = smoothstep(sample(tile, x, y, _shift(dapple.seed)), level - 0.12, level + 0.12)
-        amplitude = fade(tile, footprint, 8.0)
-        lit = lit * amplitude + (np.float32(1.0) - amplitude) * np.float32(1.0 - dapple.shaded)
-        dark = (np.float32(1.0) - lit) * np.float32(1.0 - dapple.transmission)
-        if region is not None:
-            least = np.min([x * a + y * b - d for a, b, d in _inward_lines(region)], axis=0)
-            dark *= np.clip(least * np.float32(2.0) + np.float32(0.5), 0, 1)
-        out[part] *= np.float32(1.0) - dark
-
-
-def _shift(seed: int) -> tuple[float, float]:
+def texture_shift(seed: int) -> tuple[float, float]:
+    """By how much a seed moves a texture, m."""
     x, y = np.random.default_rng([seed, 3]).uniform(0.0, 80.0, 2)
     return float(x), float(y)
 

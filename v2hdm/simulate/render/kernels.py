@@ -46,7 +46,7 @@ def _wrap(metres: Any, per_metre: Any, turn: Any) -> Any:
 
 @exactly_inlined
 def _sample(tile: _Plane, x_m: Any, y_m: Any, per_metre: Any, turn_x: Any, turn_y: Any) -> Any:
-    """A padded tile's value at a ground point, as :func:`v2hdm.simulate.render.textures.sample` has it."""
+    """A padded tile's value at a ground point, as :func:`v2hdm.simulate.render.scene.sample` has it."""
     x, y = _wrap(x_m, per_metre, turn_x), _wrap(y_m, per_metre, turn_y)
     column, row = int(x), int(y)
     share_x, share_y = x - _f(column), y - _f(row)

@@ -1,20 +1,99 @@
-"""A scene: the ground, the paint on it, what stands on it, and the light.
+"""A scene: the ground, the paint on it, what stands on it, the light; and the endless textures of them all.
 
 Everything lies in the ``map`` frame of :mod:`v2hdm.records` (metres, z up, ground at z = 0).
 Colours are linear reflectances or radiances in blue, green, red order, as OpenCV stores them.
+
+Textures are seamless tiles of noise, sampled in metres and faded out where they would alias. A tile is
+band-limited, so a pixel that covers more ground than the tile's finest wavelength would turn it into shimmer;
+its amplitude therefore fades with the pixel's footprint (frequency clamping, Norton, Rockwood and Skolmoski
+1982).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from v2hdm.records import FloatArray
 
+Float32 = NDArray[np.float32]
+
+_TILE_PX = 512
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A seamless square texture of mean 0 and standard deviation 1, ``side_m`` wide on the ground."""
+
+    values: Float32
+    side_m: float
+
+    @cached_property
+    def padded(self) -> Float32:
+        """The values with their first rows and columns repeated behind the last, for interpolation."""
+        return np.pad(self.values, ((0, 2), (0, 2)), mode="wrap")
+
+
+@cache
+def noise_tile(seed: int, side_m: float, slope: float, finest_px: float = 2.0, skew: float = 0.0) -> Tile:
+    """Noise of spectral amplitude 1 / frequency^slope, wavelengths from ``finest_px`` tile pixels upwards.
+
+    ``skew`` > 0 gives bright specks on a dark ground, as of aggregate in asphalt.
+    """
+    rng = np.random.default_rng([seed, 77])
+    frequency = np.hypot(np.fft.fftfreq(_TILE_PX)[:, None], np.fft.rfftfreq(_TILE_PX)[None])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((_TILE_PX, _TILE_PX)))
+    spectrum *= frequency**-slope * np.exp(-0.5 * (frequency * finest_px) ** 2)
+    values = np.fft.irfft2(spectrum, s=(_TILE_PX, _TILE_PX))
+    values /= values.std()
+    if skew:
+        values = np.exp(skew * values)
+        values = (values - values.mean()) / values.std()
+    return Tile(np.ascontiguousarray(values, dtype=np.float32), side_m)
+
+
+def sample(tile: Tile, x_m: Float32, y_m: Float32, offset_m: tuple[float, float] = (0.0, 0.0)) -> Float32:
+    """The tile's values at ground points (H, W), bilinear, repeated endlessly.
+
+    Coordinates are wrapped here: OpenCV's own wrapping border is four times slower and saturates at 32767.
+    """
+    columns = _wrapped(x_m, tile.side_m, offset_m[0])
+    rows = _wrapped(y_m, tile.side_m, offset_m[1])
+    return np.asarray(cv2.remap(tile.padded, columns, rows, cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _wrapped(metres: Float32, side_m: float, offset_m: float) -> Float32:
+    turns = metres * np.float32(1.0 / side_m)
+    turns += np.float32(offset_m / side_m)
+    turns -= np.floor(turns)
+    turns *= np.float32(_TILE_PX)
+    return turns
+
+
+def scale_of(tile: Tile, shift_m: tuple[float, float], finest_px: float = 4.0) -> list[float]:
+    """A tile's turns a metre, turns at 0 across and along, and its finest waves a metre, for kernels."""
+    per_wave = 1.0 / (finest_px * tile.side_m / tile.values.shape[0])
+    return [1.0 / tile.side_m, shift_m[0] / tile.side_m, shift_m[1] / tile.side_m, per_wave]
+
+
+def smoothstep(values: Float32, low: float, high: float) -> Float32:
+    """Cubic step from 0 at ``low`` to 1 at ``high``."""
+    t = np.clip((values - np.float32(low)) * np.float32(1.0 / (high - low)), 0, 1)
+    return np.asarray(t * t * (np.float32(3.0) - np.float32(2.0) * t))
+
+
 Bgr = tuple[float, float, float]
+
+Shade = Callable[[Any, Any, NDArray[np.float32]], None]
+"""Lowers the sun's visibility (H, W) on the ground, of which a view and its ground field are given."""
 
 WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
 YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
@@ -46,7 +125,7 @@ class Ground:
     """
 
     albedo_bgr: Bgr = (0.29, 0.30, 0.31)
-    texture: str = "concrete"
+    texture: str | Tile = "concrete"
     contrast: float = 0.12
     stains: float = 0.12
     slab_m: tuple[float, float] | None = None
@@ -104,20 +183,6 @@ class Shadow:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dapple:
-    """The broken shade of foliage: ``shaded`` fraction of the ground, flecks of about ``scale_m``.
-
-    ``region_map`` (N, 2) bounds it to a convex polygon; None means everywhere.
-    """
-
-    shaded: float = 0.6
-    scale_m: float = 1.0
-    transmission: float = 0.1
-    region_map: FloatArray | None = None
-    seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
 class Light:
     """Sun and sky: ``sun_direction_map`` points to the sun, irradiances are relative."""
 
@@ -150,7 +215,7 @@ class Scene:
     paints: tuple[Paint, ...] = ()
     boxes: tuple[Box, ...] = ()
     shadows: tuple[Shadow, ...] = ()
-    dapples: tuple[Dapple, ...] = ()
+    shades: tuple[Shade, ...] = ()
     light: Light = field(default_factory=Light)
     backdrop: Backdrop = field(default_factory=Backdrop)
 

@@ -7,7 +7,7 @@ Polygon fills of image libraries are not used: they dilate by half a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,7 +20,7 @@ from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray, IntArray
 from v2hdm.simulate.render import kernels
-from v2hdm.simulate.render.textures import Float32
+from v2hdm.simulate.render.scene import Float32
 
 _GRID_STEP_PX = 8
 _BAND_ROWS = 32
@@ -175,13 +175,6 @@ def bands_of(view: View, shape: Outline, first_row: int = 0) -> tuple[IntArray, 
     found = np.empty((height // _BAND_ROWS + 2, 4), dtype=np.int64)
     limits = (_BAND_ROWS, _BAND_AREA_PX)
     return found, kernels.bands(shape.boundary_px, first_row, height, width, limits, found)
-
-
-def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
-    """The windows of :func:`bands_of` as slices."""
-    found, count = bands_of(view, shape, first_row)
-    for top, bottom, left, right in found[:count].tolist():
-        yield slice(top, bottom), slice(left, right)
 
 
 def edges_of(shape: Outline, grown_px: float = 0.0) -> Float32:

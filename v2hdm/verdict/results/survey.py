@@ -9,9 +9,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from v2hdm.io.maps.corrections import Correction
+from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.stated import known_lengths
 from v2hdm.records import FloatArray
 from v2hdm.report.check_points import CheckTable, squared
 from v2hdm.site.corrections import unmet

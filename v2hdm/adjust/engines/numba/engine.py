@@ -141,7 +141,7 @@ class NumbaEngine(Engine):
         """The cost, by name."""
         spread = self.spread(estimate)
         system = ReducedSystem(self.arrays, self.plan(), spread)
-        return self.eliminate(system, estimate, robust, 0.0).terms
+        return self.eliminate(system, estimate, robust).terms
 
     def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
         """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
@@ -162,9 +162,7 @@ class NumbaEngine(Engine):
         """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
         return prior_blocks_of(self.arrays, estimate)
 
-    def eliminate(
-        self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
-    ) -> NumbaLinearised:
+    def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
         """Linearise, and subtract the eliminated corners from the reduced system.
 
         Raises:
@@ -194,11 +192,11 @@ class NumbaEngine(Engine):
             tip=np.zeros((chunks, width, width)),
             failed=np.zeros(chunks),
         )
-        growth, by_pair = 1.0 + damping, system.by_pair
+        by_pair = system.by_pair
 
         def work(begin: int, end: int) -> None:
             room = Scratch.of(layout, pairs, width)
-            linearise.linearise(begin, end, layout, base, clock, growth, by_pair, room, out)
+            linearise.linearise(begin, end, layout, base, clock, by_pair, room, out)
 
         self.share(work)
         if out.failed.any():

@@ -135,11 +135,11 @@ def unit_of(layout: Layout, u: int) -> tuple[int, int, int]:
 
 
 @inlined
-def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray, growth: float) -> bool:
+def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> bool:
     """Factorise a unit's block (2g, 2g): into ``base.lower``, or ``base.joint`` where corners are joined."""
     (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
     for i in range(n):
-        block[i, i] = block[i, i] * growth + CORNER_FLOOR
+        block[i, i] += CORNER_FLOOR
     if n == 2:
         first = math.sqrt(block[0, 0])
         below = block[1, 0] / first

@@ -91,7 +91,6 @@ def linearise(
     layout: Layout,
     base: Base,
     clock: FloatArray,
-    growth: float,
     by_pair: bool,
     scratch: Scratch,
     out: Linearisation,
@@ -104,7 +103,6 @@ def linearise(
         layout: the problem.
         base: where; its factors and rows are written.
         clock: (P, 6 Q) the pairs' left tangents by the clock offset of their camera.
-        growth: what the diagonal of V is multiplied by.
         by_pair: whether J'J is asked for by pair.
         scratch: room to work in.
         out: where the results go.
@@ -170,7 +168,7 @@ def linearise(
                 for i in range(2 * size):
                     out.whitened[2 * first + i] = gradient[i]
                 continue
-            if not factorise_unit(layout, base, u, block, growth):
+            if not factorise_unit(layout, base, u, block):
                 out.failed[q] += 1.0
                 continue
             solve_unit(layout, base, u, gradient)

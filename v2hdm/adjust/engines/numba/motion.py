@@ -1,4 +1,4 @@
-"""The motion of a few cameras: :func:`~v2hdm.geometry.tensors.exp` and its derivative.
+"""The motion of a few cameras: :func:`~v2hdm.geometry.rigid.exp` and its derivative.
 
 A tensor of six numbers costs torch as much as a thousand observations cost the kernels.
 """

@@ -26,22 +26,29 @@ from v2hdm.adjust.model import (
     state_residual,
 )
 from v2hdm.adjust.reduced import PriorBlocks, Spread
-from v2hdm.geometry.rigid import left_jacobian as rigid_left_jacobian
-from v2hdm.geometry.rigid import log
-from v2hdm.geometry.tensors import adjoint, exp, inverse, left_jacobian
+from v2hdm.geometry import rigid
+from v2hdm.geometry.tensors import inverse
+
+
+def _exp(tangent: Tensor) -> Tensor:
+    return torch.from_numpy(rigid.exp(tangent.numpy()))
+
+
+def _adjoint(dst_from_src: Tensor) -> Tensor:
+    return torch.from_numpy(rigid.adjoint(dst_from_src.numpy()))
 
 
 def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Cameras from where the vehicle is at each frame's stated time, (C, M or 1, 4, 4)."""
     cam_from_vehicle = estimate.cam_from_vehicle[:, None]
-    return cam_from_vehicle @ exp(-moved(arrays, estimate.clock_s)) if arrays.moves else cam_from_vehicle
+    return cam_from_vehicle @ _exp(-moved(arrays, estimate.clock_s)) if arrays.moves else cam_from_vehicle
 
 
 def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Poses of every pair, (C, M, 4, 4)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
-        vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
+        vehicle_from_map = _exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
     vehicle_from_map = arrays.at_moments(vehicle_from_map)
     cameras = _cam_from_vehicle_then(arrays, estimate)
     if cameras.shape[1] > 1:
@@ -55,10 +62,11 @@ def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
     """How pairs move with frame states and clock offsets."""
     state = clock = arrays.centre.new_zeros(arrays.camera_count, arrays.moment_count, 6, 0)
     if arrays.states:
-        by_tangent = left_jacobian(-frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
-        state = -adjoint(_cam_from_vehicle_then(arrays, estimate)) @ arrays.at_moments(by_tangent)
+        tangent = -frame_tangent(arrays, estimate.frame_state)
+        by_tangent = torch.from_numpy(rigid.left_jacobian(tangent.numpy())[..., list(arrays.states)])
+        state = -_adjoint(_cam_from_vehicle_then(arrays, estimate)) @ arrays.at_moments(by_tangent)
     if arrays.clock_twist.shape[-1]:
-        clock = -adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
+        clock = -_adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
     return Spread(arrays, state, clock)
 
 
@@ -123,9 +131,9 @@ def prior_blocks_of(arrays: Arrays, estimate: Estimate) -> PriorBlocks:
 def _earlier(arrays: Arrays, estimate: Estimate, prior: CameraQuadratic) -> tuple[Tensor, Tensor, Tensor]:
     """Cost of the prior by earlier markings, its gradient (C, 6 + Q) and Gauss-Newton Hessian."""
     each, like = arrays.camera_unknowns, prior.mean
-    tangent = log((estimate.cam_from_vehicle @ inverse(prior.base)).numpy())
+    tangent = rigid.log((estimate.cam_from_vehicle @ inverse(prior.base)).numpy())
     turned = np.eye(like.numel())
-    for camera, jacobian in enumerate(np.linalg.inv(rigid_left_jacobian(tangent))):
+    for camera, jacobian in enumerate(np.linalg.inv(rigid.left_jacobian(tangent))):
         part = slice(each * camera, each * camera + 6)
         turned[part, part] = jacobian
     chart = torch.as_tensor(turned, dtype=like.dtype)

@@ -1,0 +1,252 @@
+"""A solution made ready for score tests: residuals, and their derivatives less all that is estimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.model import (
+    Estimate,
+    Gradient,
+    camera_offset,
+    points_in_camera,
+    prior_residuals,
+    rigid,
+    robustified,
+)
+from v2hdm.adjust.solution import Solution
+from v2hdm.adjust.whitening import Whitening
+from v2hdm.geometry.tensors import NEAR_M
+from v2hdm.records import FloatArray
+
+_STEP = 1e-3
+"""Step of the priors' central differences, in the unit of the fault (s or rad): millimetres of motion."""
+
+STRETCHES = 24
+"""Stretches that the route is divided into: several metres each, longer than most errors go together."""
+
+_DRAWS = 16
+"""Draws of the model's own noise: what the stretches would disagree by is known to a tenth."""
+
+Rows = dict[str, Tensor]
+"""Whitened residuals, or their derivatives by one number, by kind: ``observations`` (2, K), and the priors'
+of :func:`v2hdm.adjust.model.prior_residuals`; kinds that a fault does not touch may be absent."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A solution made ready for tests: with the roots of weights, least squares remain.
+
+    Attributes:
+        whitening: the solution's Hessian.
+        root: (K,) of the weights.
+        residuals: of everything.
+        whitened_px: (2, K) residuals of the observations without weights.
+        stretch: (J,) of the route that each frame is in, from 0.
+    """
+
+    whitening: Whitening
+    root: Tensor
+    residuals: Rows
+    whitened_px: Tensor
+    stretch: Tensor
+
+    @classmethod
+    def at(cls, whitening: Whitening) -> Bench:
+        """The bench of a solution's Hessian."""
+        engine, estimate = whitening.engine, whitening.estimate
+        whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
+        _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
+        root = weight.sqrt()  # no floor: it keeps corners factorable, and is no evidence
+        rows = _rows(engine.arrays, estimate, whitened_px * root)
+        return cls(whitening, root, rows, whitened_px, stretches(engine.arrays))
+
+    @property
+    def arrays(self) -> Arrays:
+        """The problem."""
+        return self.whitening.engine.arrays
+
+    @cached_property
+    def noise(self) -> list[Rows]:
+        """Residuals that noise as the model has it would leave, drawn."""
+        generator = torch.Generator().manual_seed(0)
+        return [
+            self.efficient(
+                {
+                    name: torch.randn(row.shape, generator=generator, dtype=row.dtype).to(row.device)
+                    for name, row in self.residuals.items()
+                }
+            )
+            for _ in range(_DRAWS)
+        ]
+
+    @property
+    def camera(self) -> Tensor:
+        """The camera (K,) of each observation."""
+        return self.arrays.camera_of(self.arrays.pair).long()
+
+    def whiten(self, off: Tensor) -> Tensor:
+        """Weighted residuals (2, K) of points that are off (2, K) at depth 1."""
+        a, b, c = self.arrays.root_information
+        return torch.stack([a * off[0], b * off[0] + c * off[1]]) * self.root
+
+    @property
+    def projected(self) -> Tensor:
+        """Where the corners are projected (2, K), at depth 1."""
+        a, b, c = self.arrays.root_information
+        first = self.whitened_px[0] / a
+        return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
+
+    @cached_property
+    def poses(self) -> Tensor:
+        """``cam_from_map`` (K, 4, 4) of each observation."""
+        pairs = self.whitening.engine.poses(self.whitening.estimate).flatten(0, 1)
+        return pairs[self.arrays.pair.long()]
+
+    @cached_property
+    def points(self) -> Tensor:
+        """The observed corners (K, 3) in the cameras."""
+        corners = self.whitening.estimate.corners_map[self.arrays.corner.long()]
+        return points_in_camera(self.poses, corners)
+
+    def seen(self, moved_cam: Tensor) -> Tensor:
+        """Derivatives (2, K) of the weighted residuals by motions (K, 3) of the points in the cameras."""
+        depth = self.points[:, 2:].clamp(min=NEAR_M)
+        off = (moved_cam[:, :2] - self.points[:, :2] / depth * moved_cam[:, 2:]) / depth
+        return self.whiten(off.T)
+
+    def turned(self, tangents: Tensor) -> Tensor:
+        """Motions (K, 3) of the points in the cameras under left tangents (C, M, 6) of the pairs."""
+        tangent = tangents.flatten(0, 1)[self.arrays.pair.long()]
+        motion: Tensor = tangent[:, :3] + torch.linalg.cross(tangent[:, 3:], self.points)
+        return motion
+
+    def efficient(self, column: Rows) -> Rows:
+        """A fault's column less what is estimated in its place: z = J_p - J_y H^-1 J_y' J_p."""
+        estimated = self._along(self._coupling(column))
+        return {name: column.get(name, torch.zeros_like(row)) - row for name, row in estimated.items()}
+
+    @torch.no_grad()
+    def _along(self, whitened: Tensor) -> Rows:
+        """Derivatives of all residuals along a step of all that is estimated, whitened."""
+        base, arrays = self.whitening.estimate, self.arrays
+        step, tangents, own = self.whitening.step(whitened)
+        # Corners move with a step in proportion to it, so that of a whole step is their derivative.
+        at = self.whitening.linearised.evaluate(step, tangents, own).estimate
+        corners = at.corners_map - base.corners_map
+        along = (self.poses[:, :3, :2] @ corners[arrays.corner.long(), :, None])[..., 0]
+        high, low = (
+            _rows(
+                arrays,
+                Estimate(
+                    rigid(by * step.extrinsic) @ base.cam_from_vehicle,
+                    base.frame_state + by * step.frame_state,
+                    base.corners_map + by * corners,
+                    base.clock_s + by * step.clock_s,
+                ),
+            )
+            for by in (_STEP, -_STEP)
+        )
+        moved = {name: (row - low[name]) / (2 * _STEP) for name, row in high.items()}
+        moved["observations"] = self.seen(self.turned(tangents) + along)
+        return moved
+
+    def _coupling(self, column: Rows) -> Tensor:
+        """N_yp: what the column has in common with all that is estimated, whitened."""
+        engine, estimate = self.whitening.engine, self.whitening.estimate
+        tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
+        at = (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)
+        leaves = [one.clone().requires_grad_() for one in at]
+        moved = Estimate(rigid(leaves[0]) @ estimate.cam_from_vehicle, *leaves[1:])
+        of_priors = [name for name in column if name != "observations"]
+        gradient = Gradient(*(torch.zeros_like(one) for one in at))
+        if of_priors:
+            priors = _rows(engine.arrays, moved)
+            ends, by = [priors[name] for name in of_priors], [column[name] for name in of_priors]
+            gradient = Gradient(*torch.autograd.grad(ends, leaves, by, materialize_grads=True))
+        if "observations" in column:
+            seen = engine.pull(estimate, column["observations"] * self.root)
+            pairs = zip(vars(gradient).values(), vars(seen).values(), strict=True)
+            gradient = Gradient(*(one + other for one, other in pairs))
+        whitened: Tensor = self.whitening.whiten(gradient)
+        return whitened
+
+    def by_stretch(self, one: Rows, other: Rows) -> FloatArray:
+        """The product of two columns, (G + 1,): by stretch, and of the priors that belong to none."""
+        count = int(self.stretch.max()) + 1
+        out = one["observations"].new_zeros(count + 1)
+        for name, row in one.items():
+            product = row * other[name]
+            if name == "observations":
+                frame = self.arrays.frame_of(self.arrays.pair).long()
+                out.index_add_(0, self.stretch[frame], product.sum(0))
+            elif name == "frame_states":
+                out.index_add_(0, self.stretch, product.sum(1))
+            else:
+                out[-1] += product.sum()
+        return np.asarray(out.cpu().numpy())
+
+
+def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
+    """All residuals at an estimate; those of the ``observations`` are given."""
+    rows = {} if observations is None else {"observations": observations}
+    rows |= prior_residuals(arrays, estimate)
+    if arrays.camera_prior is not None:
+        off = camera_offset(arrays.camera_prior, estimate.cam_from_vehicle, estimate.clock_s).flatten()
+        size, axes = torch.linalg.eigh(arrays.camera_prior.information)
+        rows["earlier_markings"] = size.clamp(min=0).sqrt() * (off @ axes)
+    return rows
+
+
+def stretches(arrays: Arrays) -> Tensor:
+    """The stretch (J,) of the route that each frame is in: equally long ones of every session."""
+    ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
+    path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
+    out, count = torch.zeros_like(arrays.visit), 0
+    visits = int(arrays.visit.max()) + 1
+    for visit in range(visits):
+        own = arrays.visit == visit
+        along = path[own] - path[own].min()
+        share = along / along.max().clamp(min=1e-9)
+        out[own] = count + (share * STRETCHES).long().clamp(max=STRETCHES - 1)
+        count += STRETCHES
+    stretch: Tensor = torch.unique(out, return_inverse=True)[1]
+    return stretch
+
+
+def raised(bench: Bench, height: Tensor) -> Rows:
+    """Corners that each observation (K,) sees so much higher, m, a unit of the value."""
+    return {"observations": bench.seen(height[:, None] * bench.poses[:, :3, 2])}
+
+
+def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
+    """The information of a drive on parameters that raise the ground, all else being estimated with them.
+
+    Args:
+        solution: at the parameters' present values.
+        heights: (K, B) sparse, m by which a unit of each raises what each observation of the problem shows.
+
+    Returns:
+        The information (B, B) on them, and the gradient (B,) of the cost.
+    """
+    bench = Bench.at(solution.covariance.whitening)
+    unit = raised(bench, torch.ones_like(bench.root))["observations"]
+    columns = heights[bench.arrays.order.cpu().numpy()]
+    squared = unit.square().sum(0).cpu().numpy()
+    information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
+    seen = np.flatnonzero(information.diagonal() > 0)
+    coupled = bench.root.new_zeros(len(seen), bench.whitening.size)
+    by_column = columns[:, seen].tocsc()
+    for k, row in enumerate(coupled):
+        lifted = torch.as_tensor(by_column[:, [k]].toarray()[:, 0]).to(unit)
+        row[:] = bench._coupling({"observations": unit * lifted})
+    information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
+    gradient = columns.T @ (unit * bench.residuals["observations"]).sum(0).cpu().numpy()
+    gradient[seen] -= (coupled @ bench.whitening.gradient).cpu().numpy()
+    return information, gradient
