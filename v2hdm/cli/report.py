@@ -16,6 +16,12 @@ def run(arguments: Sequence[str]) -> None:
     parser = parser_of("report")
     parser.add_argument("folder", type=Path, help="result folder of v2hdm map")
     parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
+    parser.add_argument(
+        "--background",
+        type=Path,
+        metavar="FILE.tif",
+        help="a GeoTIFF under the map, such as an aerial picture",
+    )
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive.of_result import drive_of
     from v2hdm.report.page.document import write_page
@@ -23,5 +29,5 @@ def run(arguments: Sequence[str]) -> None:
 
     drive = drive_of(parsed.folder, parsed.drive)
     with added_to(parsed.folder, "folder") as folder:
-        path = write_page(folder, drive)
+        path = write_page(folder, drive, parsed.background)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + ("" if drive else ", without the drive's images"))

@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from v2hdm.errors import ConfigError, WorkerError
 from v2hdm.experiment.drive import drive_record
 from v2hdm.experiment.figures import save_figures
 from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
-from v2hdm.experiment.summary import by_port, claims, results_table, write_tables, write_words
+from v2hdm.experiment.summary import claims, write_tables, write_words
 from v2hdm.progress import patient
-from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
+from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.files import replace_text
 from v2hdm.store.results import growing_folder
 from v2hdm.workers import side_by_side
@@ -65,16 +64,11 @@ def _records(todo: Sequence[Job], workers: int, progress: DriveProgress) -> list
     return [records[number] for number in range(len(todo))]
 
 
-_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")  # columns on the terminal
-
-
 def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     """Run an experiment and show how far it is and what came of it."""
     console = Console(file=patient(sys.stdout))
     with drive_bars(console) as progress:
         folder, measured = run_experiment(config, config_yaml, progress)
-    for port, drives in by_port(measured).items():
-        console.print(_table(port, drives))
     tested = claims(measured)
     for claim in tested:
         if not claim.holds:
@@ -83,16 +77,3 @@ def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     agree = sum(claim.holds for claim in tested)
     plain(console, f"{agree} of {len(tested)} figures agree with the paper's claims")
     plain(console, f"results in {folder}: begin with experiment.md and figures.md")
-
-
-def _table(port: str, drives: Sequence[Measured]) -> Table:
-    """The columns of the main table that fit a terminal: method by camera set."""
-    seeds = f", {len(drives)} seeds" if len(drives) > 1 else ""
-    table = new_table(f"{port}{seeds}", _SHOWN[:2], _SHOWN[2:])
-    heads, lines = results_table(drives)
-    shown = [heads.index(name) for name in _SHOWN]
-    for number, line in enumerate(lines):
-        if number and line[1] != lines[number - 1][1]:
-            table.add_section()
-        table.add_row(*(line[column] for column in shown))
-    return table

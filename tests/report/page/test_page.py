@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -20,15 +21,17 @@ from tests.report.page.folder import (
 )
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
+from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
 from v2hdm.io.maps.evidence import COLUMNS
-from v2hdm.records import DIAMOND, Marking
+from v2hdm.records import DIAMOND, GeodeticOrigin, Marking
 from v2hdm.report.outputs import write_json
+from v2hdm.report.page import document as document_module
 from v2hdm.report.page import pictures
 from v2hdm.report.page.document import document, write_page
 from v2hdm.report.page.facts import ground_residuals, read_facts
-from v2hdm.report.page.layers import ellipses
+from v2hdm.report.page.layers import background_layer, ellipses, layers
 
 
 @pytest.fixture(scope="module")
@@ -195,12 +198,6 @@ def test_what_changed_since_an_earlier_map_is_a_layer_of_the_map(page):
 
 
 def test_coordinates_under_the_pointer_are_those_of_the_origin_to_a_millimetre(result):
-    from dataclasses import replace
-
-    from v2hdm.geometry.geodetic import geodetic_from_enu
-    from v2hdm.records import GeodeticOrigin
-    from v2hdm.report.page.layers import layers
-
     origin, facts = GeodeticOrigin(53.5, 9.9, 12.0), read_facts(result, None)
     far = Marking(DIAMOND, DIAMOND_M + np.array([4000.0, -3000.0]), 3)
     hd_map = replace(facts.hd_map, origin=origin, markings=(*facts.hd_map.markings, far))
@@ -217,6 +214,67 @@ def test_coordinates_under_the_pointer_are_those_of_the_origin_to_a_millimetre(r
     assert grid["name"] == "EPSG:32632"
     stated = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*true)
     assert at(grid, *place[0, :2]) == pytest.approx(stated, abs=1e-3)
+
+
+HAMBURG = GeodeticOrigin(53.5, 9.9, 12.0)
+
+
+def in_grid(x, y):
+    """UTM's easting and northing of a place in a map with that origin."""
+    return Grid("EPSG:32632", HAMBURG).positions(np.array([[x, y, 0.0]]))[0, :2]
+
+
+def write_tif(path, centre, dtype="uint8", count=3, crs="EPSG:32632"):
+    """160 m of dark ground around grid coordinates, 20 cm a pixel, bright within 2 m of them."""
+    rasterio = pytest.importorskip("rasterio")
+    pixels = np.full((count, 800, 800), 40, dtype)
+    pixels[:, 390:410, 390:410] = 250 if dtype == "uint8" else 4000
+    place = rasterio.Affine(0.2, 0, centre[0] - 80, 0, -0.2, centre[1] + 80)
+    look = {"width": 800, "height": 800, "count": count, "dtype": dtype, "crs": crs, "transform": place}
+    with rasterio.open(path, "w", driver="GTiff", **look) as dataset:
+        dataset.write(pixels)
+
+
+@pytest.mark.parametrize(("dtype", "count"), [("uint8", 3), ("uint16", 1)])
+def test_a_picture_of_the_users_own_lies_under_the_map_where_it_belongs(result, tmp_path, dtype, count):
+    write_tif(tmp_path / "aerial.tif", in_grid(8.0, -3.0), dtype, count)
+    facts = read_facts(result, None)
+    shown = background_layer(
+        tmp_path / "aerial.tif", replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
+    )
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(shown["src"]), np.uint8), cv2.IMREAD_COLOR)
+    west, south, east, north = shown["bounds"]
+    row, column = np.argwhere(pixels[..., 1] > 200).mean(axis=0) + 0.5
+    cell_m = (east - west) / pixels.shape[1], (north - south) / pixels.shape[0]
+    assert (west + column * cell_m[0], north - row * cell_m[1]) == pytest.approx((8.0, -3.0), abs=0.05)
+
+
+def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path):
+    write_tif(tmp_path / "aerial.tif", in_grid(0.0, 0.0))
+    write_tif(tmp_path / "elsewhere.tif", in_grid(5000.0, 0.0))
+    write_tif(tmp_path / "nowhere.tif", in_grid(0.0, 0.0), crs=None)
+    (tmp_path / "none.tif").write_bytes(b"no picture")
+    facts = read_facts(result, None)
+    placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
+    for name, of, told in (
+        ("elsewhere", placed, "none of this map's ground"),
+        ("none", placed, "no GeoTIFF"),
+        ("nowhere", placed, "no coordinate system"),
+        ("aerial", facts, "no place on the earth"),
+    ):
+        with pytest.raises(MapFileError, match=f"{name}.tif: .*{told}"):
+            background_layer(tmp_path / f"{name}.tif", of)
+
+
+def test_a_report_made_again_keeps_the_background_of_the_one_before(tmp_path, monkeypatch):
+    make_result(tmp_path)
+    shown = {"src": "UklGRg==", "type": "image/webp", "bounds": [0, 0, 1, 1]}
+    monkeypatch.setattr(document_module, "background_layer", lambda *_: shown)
+    monkeypatch.setattr(document_module.charts, "residual_charts", lambda *_: {})
+    for background in (tmp_path / "aerial.tif", None):
+        text = write_page(tmp_path / "result", None, background).read_text()
+        (found,) = re.findall(r'id="map-data">(.*?)</script>', text)
+        assert json.loads(found)["background"] == shown
 
 
 def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -267,22 +267,4 @@ def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
         axes.set(ylabel="share of corners (%)", ylim=(0, 102))
         axes.grid()
         axes.legend(loc="lower right", fontsize=8.5)
-    return out[0]
-
-
-def bar_chart(name: str, counts: Sequence[tuple[str, int]]) -> str:
-    """Counts by name, the largest first, as horizontal bars with their numbers; empty for none."""
-    if not counts:
-        return ""
-    with _chart(name, 7.2, 0.45 + 0.27 * len(counts)) as (figure, out):
-        axes = figure.subplots()
-        labels, values = [one for one, _ in counts], [count for _, count in counts]
-        bars = axes.barh(range(len(values)), values, color=OKABE_ITO["blue"], height=0.62)
-        axes.bar_label(bars, padding=4, color=INK, fontsize=9)
-        axes.set_yticks(range(len(values)), labels)
-        axes.tick_params(axis="y", length=0)
-        axes.invert_yaxis()
-        axes.set_xlabel("candidates")
-        axes.spines["left"].set_visible(False)
-        axes.margins(x=0.08)
     return out[0]

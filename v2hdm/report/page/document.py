@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +17,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
-from v2hdm.report.page.layers import ground_page, layers
+from v2hdm.report.page.layers import background_layer, ground_page, layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.tables import in_words
 from v2hdm.store.files import read_text, replace_text
@@ -53,7 +52,7 @@ def document(facts: Facts) -> SimpleNamespace:
         cameras=tables.camera_pages(facts, overlays(facts)),
         ground=ground_page(facts.folder),
         residuals=charts.residual_charts(facts, residuals) if residuals else {},
-        excluded=charts.bar_chart("excluded", Counter(one.reason for one in facts.excluded).most_common()),
+        excluded=tables.reason_table(facts),
         contents=tables.content_table(facts),
         methods=tables.method_table(facts),
         drive=tables.pair_table(metrics.get("drive") or {}),
@@ -102,18 +101,26 @@ _ASSETS = {
 """Scripts and styles that stand in the page as they are, by the folder that holds them."""
 
 
-def write_page(folder: Path, drive: Drive | None) -> Path:
+def write_page(folder: Path, drive: Drive | None, background: Path | None = None) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
     ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand: the
-    pictures are then those of the report that is there. Raises MapFileError where the folder is no result, or
-    a file in it is damaged, DriveError where an image or the truth of the drive is damaged.
+    pictures are then those of the report that is there. ``background`` is a GeoTIFF under the map; None keeps
+    that of the report that is there.
+
+    Raises MapFileError where the folder is no result, or a file in it or the background is damaged,
+    DriveError where an image or the truth of the drive is damaged.
     """
-    replace_text(folder / FILE, page_text(folder, drive))
+    replace_text(folder / FILE, page_text(folder, drive, background=background))
     return folder / FILE
 
 
-def page_text(folder: Path, drive: Drive | None, editing: Mapping[str, object] | None = None) -> str:
+def page_text(
+    folder: Path,
+    drive: Drive | None,
+    editing: Mapping[str, object] | None = None,
+    background: Path | None = None,
+) -> str:
     """The page of :func:`write_page`; ``editing`` is what its script for corrections has to know."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
@@ -123,8 +130,12 @@ def page_text(folder: Path, drive: Drive | None, editing: Mapping[str, object] |
         lstrip_blocks=True,
     )
     here = files("v2hdm.report.page")
-    page = document(read_facts(folder, drive))
-    page.pictures = page.pictures or _kept_pictures(folder / FILE)
+    facts = read_facts(folder, drive)
+    page = document(facts)
+    page.pictures = page.pictures or _kept(folder / FILE, "pictures")
+    if page.map_data:
+        kept = _kept(folder / FILE, "map-data").get("background") if background is None else None
+        page.map_data["background"] = kept if background is None else background_layer(background, facts)
     return environment.get_template("page.html").render(
         page=page,
         assets={name: (here / where / name).read_text(encoding="utf-8") for name, where in _ASSETS.items()},
@@ -134,10 +145,10 @@ def page_text(folder: Path, drive: Drive | None, editing: Mapping[str, object] |
     )
 
 
-def _kept_pictures(path: Path) -> dict[str, Any]:
-    """The pictures of a report that was made while the images of its drive were at hand."""
+def _kept(path: Path, name: str) -> dict[str, Any]:
+    """The data ``name`` of an earlier report, made while more of its sources were at hand."""
     text = read_text(path, MapFileError) if path.is_file() else ""
-    kept = re.search(r'<script type="application/json" id="pictures">(.*?)</script>', text, re.DOTALL)
+    kept = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
     try:
         return dict(json.loads(kept[1])) if kept else {}
     except (ValueError, RecursionError):

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.geodetic import Grid, geodetic_from_enu, utm_of
+from v2hdm.extras import need
+from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -63,9 +64,66 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
         pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_UNCHANGED) if coded else None
         if pixels is None:
             raise MapFileError(f"{path}: no picture that can be read; make the mosaic again")
-        while len(text := _coded(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, _QUALITY)) > LARGEST_BYTES:
-            pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
+        text = _webp(pixels)
     return {"src": text, "type": "image/webp", "bounds": bounds.tolist()}
+
+
+def _webp(pixels: np.ndarray) -> str:
+    """An image as WebP in base64, shrunk until it is within the budget."""
+    while len(text := _coded(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, _QUALITY)) > LARGEST_BYTES:
+        pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
+    return text
+
+
+_BACKGROUND_PX = 3000  # longer side of the background: at most 20 cm a pixel over 600 m
+_FINEST_M = 0.05
+
+
+def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
+    """A GeoTIFF of the user's own in the map's frame, as :func:`mosaic_layer` gives one.
+
+    Raises MapFileError where it cannot be read or laid under the map.
+    """
+    rasterio, warped = (
+        need(name, "gis", "a background", MapFileError) for name in ("rasterio", "rasterio.vrt")
+    )
+    origin = None if facts.hd_map is None else facts.hd_map.origin
+    if origin is None:
+        raise MapFileError(f"{path}: this map has no place on the earth; state the origin in drive.yaml")
+    (west, south), (east, north) = _extent(facts)
+    step = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
+    size = {"width": int(np.ceil((east - west) / step)), "height": int(np.ceil((north - south) / step))}
+    # The mosaic's projection is the map's frame to a millimetre.
+    frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
+    frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
+    try:
+        with rasterio.open(path, driver="GTiff") as source:
+            if source.crs is None:
+                raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
+            bilinear = rasterio.enums.Resampling.bilinear
+            with warped.WarpedVRT(source, **frame, **size, resampling=bilinear, add_alpha=True) as there:
+                bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
+                seen = there.dataset_mask()
+    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
+        raise MapFileError(f"{path}: no GeoTIFF that can be read ({failure})") from None
+    if not seen.any():
+        raise MapFileError(f"{path}: shows none of this map's ground; give a picture of its site")
+    if bands.dtype != np.uint8:
+        low, high = np.percentile(bands[:, seen > 0], (1, 99))
+        bands = np.clip((bands - low) * 255.0 / max(high - low, 1e-9), 0, 255).astype(np.uint8)
+    bounds = [west, north - step * size["height"], west + step * size["width"], north]
+    pixels = np.ascontiguousarray(np.moveaxis(np.concatenate([bands, seen[None]]), 0, 2))
+    return {"src": _webp(pixels), "type": "image/webp", "bounds": [float(one) for one in bounds]}
+
+
+def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
+    """South-west and north-east (2,), m, of what the map holds and 50 m around it."""
+    assert facts.hd_map is not None
+    places = [one.corners_map for one in facts.hd_map.markings]
+    places += [one.points_map for one in facts.hd_map.lanes]
+    places += [] if facts.route is None else [facts.route.map_from_vehicle[:, :2, 3]]
+    both = np.concatenate([*places, np.zeros((0 if places else 1, 2))])
+    return both.min(axis=0) - 50.0, both.max(axis=0) + 50.0
 
 
 def ground_page(folder: Path) -> GroundPage | None:
@@ -168,13 +226,10 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
 
     Within 10 km the earth's curvature leaves no more; without an origin there are none.
     """
-    hd_map, route = facts.hd_map, facts.route
+    hd_map = facts.hd_map
     if hd_map is None or hd_map.origin is None:
         return []
-    places = [one.corners_map for one in hd_map.markings] + [one.points_map for one in hd_map.lanes]
-    places += [] if route is None else [route.map_from_vehicle[:, :2, 3]]
-    low, high = (of(np.concatenate([*places, np.zeros((1, 2))]), axis=0) for of in (np.min, np.max))
-    x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(low - 50.0, high + 50.0, 7).T))
+    x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(*_extent(facts), 7).T))
     places_map, code = np.column_stack([x, y, np.zeros_like(x)]), utm_of(hd_map.origin)
     earth = geodetic_from_enu(hd_map.origin, places_map)
     grid = Grid(code, hd_map.origin).positions(places_map)[:, :2]

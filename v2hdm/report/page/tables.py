@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -214,6 +215,12 @@ def content_table(facts: Facts) -> Table | None:
             sightings = number(float(np.median([one.sightings for one in own])), 0)
             rows.append([name_of(name), form, str(len(own)), length, sightings])
     return table(("class", "as", "count", "length (m)", "sightings"), rows, words=2)
+
+
+def reason_table(facts: Facts) -> Table:
+    """Why candidates were left out, the most frequent reason first."""
+    counts = Counter(one.reason for one in facts.excluded).most_common()
+    return table(("left out because", "candidates"), [[reason, str(count)] for reason, count in counts])
 
 
 def method_table(facts: Facts) -> Table | None:

@@ -1,0 +1,118 @@
+"""What is released: the wheel, the source archive, and the files of those who package and test it."""
+
+import os
+import re
+import tarfile
+import tomllib
+import zipfile
+from email.parser import Parser
+
+import pytest
+import yaml
+from hatchling import build
+from packaging.requirements import Requirement
+from twine.commands.check import check
+
+from tests.docs.blocks import ROOT
+from v2hdm import __version__
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+CONDA = {
+    "opencv-python-headless": "py-opencv",
+    "torch": "pytorch",
+    "matplotlib": "matplotlib-base",
+}  # the others are called alike
+
+
+@pytest.fixture(scope="module")
+def released(tmp_path_factory):
+    """The wheel and the source archive as ``python -m build`` makes them."""
+    folder, before = tmp_path_factory.mktemp("dist"), os.getcwd()  # noqa: PTH109  # what hatchling builds
+    os.chdir(ROOT)
+    try:
+        return folder / build.build_wheel(str(folder)), folder / build.build_sdist(str(folder))
+    finally:
+        os.chdir(before)
+
+
+def test_an_index_takes_both_archives(released, capfd):
+    assert not check([str(one) for one in released], strict=True), capfd.readouterr().out
+
+
+def test_the_wheel_holds_the_library_with_its_data_and_nothing_else(released):
+    with zipfile.ZipFile(released[0]) as wheel:
+        names = set(wheel.namelist())
+        metadata = wheel.read(f"v2hdm-{__version__}.dist-info/METADATA").decode()
+    assert Parser().parsestr(metadata)["Version"] == __version__
+    assert {name.split("/")[0] for name in names} == {"v2hdm", f"v2hdm-{__version__}.dist-info"}
+    needed = {
+        "conf/map.yaml",
+        "conf/run/port2.yaml",
+        "report/page/vendor/leaflet.js",
+        "report/page/templates/map.js",
+    }
+    assert {f"v2hdm/{name}" for name in needed} <= names
+    assert any(name.startswith("v2hdm/detection/weights/") and name.endswith(".onnx") for name in names)
+    assert not [
+        name for name in names if re.search(r"conf/(local|train|recipe|export)|__pycache__|\.pyc$", name)
+    ]
+    assert sum(name.endswith("LICENSE") for name in names) >= 2  # ours and that of the library in the report
+
+
+def test_the_source_archive_can_be_tested_and_holds_nothing_of_this_machine(released):
+    with tarfile.open(released[1]) as archive:
+        names = {name.split("/", 1)[1] for name in archive.getnames()}
+    assert {
+        "pyproject.toml",
+        "constraints.txt",
+        "Makefile",
+        ".ci/run",
+        "tests/test_release.py",
+        "docs/design.md",
+    } <= names
+    assert not [
+        name for name in names if re.match(r"(outputs|cache|data|runs|site|\.venv|conf/local)/", name)
+    ]
+
+
+def test_the_conda_recipe_asks_for_what_the_wheel_does():
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
+    assert str(recipe["context"]["version"]) == __version__
+    assert recipe["about"]["license"] == PROJECT["license"]
+    assert recipe["about"]["license_file"] == PROJECT["license-files"]
+    assert recipe["build"]["python"]["entry_points"] == [f"v2hdm = {PROJECT['scripts']['v2hdm']}"]
+    asked = {f"python {PROJECT['requires-python']}"}
+    for one in map(Requirement, [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["map"]]):
+        limits = ",".join(sorted(map(str, one.specifier), reverse=True))
+        asked.add(f"{CONDA.get(one.name, one.name.lower())} {limits}")
+    assert set(recipe["requirements"]["run"]) == asked
+
+
+def test_the_image_is_of_the_pinned_versions_and_its_user_is_not_root():
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    told = [line.split()[0] for line in lines if re.match("[A-Z]+ ", line)]
+    assert any("-c constraints.txt" in line for line in lines)
+    assert "'.[map]'" in "".join(lines)
+    assert told.index("USER") < told.index("ENTRYPOINT")
+    assert next(line for line in lines if line.startswith("USER")) != "USER root"
+    # Whatever the build copies is let through to it.
+    let_through = re.findall(r"^!(.+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE)
+    assert {"v2hdm", "conf", "pyproject.toml", "constraints.txt", "README.md", "LICENSE"} == set(let_through)
+    assert all((ROOT / name).exists() for name in let_through)
+
+
+def test_the_workflow_runs_what_a_change_must_pass():
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    assert workflow["permissions"] == {"contents": "read"}
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    assert [step["run"] for step in steps if "run" in step] == [".ci/run"]
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+
+
+@pytest.mark.parametrize("name", ["fast", "fleet"])
+def test_what_will_go_is_said_in_the_change_log(name):
+    assert PROJECT["optional-dependencies"][name] == ["v2hdm[map]"]
+    assert (
+        f"`{name}`"
+        in (ROOT / "CHANGELOG.md").read_text().partition("Deprecated until 2.0")[2].splitlines()[0]
+    )
