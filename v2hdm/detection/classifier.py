@@ -34,7 +34,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.patch import ImageQuads, Patches, grey_of, log_light
 from v2hdm.detection.propose import Proposal, Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
-from v2hdm.geometry.quadrilateral import Quad, following
+from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, BoolArray, FloatArray, MarkingDetection
 
 CLAIMED = (
@@ -323,37 +323,40 @@ def hidden_ends(patches: Patches, quads: ImageQuads, ground: Quad) -> BoolArray:
     behind the paint and behind that ground. It is bare ground, of which a spot may be stained and across
     which a shadow's border may run just there, or a thing, of any tone and colour, which may be narrow.
     """
-    count, corners = len(quads.corners), quads.corners
-    after = following(corners)
-    inward = corners[:, [3, 0, 1, 2]] - corners + corners[:, [2, 3, 0, 1]] - after
-    long_px = np.linalg.norm(inward, axis=-1)[..., None] / 2
-    inward = (inward / np.maximum(2 * long_px, 1e-6))[:, :, None]
-    # Along the end: to one side of it, its paint, to the other; across it: beyond and before.
-    aside = quads.tangent[:, :, None] * _STRIP_PX[:, None]
-    on_it = corners[:, :, None] + (after - corners)[:, :, None] * _GRID[1:5, None]
-    along = np.stack([corners[:, :, None] - aside, on_it, after[:, :, None] + aside], axis=2)
-    depth = np.minimum(_STRIP_PX, long_px / 2)[..., None] * inward
-    across = np.stack([-_STRIP_PX[:, None] * inward, depth], axis=2)
-    points = along[:, :, :, None, :, None] + across[:, :, None, :, None]
-    shape = points.shape[:4]
-    points = quads.px(points.reshape(count, -1, len(_STRIP_PX), 2))
-    bgr = patches.light_at(np.arange(count), points)
-    logs = log_light(bgr)
-    light = np.stack([log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2]], axis=-1).reshape(*shape, -1, 2)
-    before = light[:, :, ::2, 1].reshape(count, 4, -1, 2)
-    level = np.median(before, axis=2)
-    sigma = np.hypot(_EVEN, _GRAIN * before.std(axis=2))[:, :, None]
-    off = np.median(light[:, :, :, 0], axis=3) - level[:, :, None]
-    paint, beside = off[:, :, 1], off[:, :, ::2]
-    spots = np.logaddexp(np.log(1 - _STAIN) + _normal(off, sigma), np.log(_STAIN) + _normal(off, _UNLIKE))
-    wide = _normal(beside - paint[:, :, None], np.hypot(sigma, _ALIKE))
-    other = _normal(paint, np.hypot(sigma[:, :, 0], _UNLIKE))
-    thing = other + np.logaddexp(np.log(0.5) + wide, np.log(0.5) + spots[:, :, ::2]).sum(axis=2)
-    bare = np.logaddexp(np.log(1 - _BORDER) + spots.sum(axis=2), np.log(_BORDER) + other + wide.sum(axis=2))
-    seen = ~patches.outside(points).reshape(count, 4, -1).any(axis=2)
     longer = np.roll(ground.length, 1, axis=1) + np.roll(ground.length, -1, axis=1)
-    ends = seen & (longer > 2 * _ASPECT * ground.length)
-    return np.asarray(ends & (thing - bare > np.log(1 / _HIDDEN - 1)))
+    hidden = longer > 2 * _ASPECT * ground.length
+    marking, end = np.nonzero(hidden)
+    if not len(marking):
+        return np.asarray(hidden)
+    own = quads.take(marking)
+    first, last, after, before = own.corners[np.arange(len(end)), (end + np.arange(4)[:, None]) % 4]
+    inward = before - first + after - last
+    long_px = np.linalg.norm(inward, axis=-1)[:, None] / 2
+    inward = inward[:, None] / np.maximum(2 * long_px, 1e-6)[..., None]
+    # Along the end: to one side of it, its paint, to the other; across it: beyond and before.
+    aside = own.tangent[np.arange(len(end)), end][:, None] * _STRIP_PX[:, None]
+    on_it = first[:, None] + (last - first)[:, None] * _GRID[1:5, None]
+    along = np.stack([first[:, None] - aside, on_it, last[:, None] + aside], axis=1)
+    depth = np.minimum(_STRIP_PX, long_px / 2)[..., None] * inward
+    across = np.stack([-_STRIP_PX[:, None] * inward, depth], axis=1)
+    points = along[:, :, None, :, None] + across[:, None, :, None]
+    points = own.px(points.reshape(len(end), -1, len(_STRIP_PX), 2))
+    bgr = patches.light_at(marking, points)
+    logs = log_light(bgr)
+    light = np.stack([log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2]], axis=-1)
+    light = light.reshape(len(end), 3, 2, -1, 2)
+    bare_ground = light[:, ::2, 1].reshape(len(end), -1, 2)
+    sigma = np.hypot(_EVEN, _GRAIN * bare_ground.std(axis=1))[:, None]
+    off = np.median(light[:, :, 0], axis=2) - np.median(bare_ground, axis=1)[:, None]
+    paint, beside = off[:, 1], off[:, ::2]
+    spots = np.logaddexp(np.log(1 - _STAIN) + _normal(off, sigma), np.log(_STAIN) + _normal(off, _UNLIKE))
+    wide = _normal(beside - paint[:, None], np.hypot(sigma, _ALIKE))
+    other = _normal(paint, np.hypot(sigma[:, 0], _UNLIKE))
+    thing = other + np.logaddexp(np.log(0.5) + wide, np.log(0.5) + spots[:, ::2]).sum(axis=1)
+    bare = np.logaddexp(np.log(1 - _BORDER) + spots.sum(axis=1), np.log(_BORDER) + other + wide.sum(axis=1))
+    seen = ~patches.outside(points).any(axis=(1, 2))
+    hidden[marking, end] = seen & (thing - bare > np.log(1 / _HIDDEN - 1))
+    return np.asarray(hidden)
 
 
 def _normal(off: FloatArray, sigma: FloatArray) -> FloatArray:
