@@ -68,9 +68,6 @@ CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "sy
 median; log odds of paint; the network's shares of the quadrilateral's own class, lane lines and symbols;
 whether it is outside the image."""
 
-CLAIMED_CHANNELS = CHANNELS[CHANNELS.index("paint_odds") : CHANNELS.index("outside")]
-"""The channels that are the network's."""
-
 SIZE = 20
 """Rows and columns of a picture."""
 
