@@ -18,7 +18,7 @@ from train.labels_image import ANY, LabelledImage
 from train.scenes.hardships import NONE, Hardships
 from train.scenes.scenes import drawn_scene, image_line, image_points
 from train.scenes.views import TrainingView
-from v2hdm.catalogue import CORNERED_CLASSES, LANE_CLASSES, NOT_PAINT, OUTLINED_CLASSES, PAINT_CLASSES
+from v2hdm.catalogue import CORNERED_CLASSES, NOT_PAINT, PAINT_CLASSES, SHIPPED, SYMBOL
 from v2hdm.detection.camera import camera_from_calibration, rough_calibration
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
@@ -115,7 +115,7 @@ def photograph(image: LabelledImage, config: DataConfig, rng: np.random.Generato
     pitch_deg += rng.normal(0, _PITCH_SIGMA_DEG)
     camera = camera_from_calibration(rough_calibration("photo", width, height, up_m, pitch_deg, fov_deg))
     labels, unknown = paint_labels(image, Place.whole(width, height))
-    names = (*CORNERED_CLASSES, *OUTLINED_CLASSES)
+    names = (*CORNERED_CLASSES, *SHIPPED.of_family(SYMBOL))
     silent = [k for k in PAINT_CLASSES if config.coco_complete is not None and k not in config.coco_complete]
     markings = []
     for shape in image.shapes or ():
@@ -143,7 +143,7 @@ def _shows(lane_map: FloatArray, view: TrainingView, rendered: Rendered) -> bool
     """Whether enough paint of a line (N, 2), a point every half metre, is to be seen in the image."""
     ahead = np.gradient(lane_map, axis=0)
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
-    kinds = [PAINT_CLASSES.index(kind) + 1 for kind in LANE_CLASSES]
+    kinds = [PAINT_CLASSES.index(kind) + 1 for kind in SHIPPED.lane_paint]
     shown = 0
     for point, across in zip(lane_map, left, strict=True):
         u, v = np.round(image_points(view, point + _BESIDE_M[:, None] * across)).astype(int).T
@@ -164,7 +164,7 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
     centre = camera_centre(view.cam_from_map)
     out = []
     for paint in whole_ones(scene.paints):
-        if paint.kind not in CORNERED_CLASSES + OUTLINED_CLASSES:
+        if paint.kind not in CORNERED_CLASSES + SHIPPED.of_family(SYMBOL):
             continue
         polygon = np.asarray(paint.polygon_map, dtype=np.float64)
         polygon = _before_camera(polygon, view)

@@ -31,12 +31,11 @@ from train.examples import Example, TrueMarking, example, photograph, polygon_ov
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from train.labels import LabelledImages
 from train.scenes.hardships import NONE
-from v2hdm.catalogue import OUTLINED_CLASSES
+from v2hdm.catalogue import SHIPPED, SYMBOL
 from v2hdm.detection.classifier import (
     AMONG,
     CHANNELS,
     CLAIMED,
-    CLAIMED_CHANNELS,
     COMPANIES,
     FEATURES,
     SHAPES,
@@ -172,7 +171,9 @@ def is_true(shown: Example, kind: str, corners_px: FloatArray) -> tuple[bool | N
     if share <= 0.05 or nearest is None:
         return (None if _is_untold(shown, kind, corners_px) else False), None
     of_own = max((share for share, true in overlaps if true.kind == kind), default=0.0)
-    if nearest.kind != kind and (nearest.fair or (nearest.kind in OUTLINED_CLASSES and of_own <= 0.05)):
+    if nearest.kind != kind and (
+        nearest.fair or (nearest.kind in SHIPPED.of_family(SYMBOL) and of_own <= 0.05)
+    ):
         return False, None  # the head of an arrow is no diamond
     return None, None
 
@@ -301,7 +302,7 @@ def fit_all(
         true,
         np.where(true[:, None], np.array(gathered.side_error), np.nan).astype(np.float32),
         np.array(gathered.side_variance, dtype=np.float32),
-        tuple(CHANNELS.index(name) for name in CLAIMED_CHANNELS),
+        tuple(range(CHANNELS.index("paint_odds"), CHANNELS.index("outside"))),
         tuple(FEATURES.index(name) for name in CLAIMED),
     )
     # What is true of the images with spots has been seen without them, too.

@@ -73,10 +73,12 @@ class Order:
 
     @property
     def command(self) -> str:
-        """The command that this is."""
+        """The command that this is, without folders of this machine: users read it in the manifest."""
+        source, here = self.source.resolve(), Path.cwd()
+        shown = source.relative_to(here) if source.is_relative_to(here) else source.name
         kept = f" --keep {' '.join(self.keep)}" if self.keep else ""
         images = f"--judge-images {self.judge_images} --lane-images {self.lane_images}"
-        return f"python -m train.ship {self.source} --precision {self.precision} {images}{kept}"
+        return f"python -m train.ship {shown} --precision {self.precision} {images}{kept}"
 
 
 def ship(order: Order, tell: Share) -> Path:

@@ -202,9 +202,3 @@ that fill an area; other paint is writing, teeth and whatever else is no marking
 
 CORNERED_CLASSES = SHIPPED.cornered
 """Shipped classes that are mapped as quadrilaterals by their four corners."""
-
-OUTLINED_CLASSES = SHIPPED.of_family(SYMBOL)
-"""Shipped classes that are detected with their outline."""
-
-LANE_CLASSES = SHIPPED.lane_paint
-"""Classes whose centre lines make up the lanes."""

@@ -9,6 +9,7 @@ from tests.detection.pictures import (
     bar,
     brightness_model,
     diamond,
+    extrinsic,
     make_camera,
     output_of,
     patches_of,
@@ -24,6 +25,8 @@ from v2hdm.detection.propose import open_sides
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import order_corners, side_frames
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.scene import Box, Paint, Scene
 
 NEAR = [diamond(5.4, y, 1.2, 0.7, yaw) for y, yaw in ((-1.1, 12.0), (0.1, -7.0), (1.2, 20.0))]
 FAR = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (8.0, 10.0, 12.5, 15.0) for y in (-2.3, -0.4, 1.6)]
@@ -165,6 +168,49 @@ def test_a_diamond_half_hidden_behind_a_straight_edge_is_not_believed(occluder):
     assert max(cut) < min(whole)
     assert np.mean(cut) < 0.5
     assert np.mean(np.array(cut) > DetectorOptions().min_confidence) < 0.1
+
+
+@pytest.mark.parametrize("y", [-0.6, 0.4])
+def test_a_bar_half_hidden_behind_a_dark_edge_has_no_points_there(models, y):
+    """Of an edge like the ground nothing tells but the length, of which a single image knows the class's."""
+    camera = make_camera("pinhole")
+    image = picture(camera, [bar(6.0, y, 0.3, 2.4)], ground=0.2, paint=0.6)
+    middle = int(to_image(camera, np.array([[6.0, y]]))[0, 0])
+    (whole,), _ = detect(models, image, camera, "stop_line", min_confidence=0.0)
+    assert whole.corner_valid.all()
+    image[:, middle:] = 4
+    (cut,), _ = detect(models, image, camera, "stop_line", min_confidence=0.0)
+    hidden = cut.corners_px[:, 0] > middle - 5
+    assert hidden.sum() == 2
+    np.testing.assert_array_equal(cut.corner_valid, ~hidden)
+
+
+def dash_behind(box_at):
+    """The dash seen first in a rendered image of one from 6 to 9 m ahead, perhaps behind a box 70 cm wide."""
+    camera = make_camera("pinhole")
+    dash = np.array([[6.0, -0.075], [9.0, -0.075], [9.0, 0.075], [6.0, 0.075]])
+    boxes = [Box(centre_map=box_at, size_m=(0.3, 0.7, 0.3), albedo_bgr=(0.1, 0.25, 0.5))] if box_at else []
+    scene = Scene(paints=(Paint(kind="lane_dash", polygon_map=dash),), boxes=tuple(boxes))
+    image = Renderer(scene).render(camera.info, extrinsic(), np.random.default_rng(0)).image
+    markings, _ = Detector.load(options=DetectorOptions.for_mapping()).detect(image, camera)
+    found = max(markings, key=lambda marking: marking.score)
+    order = np.argsort(found.corners_px[:, 1])
+    along = found.corners_px[order[2:]].mean(axis=0) - found.corners_px[order[:2]].mean(axis=0)
+    sigma_px = [sigma_along(found.covariance_px, corner, along) for corner in order]
+    return found, order, sigma_px
+
+
+def test_an_end_behind_a_box_is_vague_along_the_dash_and_one_that_is_seen_is_not():
+    found, _, sigma_px = dash_behind(None)
+    assert found.corner_valid.all()
+    assert max(sigma_px) < 5
+    for box_at, hidden in (((8.4, 0.0), slice(0, 2)), ((6.2, 0.0), slice(2, 4))):
+        found, order, sigma_px = dash_behind(box_at)
+        assert not found.corner_valid[order[hidden]].any()
+        assert min(sigma_px[hidden]) > 50
+        seen = [k for k in range(4) if k not in range(4)[hidden]]
+        assert found.corner_valid[order[seen]].all()
+        assert max(sigma_px[k] for k in seen) < 5
 
 
 def test_narrow_far_dashes_are_fitted_as_a_whole(models):

@@ -20,7 +20,7 @@ from tests.detection.pictures import (
     straight,
     to_image,
 )
-from v2hdm.catalogue import LANE_CLASSES
+from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import boundaries as score
@@ -259,7 +259,7 @@ def lanes_of(tmp_path, shapes, kind="lane_line", lens="plumb_bob", **options):
     detector = Detector.load(brightness_model(tmp_path, kind), DetectorOptions(**options))
     _, lanes = detector.detect(picture(camera, shapes), camera)
     view = RoadCamera(camera)
-    pieces = [lane for lane in lanes if lane.kind in LANE_CLASSES]
+    pieces = [lane for lane in lanes if lane.kind in SHIPPED.lane_paint]
     return [(lane.kind, view.ground(view.undistort(lane.points_px))) for lane in pieces]
 
 
@@ -296,7 +296,7 @@ def test_a_dash_is_a_marking_and_a_piece_of_lane(tmp_path):
     detector = Detector.load(brightness_model(tmp_path, "lane_dash"))
     markings, lanes = detector.detect(picture(camera, [bar(6.0, 0.5, 3.0, 0.2)]), camera)
     assert [m.kind for m in markings] == ["lane_dash"]
-    assert [lane.kind for lane in lanes if lane.kind in LANE_CLASSES] == ["lane_dash"]
+    assert [lane.kind for lane in lanes if lane.kind in SHIPPED.lane_paint] == ["lane_dash"]
 
 
 def test_paint_too_long_for_a_dash_is_a_line(tmp_path):

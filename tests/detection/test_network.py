@@ -277,6 +277,8 @@ def test_the_shipped_files_belong_together(folder):
     manifest = weights.read_manifest()
     assert set(manifest["files"]) == set(weights.COMMANDS)
     assert len(manifest["commit"]) >= 40
+    commands = [entry["command"] for entry in manifest["files"].values()]
+    assert not any(word.startswith("/") for command in commands for word in command.split())
 
 
 @pytest.mark.parametrize("name", list(weights.COMMANDS))

@@ -318,7 +318,7 @@ def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, r
     weights.check_weights(into)
     files = weights.read_manifest(into)["files"]
     assert {entry["command"] for entry in files.values()} == {
-        f"python -m train.ship {run} --precision float32 --judge-images 130 --lane-images 110"
+        f"python -m train.ship {run.name} --precision float32 --judge-images 130 --lane-images 110"
     }
     before = digests(weights.FOLDER)
     assert all(entry["sha256"] != before[name] for name, entry in files.items())

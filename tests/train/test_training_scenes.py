@@ -37,7 +37,7 @@ from train.scenes.traffic import traffic
 from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
 from train.scenes.weather import GROUNDS, photo_tile
 from train.scenes.windscreen import before_lens
-from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
@@ -107,7 +107,7 @@ def test_lanes_lie_on_their_paint():
     on_paint, seen = 0, 0
     for index in range(60):
         sample = training_sample(3, index, 192, 96, difficulty=0.0)
-        lane_paint = np.isin(sample.labels, [1 + PAINT_CLASSES.index(kind) for kind in LANE_CLASSES])
+        lane_paint = np.isin(sample.labels, [1 + PAINT_CLASSES.index(kind) for kind in SHIPPED.lane_paint])
         for lane in sample.lanes_px:
             u, v = np.round(lane).astype(int).T
             inside = (u >= 0) & (u < 192) & (v >= 30) & (v < 96)
@@ -146,7 +146,7 @@ def _solid_strands_about(road, lane):
     about = [
         paint
         for paint in road.paints
-        if paint.kind in LANE_CLASSES and abs(paint.polygon_map[:, 1].mean() - lane[:, 1].mean()) < 0.7
+        if paint.kind in SHIPPED.lane_paint and abs(paint.polygon_map[:, 1].mean() - lane[:, 1].mean()) < 0.7
     ]
     if any(paint.kind == LANE_DASH for paint in about):
         return []
@@ -163,7 +163,7 @@ def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one():
         several += len(left) > 1
         assert not len(left) > 1 or np.diff(left).min() > 0.75
         for paint in road.paints:
-            if paint.kind in LANE_CLASSES:
+            if paint.kind in SHIPPED.lane_paint:
                 off = [np.abs(lane[:, 1] - paint.polygon_map[:, 1].mean()).min() for lane in road.lanes]
                 assert min(off) < 0.38, "no paint of what is no line"
     assert several > 30

@@ -28,7 +28,7 @@ import numpy as np
 
 from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.fit import STATISTICS, TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
+from v2hdm.detection.fit import OPEN_SIGMA, STATISTICS, TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
 from v2hdm.detection.network import NetworkOutput, as_probability, open_session
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.patch import ImageQuads, Patches, grey_of, log_light
@@ -67,9 +67,6 @@ CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "sy
 """Channels of :func:`rectified_views`: log of the grey value over its median; log of blue over red, over its
 median; log odds of paint; the network's shares of the quadrilateral's own class, lane lines and symbols;
 whether it is outside the image."""
-
-CLAIMED_CHANNELS = CHANNELS[CHANNELS.index("paint_odds") : CHANNELS.index("outside")]
-"""The channels that are the network's."""
 
 SIZE = 20
 """Rows and columns of a picture."""
@@ -239,6 +236,24 @@ _POINT_SHARE = 0.125
 """Largest standard deviation of a point, in parts of its marking's longer diagonal: two of these are a
 deviation at which sightings are no longer taken for one shape (`association.shape_tolerance`)."""
 
+_STRIP_PX = np.array([2.5, 4.5, 6.5, 8.5])
+"""So far from an end, and from the long sides, the ground about it is looked at; nearer the paint blurs."""
+
+_ASPECT = 2.0  # longer than that a marking has ends, which things hide a part at a time
+_HIDDEN, _BORDER, _STAIN = 0.05, 0.003, 0.02
+"""Shares of ends behind a thing, at the border of a shadow or a patch all across, and of spots of the ground
+that are unlike the next one."""
+
+_UNLIKE, _ALIKE = np.array([0.8, 0.3]), np.array([0.3, 0.15])
+"""Standard deviations of log grey and of log blue over red: a thing's from the ground, and its own parts'."""
+
+_EVEN, _GRAIN = np.array([0.08, 0.05]), 0.25
+"""Bare ground differs from the next by so much, and by this share of its own scatter.
+
+With these, 89 of 100 ends of dashes that boxes hid by more than 25 cm are known, and 5 that none hid are held
+to be, in renders in which boxes stand beside every second dash.
+"""
+
 _TURNED_RAD = 0.15
 _SHARPEST_RADIUS_M = 12.0
 _MOST_TURNED_RAD = 0.9
@@ -251,7 +266,8 @@ class Readings:
 
     ``quadrilateral`` (R,) is the index of each, ``kinds`` its class; ``evidence`` (R, F) and ``views``
     (R, C, S, S) are given to the network, ``ground`` (R, 4, 2) are corners, m. The first side in a view is
-    side ``first_side`` (R,) of the quadrilateral. ``parts`` lists, by quadrilateral around a whole piece of
+    side ``first_side`` (R,) of the quadrilateral. ``hidden_ends`` (M, 4) are ends of what
+    is seen of it rather than of its paint. ``parts`` lists, by quadrilateral around a whole piece of
     paint, those around its parts: either the one or the others are markings.
     """
 
@@ -262,6 +278,7 @@ class Readings:
     views: np.ndarray
     ground: FloatArray
     first_side: np.ndarray
+    hidden_ends: BoolArray
     parts: Mapping[int, Sequence[int]]
 
 
@@ -291,7 +308,57 @@ def read_markings(
         for m, p in enumerate(chosen)
         if (among := [place[p.index + k] for k in range(1, 1 + p.blob.parts) if p.index + k in place])
     }
-    return Readings(fit, at, kinds, evidence, views, ground.corners[at], first_side, parts)
+    hidden = hidden_ends(patches, quads, ground)
+    return Readings(fit, at, kinds, evidence, views, ground.corners[at], first_side, hidden, parts)
+
+
+def hidden_ends(patches: Patches, quads: ImageQuads, ground: Quad) -> BoolArray:
+    """Which sides (M, 4) are ends of long markings at which something hides the rest of the paint.
+
+    Where paint ends, the ground beside it goes on beyond; where a thing stands before it, it ends with the
+    paint. The ground before the end, on both sides of the paint, is compared with what lies beyond the end:
+    behind the paint and behind that ground. It is bare ground, of which a spot may be stained and across
+    which a shadow's border may run just there, or a thing, of any tone and colour, which may be narrow.
+    """
+    longer = np.roll(ground.length, 1, axis=1) + np.roll(ground.length, -1, axis=1)
+    hidden = longer > 2 * _ASPECT * ground.length
+    marking, end = np.nonzero(hidden)
+    if not len(marking):
+        return np.asarray(hidden)
+    own = quads.take(marking)
+    first, last, after, before = own.corners[np.arange(len(end)), (end + np.arange(4)[:, None]) % 4]
+    inward = before - first + after - last
+    long_px = np.linalg.norm(inward, axis=-1)[:, None] / 2
+    inward = inward[:, None] / np.maximum(2 * long_px, 1e-6)[..., None]
+    # Along the end: to one side of it, its paint, to the other; across it: beyond and before.
+    aside = own.tangent[np.arange(len(end)), end][:, None] * _STRIP_PX[:, None]
+    on_it = first[:, None] + (last - first)[:, None] * _GRID[1:5, None]
+    along = np.stack([first[:, None] - aside, on_it, last[:, None] + aside], axis=1)
+    depth = np.minimum(_STRIP_PX, long_px / 2)[..., None] * inward
+    across = np.stack([-_STRIP_PX[:, None] * inward, depth], axis=1)
+    points = along[:, :, None, :, None] + across[:, None, :, None]
+    points = own.px(points.reshape(len(end), -1, len(_STRIP_PX), 2))
+    bgr = patches.light_at(marking, points)
+    logs = log_light(bgr)
+    light = np.stack([log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2]], axis=-1)
+    light = light.reshape(len(end), 3, 2, -1, 2)
+    bare_ground = light[:, ::2, 1].reshape(len(end), -1, 2)
+    sigma = np.hypot(_EVEN, _GRAIN * bare_ground.std(axis=1))[:, None]
+    off = np.median(light[:, :, 0], axis=2) - np.median(bare_ground, axis=1)[:, None]
+    paint, beside = off[:, 1], off[:, ::2]
+    spots = np.logaddexp(np.log(1 - _STAIN) + _normal(off, sigma), np.log(_STAIN) + _normal(off, _UNLIKE))
+    wide = _normal(beside - paint[:, None], np.hypot(sigma, _ALIKE))
+    other = _normal(paint, np.hypot(sigma[:, 0], _UNLIKE))
+    thing = other + np.logaddexp(np.log(0.5) + wide, np.log(0.5) + spots[:, ::2]).sum(axis=1)
+    bare = np.logaddexp(np.log(1 - _BORDER) + spots.sum(axis=1), np.log(_BORDER) + other + wide.sum(axis=1))
+    seen = ~patches.outside(points).any(axis=(1, 2))
+    hidden[marking, end] = seen & (thing - bare > np.log(1 / _HIDDEN - 1))
+    return np.asarray(hidden)
+
+
+def _normal(off: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Log density (...) of independent normal deviations (..., 2)."""
+    return np.asarray((-0.5 * (off / sigma) ** 2 - np.log(sigma)).sum(axis=-1) - np.log(2 * np.pi))
 
 
 def find_markings(
@@ -308,7 +375,11 @@ def find_markings(
     best[readings.quadrilateral[order]] = order
     turned = (np.arange(4) - readings.first_side[best, None]) % 4
     corners_px = readings.fit.corners_px
-    covariance = readings.fit.covariance_px(np.take_along_axis(side_sigma_px[best], turned, axis=1))
+    side_sigma_px = np.take_along_axis(side_sigma_px[best], turned, axis=1)
+    # Its paint may go on behind the thing for any length.
+    length_px = readings.fit.quad.length.max(axis=1)[:, None]
+    side_sigma_px = np.where(readings.hidden_ends, OPEN_SIGMA * length_px, side_sigma_px)
+    covariance = readings.fit.covariance_px(side_sigma_px)
     valid = _are_points(covariance, corners_px, camera) & camera.inside(corners_px, options.border_px)
     left_out: set[int] = set()
     for whole, parts in readings.parts.items():

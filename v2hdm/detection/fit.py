@@ -61,7 +61,7 @@ _MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
 _OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
 
-_OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
+OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
 _BEYOND_PX = 6.0
 """How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
 
@@ -209,7 +209,7 @@ def fit_quadrilaterals(
 
     grid, paint, spacing_px = lay_grid(patches, frames, corners_px)
     search_blur_px = np.maximum(_SEARCH_BLUR * spacing_px, _LEAST_SEARCH_BLUR_PX)
-    sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA, _SEARCH_SIGMA) * length_px, 2)
+    sigma_px = np.tile(np.where(open_sides, OPEN_SIGMA, _SEARCH_SIGMA) * length_px, 2)
     state = _State.at(start, search_blur_px, blur_px, sigma_px, frames)
     state.settle(grid, _SEARCH_STEPS, paint)
     searched = state.quad.corners.copy()
@@ -217,7 +217,7 @@ def fit_quadrilaterals(
     searched[lost] = start.corners[lost]
     searched_px = frames.to_px(searched)
     # Beyond the image a lens model may fold.
-    within = camera.inside(searched_px, -_OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1)
+    within = camera.inside(searched_px, -OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1)
     folded = ~within & ~open_sides.any(axis=1)
     folded |= ~(np.ptp(searched_px, axis=1).max(axis=1) < 2 * np.ptp(corners_px, axis=1).max(axis=1))
     searched[folded], searched_px[folded] = start.corners[folded], corners_px[folded]
@@ -226,7 +226,7 @@ def fit_quadrilaterals(
     found = Quad(searched)
     inward_px = -_BLOOM * blur_px * np.minimum(lattice.clipped[:, 0] / _MUCH_CLIPPED, 1.0)
     begun = found.moved(np.repeat(inward_px[:, None], 8, axis=1))
-    sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA * length_px, _OUTLINE_SIGMA_PX), 2)
+    sigma_px = np.tile(np.where(open_sides, OPEN_SIGMA * length_px, _OUTLINE_SIGMA_PX), 2)
     state = _State.at(begun, np.full(len(searched), blur_px), blur_px, sigma_px, frames)
     system = state.settle(lattice, _STEPS)
     covariance = np.linalg.inv(system.information)[:, :8, :8]

@@ -174,19 +174,16 @@ def save_comparison(
     with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
         every = np.atleast_1d(fig.subplots(1, len(panels)))
         for axes, panel, rgba in zip(every, panels, pictures, strict=True):
-            shown = _brightened(rgba, low, max(high, low + 1))
-            axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
+            bgr = rgba[..., :3].astype(np.float32)
+            stretched = np.clip((bgr - 0.5 * low) / (max(high, low + 1) - 0.5 * low), 0, 1)
+            seen = rgba[..., 3:].astype(np.float32) / 255  # white where nothing was seen
+            axes.imshow(
+                1 - seen * (1 - stretched), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased"
+            )
             axes.set(title=panel.title, xlabel=panel.caption, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
             axes.plot([0.4, 0.4 + _BAR_M], [0.4, 0.4], color="white", lw=3, solid_capstyle="butt")
             axes.text(0.4 + _BAR_M / 2, 0.52, f"{_BAR_M:g} m", color="white", ha="center", va="bottom")
-
-
-def _brightened(rgba: np.ndarray, low: float, high: float) -> np.ndarray:
-    """The picture with its levels stretched; white where nothing was seen."""
-    stretched = np.clip((rgba[..., :3].astype(np.float32) - 0.5 * low) / (high - 0.5 * low), 0, 1)
-    seen = rgba[..., 3:].astype(np.float32) / 255
-    return np.asarray(1 - seen * (1 - stretched))
 
 
 LARGEST_PICTURE_PX = 8192  # of either side of the picture: graphics cards of computers and phones draw that

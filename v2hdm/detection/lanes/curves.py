@@ -381,17 +381,14 @@ def find_road(evidence: Evidence, horizon: Horizon) -> Road:
     certain = np.argsort((np.diagonal(doubt, axis1=1, axis2=2) / np.diag(spread)).sum(axis=1))[:_CANDIDATES]
     candidates = [_along(mean[k], doubt[k], free) for k in certain]
     *along, alone = evidence.log_evidence(Prior.several([*candidates, free]))
-    best = max((ratio - alone for ratio in along), key=_agreement)
+    gains = np.array(along) - alone
+    agreement = np.logaddexp(np.log(_SHARE) + gains, np.log1p(-_SHARE)).sum(axis=1)
+    best = gains[agreement.argmax()]
     # The mean of what all say of the road, each as far as it keeps to it.
     weight = 1 / (1 + (1 - _SHARE) / _SHARE * np.exp(-np.clip(best, -50, 50)))
     each = np.linalg.inv(doubt) * weight[:, None, None]
     shared = np.linalg.inv(each.sum(axis=0) + free.information[_SHARED_BLOCK])
     return Road(_along(shared @ np.einsum("nij,nj->i", each, mean), shared + spread, free), free)
-
-
-def _agreement(gain: FloatArray) -> float:
-    """Log probability of lines of such log ratios, some of which keep to the road."""
-    return float(np.logaddexp(np.log(_SHARE) + gain, np.log1p(-_SHARE)).sum())
 
 
 def _along(shared: FloatArray, covariance: FloatArray, free: Prior) -> Prior:

@@ -59,22 +59,18 @@ def _branches(blob: Blob) -> list[FloatArray]:
     """The two edges (n, 2, 2), recorded px, of each branch of a blob, cut by cut."""
     height, width = blob.level.shape
     by_rows = height >= _ROWS_MIN_ASPECT * width
-    order = [1, 0] if by_rows else [0, 1]
+    level, order = (blob.level, [1, 0]) if by_rows else (blob.level.T, [0, 1])
+    i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
+    crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
+    runs = np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
     return [
         blob.origin_px + blob.stride * np.stack([chain[:, [0, 1]], chain[:, [0, 2]]], axis=1)[..., order]
-        for chain in _chains(_cuts(blob.level if by_rows else blob.level.T))
+        for chain in _chains(runs)
     ]
 
 
-def _cuts(level: np.ndarray) -> FloatArray:
-    """Runs (R, 3) of row, start and end column of where a field (h, w) is positive, in order."""
-    i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
-    crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
-    return np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
-
-
 def _chains(runs: FloatArray) -> list[FloatArray]:
-    """Runs linked from row to row where they overlap (n, 3), each chain one branch of the blob."""
+    """Runs (R, 3) of row, start and end column, linked where they overlap: a branch of the blob each."""
     if len(runs) < _MIN_POINTS:
         return []
     above, below = runs[:-1], runs[1:]

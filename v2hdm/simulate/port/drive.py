@@ -176,10 +176,10 @@ def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) 
     report()
     if workers <= 1 or len(jobs) < 2 * workers:
         for job in jobs:
-            _write_picture(port, job)
+            _write_picture(job, port)
             report()
     else:
-        share_out(_work, jobs, workers, _start_worker, (port.config,), report)
+        share_out(_write_picture, jobs, workers, _start_worker, (port.config,), report)
 
 
 def _start_worker(config: PortConfig) -> None:
@@ -188,13 +188,9 @@ def _start_worker(config: PortConfig) -> None:
     _worker_port = build_port(config)
 
 
-def _work(job: _Job) -> None:
-    assert _worker_port is not None
-    _write_picture(_worker_port, job)
-
-
-def _write_picture(port: Port, job: _Job) -> None:
-    camera, frame, target = job
+def _write_picture(job: _Job, own: Port | None = None) -> None:
+    port, (camera, frame, target) = own or _worker_port, job
+    assert port is not None
     data = port.jpeg(port.picture(camera, frame).image)
     with whole_file(Path(target)) as partial:
         partial.write_bytes(data)

@@ -121,19 +121,12 @@ def _draw_face(
             continue
         if box.corrugated and face.upright:
             waves = np.sin(seen[1] * np.float32(2 * np.pi / _CORRUGATION_M))
-        colour = _colour(box, face, lit, *seen[1:])
+        albedo = _albedo(box, face, *seen[1:])
+        parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
+        colour = np.stack(parts).reshape(3, *(parts[0].shape or (1, 1)))  # (3, 1, 1) where it is one tone
         kernels.draw_face(
             window, seen, _DIRT_TILE.padded, scale, waves, face.upright, colour, radiance, hidden
         )
-
-
-def _colour(
-    box: Box, face: _Face, lit: Sequence[float], along_m: Float32, up_m: Float32, footprint_m: Float32
-) -> Float32:
-    """The light (3, h, w) that a face of no other tone sends from a window, or (3, 1, 1) where it is one."""
-    albedo = _albedo(box, face, along_m, up_m, footprint_m)
-    parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
-    return np.stack(parts).reshape(3, *(parts[0].shape or (1, 1)))
 
 
 def _albedo(
