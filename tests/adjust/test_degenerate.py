@@ -129,7 +129,6 @@ def test_a_known_length_that_cannot_be_is_refused_by_name(message):
     [
         ({"pose_states": ("yaw",)}, "unknown pose state 'yaw'"),
         ({"loss": "l1"}, "unknown loss 'l1'"),
-        ({"solver": "ceres"}, "unknown solver 'ceres'"),
         ({"loss_scale": 0.0}, "loss_scale is 0.0"),
         ({"gate_probability": 1.0}, "gate_probability is 1.0"),
         ({"gap_tolerance": 0.0}, "gap_tolerance is 0.0"),

@@ -115,6 +115,16 @@ def test_a_step_within_the_noise_that_is_stated_is_unobservable_however_quiet_th
     assert is_told or "below 9.2 cm" in finding.says
 
 
+@pytest.mark.parametrize(("of_all", "is_told"), [(0.004, True), (0.03, False)])
+def test_a_focal_length_that_both_cameras_may_share_unseen_is_unobservable(of_all, is_told):
+    sigmas = {("front",): 0.001, ("rear",): 0.001, ("front", "rear"): of_all}
+    tests = tuple(contradiction(Fault.FOCAL, who, 0, "", 0.001, one, 1.0) for who, one in sigmas.items())
+    (finding,) = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.check == "focal length"]
+    assert finding.status is Status.PASS
+    assert finding.is_unobservable is not is_told
+    assert is_told or "errors that all cameras share below 0.12" in finding.says
+
+
 def test_a_rival_that_explains_as_much_is_named_as_well():
     one = contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
     other = contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)

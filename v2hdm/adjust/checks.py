@@ -174,25 +174,35 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
 
 
 def _check_observations(problem: Problem) -> None:
-    from v2hdm.adjust.engines.numba.prepare import Seen, first_unsound  # loads numba
-
-    frames = len(problem.map_from_vehicle)
-    by_corner = np.zeros(problem.corner_count, dtype=np.int64)
-    by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
-    seen = Seen.of(problem.observations.columns, problem.intrinsic)
-    k = first_unsound(seen, frames, _SYMMETRIC_TO, _MAX_SLOPE, by_corner, by_camera)
-    if k >= 0:
-        raise AdjustError(_fault(problem, k))
-    for name, times in (("corner", by_corner), ("camera", by_camera)):
+    seen, sizes = problem.observations, _sizes(problem)
+    sound = np.ones(len(seen.corner), dtype=bool)
+    for name, size in sizes.items():
+        index = getattr(seen, name)
+        sound &= (index >= 0) & (index < size)
+    intrinsic = problem.intrinsic[np.where(sound, seen.camera, 0)]
+    with np.errstate(invalid="ignore", over="ignore"):
+        (xx, xy), (yx, yy) = seen.covariance_px.astype(np.float64).transpose(1, 2, 0)
+        sound &= (xx > 0) & (xx * yy > yx**2) & (xx * yy < np.inf)
+        sound &= (xy - yx) ** 2 <= _SYMMETRIC_TO**2 * xx * yy
+        sound &= (np.abs((seen.pinhole_px - intrinsic[:, 2:]) / intrinsic[:, :2]) <= _MAX_SLOPE).all(1)
+    if not sound.all():
+        raise AdjustError(_fault(problem, int(sound.argmin())))
+    for name in ("corner", "camera"):
+        times = np.bincount(getattr(seen, name), minlength=sizes[name])
         if not times.all():
             raise AdjustError(f"{name} {times.argmin()} has no observation: leave it out of the problem")
+
+
+def _sizes(problem: Problem) -> dict[str, int]:
+    """How many there are of each thing that an observation names."""
+    frames = len(problem.map_from_vehicle)
+    return {"camera": len(problem.intrinsic), "frame": frames, "corner": problem.corner_count}
 
 
 def _fault(problem: Problem, k: int) -> str:
     """The message for observation k, which is unsound."""
     seen = problem.observations
-    sizes = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
-    for name, size in zip(("camera", "frame", "corner"), sizes, strict=True):
+    for name, size in _sizes(problem).items():
         index = getattr(seen, name)[k]
         if not 0 <= index < size:
             return f"observation {k} names {name} {index}, but there are only {size}"

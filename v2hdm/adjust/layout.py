@@ -7,7 +7,7 @@ The errors of the recorded poses become states of the frames, each expected from
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,9 +21,6 @@ from v2hdm.adjust.problem import POSE_STATES, KnownLengths, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.tensors import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from v2hdm.adjust.engines.numba.prepare import Seen
 
 _NEAR_M = 10_000.0
 """Coordinates of this size are known to a picometre, and moving them would cost memory for nothing."""
@@ -123,15 +120,11 @@ def make_arrays(
     def index(values: NDArray[Any]) -> Tensor:
         return torch.as_tensor(values, device=device)
 
-    from v2hdm.adjust.engines.numba.prepare import Seen, whiten_observations  # loads numba
-
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
-    seen = Seen.of(problem.observations.columns, problem.intrinsic)
-    order, corner, pair = _sorted_observations(seen, rank, len(problem.map_from_vehicle))
-    measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
-    whiten_observations(seen, order, measured, root)
+    order, corner, pair = _sorted_observations(problem, rank)
+    measured, root = _whitened(problem, order)
     states, transition, information_root = state_prior(problem, pose_states)
     # Without a survey the information is 0.
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
@@ -211,21 +204,33 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
 
 def _sorted_observations(
-    seen: Seen, rank: IntArray, frames: int
+    problem: Problem, rank: IntArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Observations (K,) by corner, then camera, then frame; the corner and the pair of each."""
-    from v2hdm.adjust.engines.numba.prepare import sort_observations  # loads numba
-
-    order, corner, pair = (np.empty(len(seen.corner), dtype=np.int32) for _ in range(3))
-    at = np.zeros(len(rank) + 1, dtype=np.int64)
-    again = sort_observations(seen, rank, frames, at, order, corner, pair)
-    if again >= 0:
-        first, second = sorted(order[again - 1 : again + 1].tolist())
+    seen, frames = problem.observations, len(problem.map_from_vehicle)
+    pair, corner = seen.camera.astype(np.int64) * frames + seen.frame, rank[seen.corner]
+    key = corner * (len(problem.intrinsic) * frames) + pair
+    order = np.argsort(key, kind="stable")
+    again = np.flatnonzero(np.diff(key[order]) == 0)
+    if len(again):
+        first, second = order[again[0] : again[0] + 2].tolist()
         raise AdjustError(
             f"observations {first} and {second} are the same corner {seen.corner[first]} in frame "
             f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
         )
-    return order, corner, pair
+    return order.astype(np.int32), corner[order].astype(np.int32), pair[order].astype(np.int32)
+
+
+def _whitened(problem: Problem, order: NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
+    """``measured`` (2, K) and ``root_information`` (3, K) of the arrays, for observations in an order."""
+    seen = problem.observations
+    intrinsic = problem.intrinsic[seen.camera[order]].T
+    xx, yx, yy = (seen.covariance_px[order, row, column] for row, column in ((0, 0), (1, 0), (1, 1)))
+    first = np.sqrt(xx, dtype=np.float64)
+    below = yx / first
+    last = np.sqrt(yy - below**2)
+    root = np.stack([intrinsic[0] / first, -below * intrinsic[0] / (first * last), intrinsic[1] / last])
+    return (seen.pinhole_px[order].T - intrinsic[2:]) / intrinsic[:2], root
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:

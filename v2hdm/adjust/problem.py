@@ -70,11 +70,6 @@ class Observations:
     covariance_px: FloatArray
     row_share: FloatArray | None = None
 
-    @property
-    def columns(self) -> tuple[IntArray | FloatArray, ...]:
-        """All but the rows."""
-        return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
-
     def take(self, rows: IntArray | BoolArray) -> Observations:
         """The observations at ``rows``, indices or a mask."""
         taken: list[Any] = [None if one is None else one[rows] for one in vars(self).values()]

@@ -227,6 +227,10 @@ class _Answer:
             return blank
         freedom = self.freedom
         multiple = (_PRIOR_FREEDOM * usual + freedom * self.disagreement) / (_PRIOR_FREEDOM + freedom)
+        if at.fault not in CHANGES:
+            # An error that lasts the whole drive is held against noise that may last as long, which stretches
+            # have in common and do not disagree by: they widen the model's sigma, and cannot narrow it.
+            multiple = max(multiple, 1.0)
         w, s, total = self.information, self.score, float(self.information.sum())
         sigma = float(np.sqrt(multiple * w[:-1].sum() + w[-1])) / total
         # Each stretch as the others predict it; the priors that belong to no stretch are with the others.

@@ -200,18 +200,9 @@ def solve_bundle(
             "at a lower speed or raise the image rate."
         )
     knots, corners_start = lanes or (None, None)
-    own_corner = association.corner_order()[row, corner]
-    covariance_px = sightings.covariance_px[row, own_corner]
-    on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
-    covariance_px[on_line] = line_only(covariance_px[on_line], _OPEN_END_PX)
-    observations = Observations(
-        camera=sightings.camera[row],
-        frame=sightings.frame[row],
-        corner=corner_index[group, corner],
-        pinhole_px=sightings.corners_pinhole_px[row, own_corner],
-        covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
-        row_share=sightings.row_share[row, own_corner],
-    )
+    on_line = known_elsewhere(association, sightings.valid & usable, usable)
+    at = row, association.corner_order()[row, corner]
+    observations = _observations(sightings, at, on_line, corner_index[group, corner], model)
     first = int(corner_index.max(initial=-1)) + 1
     if knots is not None:
         observations = _joined(observations, knots.observations(first))
@@ -240,6 +231,22 @@ def solve_bundle(
         adjusted = replace(adjusted, read_out_s=read_out_s)
     index, seen = {sightings.cameras[c]: k for k, c in enumerate(used.tolist())}, (row, group, corner)
     return Bundle(adjusted, model, problem, solution, association, *seen, corner_index, index, frames, knots)
+
+
+def _observations(
+    sightings: Sightings, at: tuple[IntArray, IntArray], on_line: BoolArray, corner: IntArray, model: Model
+) -> Observations:
+    """What the sightings' own corners ``at`` (row, corner; K each) show of the problem's ``corner`` (K,)."""
+    covariance_px, ends = sightings.covariance_px[at], on_line[at]
+    covariance_px[ends] = line_only(covariance_px[ends], _OPEN_END_PX)
+    return Observations(
+        camera=sightings.camera[at[0]],
+        frame=sightings.frame[at[0]],
+        corner=corner,
+        pinhole_px=sightings.corners_pinhole_px[at],
+        covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
+        row_share=sightings.row_share[at],
+    )
 
 
 _OF_OBSERVATIONS = "residual_px", "mahalanobis2", "verdict"

@@ -56,8 +56,9 @@ _ODDS_LIMIT = CONTRADICTED_SIGMAS**2 / 2
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
 _LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
-# Sigma, m, of the point that the poses are of, up to which a drive observes it: the usual accuracy goal.
-_LEVER_OBSERVABLE_M = 0.05
+# Sigma, m, of the point that the poses are of, up to which a drive observes it: twice that, at 95 %, is the
+# usual accuracy goal.
+_LEVER_OBSERVABLE_M = 0.025
 
 # The check that reports each fault, and the recovery.
 _CHECKS: Mapping[Fault, tuple[str, str]] = {
@@ -190,7 +191,19 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
 
 
 def _observable(tested: list[Contradiction]) -> list[Contradiction]:
-    return [one for one in tested if max(one.sigma, one.model_sigma) <= OBSERVABLE_SIGMA[one.fault]]
+    """The tests that this drive observes; none where an error that all cameras share may hide beside them."""
+    return [] if _hidden(tested) else [one for one in tested if _is_observable(one)]
+
+
+def _hidden(tested: list[Contradiction]) -> list[Contradiction]:
+    """Errors of single cameras that this drive observes, and that all may share without its seeing them."""
+    seen = {(one.fault, one.axis) for one in tested if len(one.cameras) == 1 and _is_observable(one)}
+    shared = [one for one in tested if len(one.cameras) > 1 and (one.fault, one.axis) in seen]
+    return [one for one in shared if not _is_observable(one)]
+
+
+def _is_observable(one: Contradiction) -> bool:
+    return _sigma(one) <= OBSERVABLE_SIGMA[one.fault]
 
 
 def _corrected(one: Contradiction) -> Finding:
@@ -228,17 +241,32 @@ def _input(one: Contradiction, status: Status, says: str) -> Finding:
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     observable = _observable(tested)
     if not observable:
-        size = CONTRADICTED_SIGMAS * min(max(one.sigma, one.model_sigma) for one in tested)
-        scale, unit = _SHOWN[tested[0].fault.unit]
-        below = f" below {scale * size:.2g} {unit}".rstrip() if np.isfinite(size) else ""
-        says = f"the markings of this drive do not tell errors{below}: drive a turn, and past more of them"
-        return passed(check, ", ".join(tested[0].cameras), says)
+        hidden = _hidden(tested)
+        least = min(hidden or tested, key=_sigma)
+        below = f" below {_least_shown(least)}" if np.isfinite(_sigma(least)) else ""
+        whose = " that all cameras share" if hidden else ""
+        says = f"the markings of this drive do not tell errors{whose}{below}"
+        return passed(check, ", ".join(least.cameras), f"{says}: drive a turn, and past more of them")
     worst = max(observable, key=lambda one: one.sigmas)
     if is_contradicted(worst):
         says = "not told apart from what is named as wrong: mend that first"
         return passed(check, ", ".join(worst.cameras), says)
-    says = f"the markings agree with what is stated, to {worst.sigmas:.1f} sigmas"
+    blind = _least_shown(max(observable, key=_sigma))
+    says = (
+        f"the markings agree with what is stated, to {worst.sigmas:.1f} sigmas; they show errors from {blind}"
+    )
     return _input(worst, Status.PASS, says)
+
+
+def _sigma(one: Contradiction) -> float:
+    """By the stretches or by the model, whichever is larger."""
+    return max(one.sigma, one.model_sigma)
+
+
+def _least_shown(one: Contradiction) -> str:
+    """The size from which on a drive shows an error, with its unit."""
+    scale, unit = _SHOWN[one.fault.unit]
+    return f"{CONTRADICTED_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
 
 
 def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
