@@ -44,25 +44,37 @@ def measured(folder, port, earlier=None):
     drive = read_drive(folder)
     truth = read_truth(drive)
     calibrations = {k: Calibration(one.info, truth.cam_from_vehicle[k]) for k, one in drive.cameras.items()}
-    shown = (truth.visibility > 0.95).sum(axis=0) >= 2
-    markings = [replace(m, id=k) for k, m in enumerate(truth.map.markings, start=1) if shown[k - 1]]
+    visible = truth.visibility > 0.95
+    known = np.flatnonzero(visible.sum(axis=0) >= 2)
+    markings = [replace(truth.map.markings[k], id=int(k) + 1) for k in known]
+    shown = {(int(image), int(number)) for image, number in np.argwhere(visible[:, known])}
     paints = build_port(port).renderer.scene.paints
     centres = np.array([one.polygon_map.mean(axis=0) for one in paints])
     nearest = [np.argmin(((centres - m.corners_map.mean(axis=0)) ** 2).sum(axis=1)) for m in markings]
     poses, grey = truth.map_from_vehicle, grey_reader(drive)
-    hd_map = with_wear(HdMap(tuple(markings)), drive.images, poses, calibrations, grey, earlier)
+    hd_map = with_wear(HdMap(tuple(markings)), drive.images, poses, calibrations, grey, shown, earlier)
     return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
 
 
 def test_the_share_of_paint_left_is_within_five_hundredths_of_what_was_rendered(short_drive):
-    hd_map, rendered = measured(short_drive, short_port())
-    found = [(one.paint.share, one.paint.sigma, rendered[one.id]) for one in hd_map.markings if one.paint]
+    hd_map, true_share = measured(short_drive, short_port())
+    found = [(one.paint.share, one.paint.sigma, true_share[one.id]) for one in hd_map.markings if one.paint]
     share, sigma, true = np.array(found).T
     assert len(found) > 20
     assert true.min() < 0.4  # some are nearly gone
     assert np.abs(share - true).mean() <= 0.05
     assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.85
     assert np.corrcoef(share, true)[0, 1] > 0.9
+
+
+def test_shadows_and_vehicles_of_a_port_that_nothing_was_tuned_on_are_no_wear(rendered):
+    port = replace(short_port(), seed=10)
+    hd_map, true_share = measured(rendered(port), port)
+    found = [(one.paint.share, one.paint.sigma, true_share[one.id]) for one in hd_map.markings if one.paint]
+    share, sigma, true = np.array(found).T
+    assert len(found) > 20
+    assert np.abs(share - true).mean() <= 0.06
+    assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.95
 
 
 def test_two_visits_keep_the_order_and_the_second_states_the_change(rendered):
@@ -83,6 +95,6 @@ def test_a_marking_that_no_image_shows_keeps_what_the_earlier_map_says(small_dri
     drive = read_drive(small_drive)
     away = replace(read_truth(drive).map.markings[0], corners_map=np.eye(4)[:, :2] + 1e4, id=1)
     before = HdMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
-    arguments = drive.images, [one.map_from_vehicle for one in drive.images], {}, grey_reader(drive)
+    arguments = drive.images, [one.map_from_vehicle for one in drive.images], {}, grey_reader(drive), set()
     assert with_wear(HdMap((away,)), *arguments, before).markings[0].paint == PaintLeft(0.7, 0.1)
     assert with_wear(HdMap((away,)), *arguments).markings[0].paint is None

@@ -185,12 +185,17 @@ def _with_wear(
     """The same with the paint that is left of each marking of the best map."""
     name, last = list(sets.items())[-1]
     best = last.methods[BEST]
-    if best.poses is None:
+    if best.poses is None or best.residuals is None:
         return dict(sets)
     poses = [best.poses.of_image(image) for image in drive.images]
     before = None if earlier is None else earlier.hd_map
     grey, threads = grey_reader(drive), context.processes
-    worn = with_wear(best.hd_map, drive.images, poses, best.calibrations, grey, before, threads)
+    whole = best.residuals.whole_views()
+    index = {drive.name_of(image.path): k for k, image in enumerate(drive.images)}
+    ids = (k if one.id is None else one.id for k, one in enumerate(best.hd_map.markings, start=1))
+    number = {one: k for k, one in enumerate(ids)}
+    shown = {(index[image], number[marking]) for image, marking in whole if marking in number}
+    worn = with_wear(best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads)
     methods = {**last.methods, BEST: replace(best, hd_map=worn)}
     return {**sets, name: replace(last, methods=methods)}
 

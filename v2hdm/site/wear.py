@@ -1,15 +1,16 @@
 """How much of its paint each marking has left, as the nearest images show it.
 
 An image is decoded to linear light, in which a pixel half on paint and half on ground lies half way, and
-divided by the ground beside the marking, so that neither exposure nor light matters. The median over the
-nearest images at each cell of the marking leaves out what hides it in some. The cells are then explained as a
-mixture of full paint, bare ground and cells part of each; how bright full paint is over its ground is the
-marking's own, with a prior from all markings of its class: dirt dims paint that is whole.
+divided by the ground beside the marking, so that neither exposure nor light matters. A cell may be lit as the
+ground of either side: the edge of a shadow often lies across a marking. The median over the
+nearest images at each cell leaves out what hides it in some. The cells are then explained as a mixture of
+full paint, bare ground and cells part of each; how bright full paint is over its ground is the marking's own,
+with a prior from all markings of its class: dirt dims paint that is whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -39,9 +40,9 @@ _INDEPENDENT = 12.0
 
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
 _ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
-_MODEL_SIGMA = (0.03, 0.2)
+_MODEL_SIGMA = (0.045, 0.3)
 """Sigma of a share beside that of the fit, and its growth with what is worn: flakes finer than a pixel look
-like dirt (38 rendered markings)."""
+like dirt, and a shadow narrower than a marking like wear (143 rendered markings of ports 5 to 8 and 11)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Cells:
     """Places (along, across, 2) in and beside a marking; the first and last columns lie on the ground."""
 
     places_map: FloatArray
-    contrasts: list[FloatArray]
+    contrasts: list[FloatArray]  # of each image (3, along, across), over one side's ground, the other's, both
 
     @classmethod
     def of(cls, corners_map: FloatArray) -> Cells:
@@ -69,29 +70,38 @@ class Cells:
     def add(self, light: FloatArray) -> None:
         """Take the light (along, across) of one image."""
         count = len(_BESIDE_M)
-        beside = np.concatenate([light[:, :count], light[:, -count:]], axis=1)
-        padded = np.pad(np.median(beside, axis=1), 4, mode="edge")
-        ground = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)
-        self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[:, None] - 1.0)
+        beside = np.median([light[:, :count], light[:, -count:]], axis=2)
+        padded = np.pad(beside, ((0, 0), (4, 4)), mode="edge")
+        ground = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1), axis=2)
+        ground = np.stack([*ground, ground.mean(axis=0)])
+        self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
-    def fit(self) -> tuple[FloatArray, FloatArray]:
-        """The log likelihood of each of :data:`_CONTRASTS`, and the share of paint if it is that of paint."""
-        every = np.clip(np.median(self.contrasts, axis=0).ravel(), -0.5, 4.0)
-        cells = every[:: -(-len(every) // _FITTED)]
+    def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Fit the cells by each of :data:`_CONTRASTS`, were it that of full paint.
+
+        Returns the log likelihoods, the shares of paint, and the sigmas of these for want of knowing which
+        cells are paint, and for images that disagree.
+        """
+        every = np.clip(np.median(self.contrasts, axis=0).reshape(3, -1), -0.5, 4.0)
+        cells = every[:, None, :: -(-every.shape[1] // _FITTED)]
         paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
         partly = norm.cdf(cells, 0.0, _GROUND_SIGMA) - norm.cdf(cells, paint, sigma)
         bare = np.broadcast_to(norm.pdf(cells, 0.0, _GROUND_SIGMA), partly.shape)
-        densities = np.stack([norm.pdf(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint]) + 1e-6
+        by_side = np.stack([norm.pdf(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint])
+        densities, cells = by_side.mean(axis=1) + 1e-6, cells.mean(axis=0)
         weight = np.broadcast_to(np.array([0.6, 0.2, 0.2])[:, None, None], (3, len(paint), 1))
         for _ in range(_ROUNDS):
             joint = weight * densities
             member = joint / joint.sum(axis=0)
             weight = (member.sum(axis=2, keepdims=True) + np.array([1.0, 0.3, 0.3])[:, None, None]) / (
-                len(cells) + 1.6
+                cells.size + 1.6
             )
         share = (member[0] + member[2] * np.clip(cells / paint, 0.0, 1.0)).mean(axis=1)
         log_likelihood = np.log((weight * densities).sum(axis=0)).sum(axis=1)
-        return log_likelihood * min(1.0, _INDEPENDENT / len(cells)), share
+        doubt = 2 * (member[0] * member[1]).mean(axis=1)
+        of_images = np.median(np.mean(self.contrasts, axis=1), axis=(1, 2)) / _CONTRASTS[:, None]
+        apart = np.median(np.abs(of_images - np.median(of_images, axis=1, keepdims=True)), axis=1)
+        return log_likelihood * min(1.0, _INDEPENDENT / cells.size), share, np.hypot(doubt, apart)
 
 
 def with_wear(
@@ -100,17 +110,19 @@ def with_wear(
     map_from_vehicle: Sequence[FloatArray],
     calibrations: Mapping[str, Calibration],
     grey: Callable[[Image], NDArray[np.float32]],
+    shown: Set[tuple[int, int]],
     earlier: HdMap | None = None,
     threads: int = 1,
 ) -> HdMap:
     """``hd_map`` with the share of paint that each marking has left, where two images or more show it near.
 
-    ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W).
+    ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W),
+    ``shown`` are the pairs of an image's index and a marking's that nothing hides there.
     A marking that the ``earlier`` map has, by its id, states the change, and keeps what that says where this
     drive did not look.
     """
     cells = [Cells.of(one.corners_map) for one in hd_map.markings]
-    for number, light in _seen(cells, images, map_from_vehicle, calibrations, grey, threads):
+    for number, light in _seen(cells, images, map_from_vehicle, calibrations, grey, shown, threads):
         cells[number].add(light)
     known = [k for k, one in enumerate(cells) if len(one.contrasts) >= _VIEWS[0]]
     shares = _shares([cells[k].fit() for k in known], [hd_map.markings[k].kind for k in known])
@@ -123,13 +135,13 @@ def with_wear(
     return replace(hd_map, markings=tuple(markings))
 
 
-def _shares(fits: Sequence[tuple[FloatArray, FloatArray]], kinds: Sequence[str]) -> list[PaintLeft]:
+def _shares(fits: Sequence[tuple[FloatArray, ...]], kinds: Sequence[str]) -> list[PaintLeft]:
     """The shares, with the contrast of full paint of each class learned from all of its markings."""
     out: dict[int, PaintLeft] = {}
     log_contrasts = np.log(_CONTRASTS)
     for kind in set(kinds):
         mine = [k for k, one in enumerate(kinds) if one == kind]
-        likelihood, share = (np.stack([fits[k][part] for k in mine]) for part in (0, 1))
+        likelihood, share, own_sigma = (np.stack([fits[k][part] for k in mine]) for part in range(3))
         middle, spread = np.log(1.3), 0.5
         for _ in range(3):
             log_posterior = likelihood + norm.logpdf(log_contrasts, middle, spread)
@@ -140,7 +152,7 @@ def _shares(fits: Sequence[tuple[FloatArray, FloatArray]], kinds: Sequence[str])
             middle = (own.sum() + 4 * np.log(1.3)) / (len(mine) + 4)
             spread = float(np.sqrt((((own - middle) ** 2).sum() + 4 * 0.5**2) / (len(mine) + 4)))
         mean = (posterior * share).sum(axis=1)
-        variance = (posterior * (share - mean[:, None]) ** 2).sum(axis=1)
+        variance = (posterior * ((share - mean[:, None]) ** 2 + own_sigma**2)).sum(axis=1)
         floor, growth = _MODEL_SIGMA
         sigma = np.sqrt(variance + floor**2 + (growth * (1.0 - mean)) ** 2)
         out |= {k: PaintLeft(float(m), float(s)) for k, m, s in zip(mine, mean, sigma, strict=True)}
@@ -158,6 +170,7 @@ def _seen(
     map_from_vehicle: Sequence[FloatArray],
     calibrations: Mapping[str, Calibration],
     grey: Callable[[Image], NDArray[np.float32]],
+    shown: Set[tuple[int, int]],
     threads: int,
 ) -> Iterator[tuple[int, FloatArray]]:
     """(marking, light of its cells) in those of the images that show it whole from nearest."""
@@ -172,6 +185,8 @@ def _seen(
         px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
         size = np.array([own.info.width, own.info.height])
         for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
+            if (index, number) not in shown:
+                continue
             edge = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
             if ((edge @ px_from_map[2, :2] + px_from_map[2, 2]) <= 0.3).any():
                 continue

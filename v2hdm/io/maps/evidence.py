@@ -46,6 +46,13 @@ class Residuals:
     def __len__(self) -> int:
         return len(self.row_image)
 
+    def whole_views(self) -> set[tuple[str, int]]:
+        """The images, by path, that show all four corners of a marking of the map, and its id."""
+        known = self.is_point & (self.marking > 0)
+        pairs = np.column_stack([self.row_image, self.marking])[known]
+        views, corners = np.unique(pairs, axis=0, return_counts=True)
+        return {(self.image[image], marking) for image, marking in views[corners == 4].tolist()}
+
     def renamed(self, marking: IntArray, corner: IntArray) -> Residuals:
         """The same with other ids (M,) of markings 1 to M, 0 for none, and other corners (M, 4)."""
         known = self.marking > 0
