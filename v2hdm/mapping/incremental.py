@@ -25,7 +25,7 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 """Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""
@@ -37,9 +37,6 @@ _FIRST_LINK_MARKINGS = 12  # from so many the extrinsics are better than the IPM
 _LINK_GROWTH = 4
 """How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
 more than the last time alone."""
-
-_RECORD_GROWTH = 1.6
-"""How many times as large the map is whenever its markings are kept for the figure of its growth."""
 
 _LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
@@ -90,21 +87,7 @@ class IncrementalMapper:
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
         self._drive = drive_problem(sightings, rig, cameras, model)
-        self.growth: list[tuple[Marking, ...]] = []
-        self._record_at = 2
         self._begin(rig, 0)
-
-    def _record(self) -> None:
-        """Keep the whole markings of the map whenever it has grown by so much: how its error settles."""
-        if len(self._places) < max(self._record_at, self._known):
-            return
-        whole = (
-            Marking(self._sightings.kinds[place.kind], corners, len(place.images))
-            for number, place in enumerate(self._places)
-            if np.isfinite(corners := self._corners(number)).all()
-        )
-        self.growth.append(tuple(whole))
-        self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
     def run(self, progress: Callable[[str], None]) -> tuple[Association, Rig]:
         """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
@@ -168,7 +151,6 @@ class IncrementalMapper:
             marking, turn = self._same_as(track)
             if self._take(track, marking, turn):
                 number[own] = len(self._places) - 1 if marking is None else marking
-                self._record()
                 shift[own] = (shift[own] + turn) % 4
         return Association(number, shift, len(self._places)), True
 

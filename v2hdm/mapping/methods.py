@@ -290,7 +290,7 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
 def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) -> MethodResult:
     inputs = outcome.inputs
     options, drive, cameras, bundle = inputs.options, inputs.drive, inputs.cameras, optimised.bundle
-    solution, growth, noise = bundle.solution, inputs.optimiser.growth, drive.pose_noise
+    solution, noise = bundle.solution, drive.pose_noise
     if solution.status is not Status.CONVERGED:
         _log.warning(
             "the joint optimisation ended early (%s): %s", solution.status.value, solution.status.advice
@@ -325,7 +325,6 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         excluded=(*optimised.excluded, *no_symbols, *rejected),
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
-        growth=(*growth, optimised.markings) if growth else (),
         diagnostics={
             "observations": float(len(bundle.row)),
             "candidates": float(bundle.association.count),

@@ -141,7 +141,6 @@ class Optimiser:
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
-        self.growth: tuple[tuple[Marking, ...], ...] = ()
         self.camera_names = sightings.cameras
         start = initial_rig(self._cameras, sightings.map_from_vehicle)
         self.initial_rig = rolling(start, self._cameras.values(), sightings, options.estimate_read_out)
@@ -324,7 +323,6 @@ class Optimiser:
             coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
         association, rig = mapper.run(progress)
-        self.growth = tuple(mapper.growth)
         association = self._with_all_that_fit(association, rig)
         bundle = self._solve(association, self._usable(association, rig), rig)
         self._reweigh(bundle)

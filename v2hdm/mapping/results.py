@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.adjust import ScoreTest
 from v2hdm.io.maps.evidence import Residuals
-from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
+from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.markings import Suspicion
 
@@ -134,7 +134,6 @@ class MethodResult:
         calibrations: by camera, empty where the method only has an IPM.
         reprojection_rmse_px: over the accepted corner observations; None for methods that do not reproject.
         initial_reprojection_rmse_px: the same under the extrinsic that the optimisation started from.
-        growth: the maps after the first markings, in the incremental mode, the whole map last.
         diagnostics: named figures for the log and the report.
         certainty: by camera, a sentence on what the drive determined and what rests on the survey.
         evidence: for the checks after the solve.
@@ -153,7 +152,6 @@ class MethodResult:
     excluded: tuple[Exclusion, ...] = ()
     reprojection_rmse_px: float | None = None
     initial_reprojection_rmse_px: float | None = None
-    growth: tuple[tuple[Marking, ...], ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     certainty: Mapping[str, str] = field(default_factory=dict)
     evidence: SolveEvidence | None = None

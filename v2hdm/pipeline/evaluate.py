@@ -15,8 +15,8 @@ from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.recovery import Inputs
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Drive, HdMap, ImageDetections, Truth
-from v2hdm.report.metrics import driven_past, extrinsic_figures, growth_figures, headline, map_figures
+from v2hdm.records import Drive, ImageDetections, Truth
+from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_figures
 
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
 
@@ -63,7 +63,6 @@ def evaluate(
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
         metrics |= {"reference": reference, "disturbances": truth.disturbances}
-        metrics["growth"] = growth_of(list(methods.values())[-1], truth)
     headlines = [headline(name, by_method) for name, by_method in results.items()]
     if truth is not None and truth.disturbances:
         disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
@@ -90,22 +89,6 @@ def _own_figures(result: MethodResult) -> dict[str, Any]:
     if result.diagnostics:
         figures["diagnostics"] = dict(result.diagnostics)
     return figures
-
-
-def growth_of(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
-    """Corner RMSE (m) over the first n markings per method, in the incremental mode; else empty.
-
-    The naive methods keep a marking as it is once it has been passed, so their first n will do.
-    """
-    steps = methods["Opt"].growth
-    if not steps:
-        return {}
-    counts = [len(markings) for markings in steps]
-    growth = {"Opt": growth_figures([HdMap(markings) for markings in steps], truth)}
-    for name, result in methods.items():
-        if name != "Opt":
-            growth[name] = growth_figures([HdMap(result.hd_map.markings[:n]) for n in counts], truth)
-    return growth
 
 
 def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[str, Any]:

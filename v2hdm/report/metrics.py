@@ -265,13 +265,6 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
     return figures
 
 
-def growth_figures(maps: Sequence[HdMap], truth: Truth) -> list[tuple[int, float]]:
-    """Number of markings and corner RMSE (m) of each of a sequence of growing maps."""
-    nothing = np.zeros(len(truth.map.markings), dtype=bool)
-    found = [(len(m.markings), marking_metrics(m, truth, nothing).corner_rmse_m) for m in maps]
-    return [(count, rmse) for count, rmse in found if np.isfinite(rmse)]
-
-
 def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
     """The result of one camera set in one sentence."""
     best = results.get("Opt", {})
