@@ -13,14 +13,13 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from v2hdm.errors import MapFileError
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, ground_page, layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.tables import in_words
-from v2hdm.store.files import read_text, replace_text
+from v2hdm.store.files import replace_text
 
 
 def document(facts: Facts) -> SimpleNamespace:
@@ -147,7 +146,8 @@ def page_text(
 
 def _kept(path: Path, name: str) -> dict[str, Any]:
     """The data ``name`` of an earlier report, made while more of its sources were at hand."""
-    text = read_text(path, MapFileError) if path.is_file() else ""
+    # Not one of the inputs, which are never written over: the new report takes its place.
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     kept = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
     try:
         return dict(json.loads(kept[1])) if kept else {}
