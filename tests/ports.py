@@ -21,7 +21,7 @@ TINY_ROUTE = [[12.0, 0.0], [12.0, 55.0], [4.0, 0.0]]
 
 def short_port() -> PortConfig:
     """A straight and a bend of the default port, fewer obstacles, another vehicle's IPM to start from."""
-    route = RouteConfig(pieces=ROUTE, image_spacing_m=1.0)
+    route = RouteConfig(pieces=ROUTE, image_spacing_m=1.5)
     yard = YardConfig(parked_trucks=1, barriers=2, lamp_posts=2, moving_trucks=1, shadow_strips=2)
     return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route, yard=yard)
 
