@@ -1,4 +1,4 @@
-"""What is released: the wheel, the source archive, and the files of those who package and test it."""
+"""The wheel, the source archive, and the files of those who package and test a release."""
 
 import os
 import re

@@ -279,7 +279,7 @@ def _checks(facts: Facts) -> list[dict[str, Any]]:
 
 
 def _changes(facts: Facts) -> list[dict[str, Any]]:
-    """What is no longer as in the map that this one was built on, as ``metrics.json`` lists it."""
+    """The differences from the map that this one was built on, as ``metrics.json`` lists them."""
     return [
         {name: one[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
         | {"k": one["class"], "n": one["found"], "p": one["after_map"] or one["before_map"]}
