@@ -76,7 +76,7 @@ def test_the_source_archive_can_be_tested_and_holds_nothing_of_this_machine(rele
 
 
 def test_the_conda_recipe_asks_for_what_the_wheel_does():
-    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
+    recipe = yaml.safe_load((ROOT / ".ci" / "conda-recipe.yaml").read_text())
     assert str(recipe["context"]["version"]) == __version__
     assert recipe["about"]["license"] == PROJECT["license"]
     assert recipe["about"]["license_file"] == PROJECT["license-files"]

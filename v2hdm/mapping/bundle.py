@@ -236,7 +236,7 @@ def solve_bundle(
 def _observations(
     sightings: Sightings, at: tuple[IntArray, IntArray], on_line: BoolArray, corner: IntArray, model: Model
 ) -> Observations:
-    """Observations of the problem's ``corner`` (K,) by the sightings' own corners ``at`` (row, corner; K each)."""
+    """Observations of ``corner`` (K,) by corners ``at`` (row, corner; K each) of the sightings."""
     covariance_px, ends = sightings.covariance_px[at], on_line[at]
     covariance_px[ends] = line_only(covariance_px[ends], _OPEN_END_PX)
     return Observations(

@@ -4,8 +4,8 @@ An image is decoded to linear light, in which a pixel half on paint and half on 
 divided by the ground beside the marking, so that neither exposure nor light matters. A cell may be lit as the
 ground of either side: the edge of a shadow often lies across a marking. Only images that show all corners of
 a marking count, and each cell takes their median. The cells are then explained as a mixture of full paint,
-bare ground and cells part of each; how bright full paint is over its ground is the marking's own, with a prior
-from all markings of its class: dirt dims paint that is whole.
+bare ground and cells part of each; how bright full paint is over its ground is the marking's own, with a
+prior from all markings of its class: dirt dims paint that is whole.
 """
 
 from __future__ import annotations
