@@ -287,6 +287,23 @@ def test_near_and_far_corners_are_found_to_a_tenth_of_a_pixel_and_say_so(lens):
     assert 0.05 < np.median(squares) < 3.0
 
 
+@pytest.mark.parametrize(("x", "y", "yaw"), [(8.0, -1.0, 30.0), (20.0, 2.0, 85.0), (26.0, -4.0, 30.0)])
+def test_a_marking_is_fitted_alike_whatever_else_the_image_shows(x, y, yaw):
+    """The bands about a slim dash's sides go on beyond its sharp corners; the larger markings' boxes too."""
+    camera = make_camera()
+    view = RoadCamera(camera, 16)
+    shapes = [bar(x, y, 3.0, 0.15, yaw), diamond(6.0, 1.0, 1.2, 0.7, 20.0), bar(8.0, -1.5, 4.0, 0.3)]
+    image = picture(camera, shapes)
+    start = np.stack([order_corners(to_image(camera, shape)) for shape in shapes]) + 0.7
+    output = patches_about(image, view, start).output
+
+    def corners_px(count):
+        patches = patches_of(image, view, output, start[:count])
+        return fit_quadrilaterals(patches, view, start[:count], open_sides(start[:count], view)).corners_px
+
+    np.testing.assert_allclose(corners_px(3)[0], corners_px(1)[0], atol=0.005)
+
+
 @pytest.mark.parametrize("paint", [1.2, 1.6])
 def test_paint_brighter_than_the_sensor_can_say_is_not_drawn_larger(paint):
     """Where the paint is clipped, the visible edge lies outside the true one, by .3 px and more here."""

@@ -146,7 +146,8 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     columns, rows = _columns_and_rows(in_box, size)
     across, down = columns.shape[1], rows.shape[1]
     band = _in_band(in_box, bow_px, columns, rows)
-    band[..., -1] = band[:, -1] = False
+    # Beyond its own box a sharp corner's band goes on, as far as the largest marking of the image lets it.
+    band &= (rows < size[:, 1:])[:, :, None] & (columns < size[:, :1])[:, None]
     cell = np.flatnonzero(band)
     marking, within = np.divmod(cell, across * down)
     i, j = np.divmod(within, across)
