@@ -77,8 +77,9 @@ class Counts:
     """How often G candidates were seen, each (G,).
 
     ``images`` with accepted observations; ``observations`` of corners, and how many are ``agreeing`` with the
-    solution; ``easy_views``, images with the whole candidate in easy view, and those where it was ``found``;
-    ``as_symbol``, images in which a symbol lies on it.
+    solution; ``easy_views``, images with the whole candidate in easy view, those where it was ``found``, and
+    of these the ones in which each corner is a point, ``pointed`` (G, 4); ``as_symbol``, images in which a
+    symbol lies on it.
     """
 
     images: IntArray
@@ -86,6 +87,7 @@ class Counts:
     agreeing: IntArray
     easy_views: IntArray
     found: IntArray
+    pointed: IntArray
     as_symbol: IntArray
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:

@@ -144,7 +144,8 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     weight, probability = np.asarray(taken, dtype=np.float64), np.zeros((len(candidates), _KINDS))
     for _ in range(_PASSES):
         shapes = learn_shapes(candidates.subset(weight > 0.5))
-        hypotheses = _hypotheses(candidates, shapes, share, paint, weight, probability[:, OTHER_LENGTH])
+        of_drive = share, paint, weight, probability[:, OTHER_LENGTH], _vague_evidence(counts, weight)
+        hypotheses = _hypotheses(candidates, shapes, *of_drive)
         by_kind, sources = np.array([one.kind for one in hypotheses]), _counted(counts, weight)
         shaped = np.stack([one.log_likelihood for one in hypotheses])
         joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
@@ -283,11 +284,12 @@ def _hypotheses(
     paint: PaintError,
     weight: FloatArray,
     other_length: FloatArray,
+    vague: FloatArray,
 ) -> list[_Hypothesis]:
     """All that N candidates may be, given the shapes of their class.
 
     ``weight`` and ``other_length`` (N,) are the probabilities so far of being a marking, and one of another
-    length.
+    length; ``vague`` (N, 4) is the log likelihood ratio of views that do not agree on a corner's place.
     """
     out: list[_Hypothesis] = []
     nothing = np.zeros((8, 8))
@@ -319,6 +321,10 @@ def _hypotheses(
         worn = [np.zeros(len(candidates))] * len(ends)
         if shape.is_elongated:
             worn = _worn_evidence(candidates, [end for end, _ in ends], weight)
+            worn = [
+                ragged + np.sum(end.reshape(-1, 4, 2).any(axis=2) * vague, axis=1) / 2
+                for ragged, (end, _) in zip(worn, ends, strict=True)
+            ]
             # Of what is no marking any end is as likely ragged as not.
             anything = np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0)
             shorter = (ends[0][0] + ends[1][0]) / 2
@@ -375,6 +381,19 @@ def _worn_evidence(
     odds = worn + _CLEAR_SHARE * (sound - worn)
     odds /= sound + _UNCLEAR_SHARE * (worn - sound)
     return list(np.where(whole, np.log(odds), 0.0))
+
+
+def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
+    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views without an agreed place of it.
+
+    They are as few of a sound one as they are of all corners of markings; of every second worn or hidden
+    one they are as likely any share.
+    """
+    found = np.maximum(counts.found[:, None], counts.pointed)
+    vague = found - counts.pointed
+    rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
+    sound = _rates(vague, found, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
+    return np.asarray(np.logaddexp(_rates(vague, found, 1.0, 1.0) - sound, 0.0) - np.log(2))
 
 
 def _other_lengths(
