@@ -169,7 +169,7 @@ def test_a_length_that_several_dashes_have_is_no_wear():
 
 
 def test_two_ends_that_most_views_know_to_be_hidden_are_no_other_length():
-    """Both dashes are as short, as behind boxes of one size; where no view knew it, that would be a length."""
+    """Both are as short, as behind boxes of one size; were it not for the views, that would be a length."""
     true, candidates = row(7, [DASH] * 50, 0.005)
     counts = well_seen(50)
     for place in (10, 20):

@@ -384,10 +384,10 @@ def _worn_evidence(
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views without an agreed place of it.
+    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that do not agree on its place.
 
-    They are as few of a sound one as they are of all corners of markings; of every second worn or hidden
-    one they are as likely any share.
+    They are as few for a sound one as for all corners of markings; for every second worn or hidden one any
+    share of them is as likely.
     """
     found = np.maximum(counts.found[:, None], counts.pointed)
     vague = found - counts.pointed
