@@ -141,7 +141,7 @@ def observer():
     made = {k: image(route[k], rng) for k in range(len(route))}
     frames, none = np.arange(len(route)), np.zeros(0, dtype=np.int64)
     seen = none, none, none, none, np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros((0, 4), dtype=bool)
-    rest = ("diamond",), np.zeros_like(frames), np.zeros((0, 4))
+    rest = ("diamond",), np.zeros_like(frames), np.zeros((0, 4)), np.zeros(0)
     sightings = Sightings(("front",), 0.1 * frames, route, *seen, *rest)
     views, rig = Views(frames, np.zeros_like(frames), frames), Rig(INTRINSIC[None], MOUNT[None], route)
     return Observer(sightings, views, (CAMERA,), rig, 0.0, made.__getitem__)

@@ -52,7 +52,9 @@ def row(seed, shapes, sigma_m=0.01):
 def well_seen(count):
     """Each place in ten images, in all of its easy views, and never as part of a symbol."""
     ten = np.full(count, 10)
-    return Counts(ten, 4 * ten, 4 * ten, ten - 2, ten - 2, np.full((count, 4), 8), 0 * ten)
+    return Counts(
+        ten, 4 * ten, 4 * ten, np.full(count, 7.0), ten - 2, ten - 2, np.full((count, 4), 8), 0 * ten
+    )
 
 
 def of_one_class(candidates, counts=None):
@@ -292,7 +294,7 @@ def test_reasons_name_what_has_won():
     classified = verdict(without(candidates, 5, [0, 1, 2]), counts)
     reasons = {place: reason for place, reason in enumerate(classified.verdict) if reason is not None}
     assert set(reasons) == {3, 5, 7}
-    assert reasons[3] == "part of a symbol, such as an arrow"
+    assert reasons[3] == "part of other paint, such as an arrow or a letter"
     assert reasons[5] == "a corner was never seen twice"
     assert reasons[7] in ("found in too few of its images", "not shaped like a marking of its class")
     assert len(classified.markings()) == 37
@@ -408,3 +410,19 @@ def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen():
     unseen = np.full((1, 4, 2), np.nan)
     found = Candidates.seen(unseen, np.full((1, 8, 8), np.nan), np.array([[30.0, 4.0]]))
     np.testing.assert_array_equal(found.corners_map, np.broadcast_to([30.0, 4.0], (1, 4, 2)))
+
+
+def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_worn_marking_is_none():
+    true, candidates = row(22, [DIAMOND] * 60)
+    candidates.corners_map[7] += 0.6 * (true[7] - true[7].mean(axis=0))
+    counts = well_seen(60)
+    counts.log_odds[:] += np.random.default_rng(22).normal(0.0, 1.0, 60)
+    counts.log_odds[[7, 8]] = 1.8
+    for never_easy in (counts.easy_views, counts.found, counts.pointed):
+        never_easy[7:9] = 0
+    assert verdict(candidates, counts).verdict[7:9] == [
+        "part of other paint, such as an arrow or a letter",
+        None,
+    ]
+    counts.log_odds[7] = 7.0
+    assert verdict(candidates, counts).verdict[7] is None

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logit
 
 from v2hdm.errors import MappingError
 from v2hdm.geometry.lens import has_distortion, undistort_points
@@ -103,7 +104,8 @@ class Sightings:
     images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
     says which of them are points, small in every direction. ``row_share`` (S, 4) is when in the read-out
-    their rows were taken (:func:`row_shares`). ``symbols`` are those of the same images.
+    their rows were taken (:func:`row_shares`); ``log_odds`` (S,) of being markings are the detector's.
+    ``symbols`` are those of the same images.
     ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
     """
 
@@ -120,6 +122,7 @@ class Sightings:
     kinds: tuple[str, ...]
     visit: IntArray
     row_share: FloatArray
+    log_odds: FloatArray
     symbols: Symbols = NO_SYMBOLS
 
     def __len__(self) -> int:
@@ -134,7 +137,7 @@ class Sightings:
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
         of_rows = ["image", "camera", "frame", "kind"]
-        of_rows += ["corners_pinhole_px", "covariance_px", "valid", "row_share"]
+        of_rows += ["corners_pinhole_px", "covariance_px", "valid", "row_share", "log_odds"]
         return replace(self, **{name: getattr(self, name)[rows] for name in of_rows})
 
 
@@ -210,6 +213,7 @@ def collect_sightings(
         kinds=kinds,
         visit=frames.visit,
         row_share=row_share,
+        log_odds=logit(np.clip([marking.score for _, marking in rows], 1e-4, 1 - 1e-4)),
         symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)

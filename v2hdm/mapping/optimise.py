@@ -261,6 +261,7 @@ class Optimiser:
         count = len(corners_map)
         group, image = bundle.group[accepted], self.sightings.image[bundle.row[accepted]]
         shown = np.unique(np.stack([group, image]), axis=1)
+        odds = np.bincount(group, self.sightings.log_odds[bundle.row[accepted]], minlength=count)
         easy = np.stack(easy_views(self._views, rig, list(self._cameras.values()), corners_map))
         place, number = (pairs[0] * (1 << 32) + pairs[1] for pairs in (shown, easy))
         found = np.isin(number, place)
@@ -271,6 +272,7 @@ class Optimiser:
             images=np.bincount(shown[0], minlength=count),
             observations=np.bincount(bundle.group, minlength=count),
             agreeing=np.bincount(group, minlength=count),
+            log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
             easy_views=np.bincount(easy[0], minlength=count),
             found=np.bincount(easy[0, found], minlength=count),
             pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),

@@ -76,15 +76,16 @@ class Candidates:
 class Counts:
     """How often G candidates were seen, each (G,).
 
-    ``images`` with accepted observations; ``observations`` of corners, and how many are ``agreeing`` with the
-    solution; ``easy_views``, images with the whole candidate in easy view, those where it was ``found``, and
-    of these the ones in which each corner is a point, ``pointed`` (G, 4); ``as_symbol``, images in which a
-    symbol lies on it.
+    ``images`` with accepted observations; ``observations`` of corners, how many are ``agreeing`` with the
+    solution, and the mean of the detector's ``log_odds`` of these; ``easy_views``, images with the whole
+    candidate in easy view, those where it was ``found``, and of these the ones in which each corner is a
+    point that agrees, ``pointed`` (G, 4); ``as_symbol``, images in which a symbol lies on it.
     """
 
     images: IntArray
     observations: IntArray
     agreeing: IntArray
+    log_odds: FloatArray
     easy_views: IntArray
     found: IntArray
     pointed: IntArray

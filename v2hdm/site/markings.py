@@ -21,7 +21,7 @@ from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CLUTTER, CORNERS_OF_IMAGE, PART_OF_SYMBOL, Posterior, posterior
 
-OF_SYMBOL = "part of a symbol, such as an arrow"
+OF_SYMBOL = "part of other paint, such as an arrow or a letter"
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 COVERED = "lies on a better supported marking"
@@ -30,6 +30,7 @@ _CLUTTER_BY = (
     "seen in too few images",
     "found in too few of its images",
     "its sightings contradict each other",
+    "does not look like its class",
 )
 """Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
 

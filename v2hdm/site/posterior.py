@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.special import betaln, logsumexp
-from scipy.stats import f, norm
+from scipy.stats import f, norm, t
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
@@ -88,7 +88,17 @@ CORNERS_OF_IMAGE = 4.0
 """Observations that err together: those of one image."""
 
 _UNDER_SYMBOL = (0.02, 0.5)
-"""Share of the images of a marking, and of part of a symbol, in which a symbol lies on it."""
+"""Share of the images of a marking, and of part of a symbol, in which a symbol lies on it.
+
+Every second part of other paint is of a letter or a drawing that no class has, and counts as a marking here.
+"""
+
+_ODDS, _ODDS_COUNT, _ODDS_FREEDOM = (6.0, 1.2), (1.0, 4.0), 4.0
+"""The detector's mean log odds of a marking: mean and scale before the drive says, how many markings these
+are worth, and degrees of freedom of Student's t distribution, since worn ones are among them."""
+
+_OTHER_ODDS = (1.5, 1.5)
+"""Mean and sigma of the same of anything else (fourteen candidates of a rendered port)."""
 
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
@@ -109,9 +119,9 @@ class Posterior:
     """The posterior of G candidates.
 
     ``probability`` (G, 8) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
-    of a marking. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
-    images show it, how many of its easy views, and how well they agree. ``misfit`` (G,) is the p-value of its
-    deviation from its class's nearest shape, 1 where the class has none.
+    of a marking. ``evidence`` (G, 5) speaks for a marking and against clutter, in nats: the shape, how many
+    images show it, how many of its easy views, how well they agree, and how it looks to the detector.
+    ``misfit`` (G,) is the p-value of its deviation from its class's nearest shape, 1 if the class has none.
     """
 
     probability: FloatArray
@@ -124,7 +134,7 @@ class Posterior:
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
     """The posterior of G candidates of classes ``kind`` (G,), given where and how often they were seen."""
     total = len(candidates)
-    probability, evidence = np.zeros((total, _KINDS)), np.zeros((total, 4))
+    probability, evidence = np.zeros((total, _KINDS)), np.zeros((total, 5))
     log_odds, misfit = np.zeros(total), np.ones(total)
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     for one in np.unique(kind):
@@ -167,7 +177,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
 
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihoods (3, N, 3) of images, easy views, the rest; of each for marking, symbol and clutter."""
+    """Log likelihoods (4, N, 3) of images, easy views, the rest, looks; for marking, other paint, clutter."""
     images = np.maximum(counts.images, 1)
     stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
     shown = np.stack([_geometric(images, stay), *2 * [_geometric(images, _CLUTTER_REPEATS)]], axis=1)
@@ -179,8 +189,24 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
     under, alone = counts.as_symbol, counts.images
     plain, covered = (under[:, None] * np.log(p) + alone[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL)
+    covered = np.logaddexp(covered, plain) - np.log(2)
     rest = np.hstack([right, right, wrong]) / CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
-    return np.stack([shown, found, rest])
+    there = counts.images > 0
+    alike = _log_like_class(counts.log_odds, weight * there)
+    unlike = norm.logpdf(counts.log_odds, *_OTHER_ODDS)
+    # The shaft of an arrow looks like a dash, most else like nothing that the detector knows.
+    either = np.logaddexp(alike, unlike) - np.log(2)
+    looks = np.stack([alike, either, unlike], axis=1) * there[:, None]
+    return np.stack([shown, found, rest, looks])
+
+
+def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
+    """Log likelihood (N,) of a marking's mean log ``odds`` (N,), by those of markings (``weight``)."""
+    (mean, scale), (strength, freedom), total = _ODDS, _ODDS_COUNT, weight.sum()
+    mean = (strength * mean + weight @ odds) / (strength + total)
+    spread = weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM)
+    scale = np.sqrt((freedom * scale**2 + spread) / (freedom + total))
+    return np.asarray(t.logpdf(odds, _ODDS_FREEDOM, mean, scale))
 
 
 def _geometric(images: IntArray, stay: float) -> FloatArray:
@@ -384,7 +410,7 @@ def _worn_evidence(
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that do not agree on its place.
+    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on its place.
 
     They are as few for a sound one as for all corners of markings; for every second worn or hidden one any
     share of them is as likely.
