@@ -384,7 +384,7 @@ def _worn_evidence(
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that do not agree on its place.
+    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on its place.
 
     They are as few for a sound one as for all corners of markings; for every second worn or hidden one any
     share of them is as likely.
