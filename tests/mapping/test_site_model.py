@@ -324,13 +324,17 @@ def test_a_place_less_certain_than_allowed_is_left_out():
     assert verdict(candidates).verdict[3] == "its position is too uncertain"
 
 
+def piece_of(corners):
+    """What a barrier on two adjacent sides leaves to be seen: .7 of one extent and .5 of the other."""
+    u, v = corners[1] - corners[0], corners[3] - corners[0]
+    return corners[0] + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
+
+
 def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diamond():
     rng = np.random.default_rng(16)
     true = painted([DIAMOND] * 40, rng)
     candidates = solved(true, rng)
-    # A barrier stands on two adjacent sides: .7 of one extent and .5 of the other are left to be seen.
-    kept, u, v = true[7, 0].copy(), true[7, 1] - true[7, 0], true[7, 3] - true[7, 0]
-    candidates.corners_map[7] = kept + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
+    candidates.corners_map[7] = piece_of(true[7])
     found = of_one_class(candidates)
     assert found.probability[7, PIECE] > 0.8
     assert normalised(found, true)[7] < 20
@@ -348,8 +352,7 @@ def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size():
     rng = np.random.default_rng(18)
     true = painted([DIAMOND] * 5, rng)
     candidates = solved(true, rng)
-    kept, u, v = true[2, 0].copy(), true[2, 1] - true[2, 0], true[2, 3] - true[2, 0]
-    candidates.corners_map[2] = kept + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
+    candidates.corners_map[2] = piece_of(true[2])
     found = of_one_class(candidates)
     assert (normalised(found, true) < 25).all()
     assert (found.probability[[0, 1, 3, 4], OF_CLASS] > 0.8).all()

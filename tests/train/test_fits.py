@@ -330,21 +330,25 @@ def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, r
 
 
 @pytest.mark.slow
-def test_without_another_folder_the_detectors_own_files_and_the_float32_file_are_replaced(
+def test_a_float32_file_replaces_the_detectors_own_files_as_a_checkpoint_does(
     into, run, quick, monkeypatch, tmp_path
 ):
+    checkpoint = load_checkpoint(run / "best.pt")
+    export_checkpoint(checkpoint, tmp_path / "net.onnx", 18, 1e-3)
     monkeypatch.setattr(weights, "FOLDER", into)
     monkeypatch.setattr(shipment, "_FLOAT_FILE", tmp_path / "models" / "marking_net.onnx")
-    shipped(Order(source=run, precision="float32"))
+    shipped(Order(source=tmp_path / "net.onnx", precision="float32"))
     weights.check_weights(into)
+    assert read_exported(into / "default.onnx").label["steps"] == checkpoint.step
     assert read_exported(tmp_path / "models" / "marking_net.onnx").label["precision"] == "float32"
     assert not (into / "marking_net.onnx").exists()
 
 
-def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
-    into, run, quick, monkeypatch
-):
-    order = Order(source=run, into=into, precision="float32", judge_images=100, lane_images=100)
+def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(into, quick, monkeypatch):
+    network = onnx.load(weights.NETWORK_FILE)
+    network.doc_string = "other bytes"
+    onnx.save(network, "other.onnx")
+    order = Order(source=Path("other.onnx"), into=into, judge_images=100, lane_images=100)
     before = digests(into)
 
     def killed(*_):
@@ -360,7 +364,8 @@ def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
     (left / "2.npz").unlink()
     shipped(order)
     assert quick[4:] == [range(50, 75)], "only what was not done yet"
-    assert digests(into)["judge.onnx"] != before["judge.onnx"]
+    after = digests(into)
+    assert all(after[name] != before[name] for name in ("default.onnx", "judge.onnx"))
 
 
 def test_another_network_or_other_numbers_begin_anew(into, run):
@@ -381,14 +386,6 @@ def test_judge_and_lane_score_can_be_kept_for_a_network_that_was_exported_before
     shipped(Order(source=network, into=into, keep=("judge", "lane_score")))
     assert weights.read_manifest(into)["files"]["judge.onnx"]["command"].endswith("--keep judge lane_score")
     assert digests(into)["judge.onnx"] == after["judge.onnx"]
-
-
-@pytest.mark.slow
-def test_a_float32_file_is_exported_as_a_checkpoint_is(into, run, quick, tmp_path):
-    checkpoint = load_checkpoint(run / "best.pt")
-    export_checkpoint(checkpoint, tmp_path / "net.onnx", 18, 1e-3)
-    shipped(Order(source=tmp_path / "net.onnx", into=into, precision="float32"))
-    assert read_exported(into / "default.onnx").label["steps"] == checkpoint.step
 
 
 @pytest.mark.parametrize(
