@@ -79,6 +79,25 @@ def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
     assert "120 cm behind" in found["survey"].says
 
 
+@pytest.mark.parametrize(
+    ("fault", "value", "of", "status"),
+    [
+        (Fault.CLOCK_DRIFT, 0.017, ("front", "rear"), Status.FAIL),
+        (Fault.CLOCK_DRIFT, 0.007, ("front", "rear"), Status.WARN),
+        (Fault.CLOCK_DRIFT, 0.017, ("rear",), Status.WARN),
+        (Fault.FOCAL, 0.017, ("front", "rear"), Status.WARN),
+    ],
+)
+def test_a_clock_is_corrected_only_if_no_drift_of_it_is_likelier_than_none(drive, fault, value, of, status):
+    mended = ("front",) if of == ("rear",) else of
+    clock = contradiction(Fault.CLOCK, mended, 0, "", 0.02, 0.002, 10.0)
+    left = contradiction(fault, of, 0, "", value, 0.006, 2.7)
+    alone = raised(result(replace(FINE, score_tests=(left,))), drive)
+    found = raised(result(replace(FINE, score_tests=(left,), corrected=(clock,))), drive)
+    assert not alone, "as likely as chance in a drive whose clock is right"
+    assert max((one.status for one in found.values()), key=lambda one: one.rank) is status
+
+
 def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive):
     focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
     late = replace(CLOCK, value=0.2, p_value=1e-80)

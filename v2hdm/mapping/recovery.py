@@ -337,14 +337,18 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
 
 def is_contradicted(one: ScoreTest) -> bool:
     """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
-    size, surely = _SIZES[one.fault], _CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS
-    return one.model_sigma <= size.sigma and one.sigmas > surely and abs(one.value) > size.least
+    return matters(one) and one.sigmas > (_CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS)
 
 
 def is_likely(one: ScoreTest) -> bool:
     """Whether an input is likelier off than right by more than matters, if not surely."""
+    return matters(one) and log_odds(one) > _LIKELY
+
+
+def matters(one: ScoreTest) -> bool:
+    """Whether an input is off by more than a drive can bear, as far as this one observes it."""
     size = _SIZES[one.fault]
-    return one.model_sigma <= size.sigma and abs(one.value) > size.least and log_odds(one) > _LIKELY
+    return one.model_sigma <= size.sigma and abs(one.value) > size.least
 
 
 def is_physical(one: ScoreTest) -> bool:

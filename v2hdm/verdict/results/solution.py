@@ -25,6 +25,7 @@ from v2hdm.mapping.recovery import (
     is_likely,
     is_physical,
     log_odds,
+    matters,
 )
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
@@ -103,6 +104,9 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
 # How an input was corrected, where it was not just left out.
 _CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no known size was used"}
 
+# Faults that a constant clock offset may stand for.
+_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)
+
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 # What units are shown as, and by what values are multiplied for it.
@@ -170,6 +174,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     findings = [_corrected(one) for one in evidence.corrected]
     raised = {finding.check for finding in findings}
     still = [one for one in evidence.score_tests if is_contradicted(one)]
+    still = still or [one for one in evidence.score_tests if _is_left(one, evidence.corrected)][:1]
     foreign = _foreign(evidence)
     causes = {foreign: evidence.foreign[2], _stamps(evidence): _jitter_odds(evidence)}
     if still:
@@ -210,6 +215,16 @@ def _corrected(one: Contradiction) -> Finding:
     done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
     says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
     return _input(one, Status.WARN, says)
+
+
+def _is_left(one: Contradiction, corrected: Sequence[Contradiction]) -> bool:
+    """Whether the correction of a clock leaves a drift, or a heading, that is likelier than none.
+
+    A clock that is off drifts as often as not, and may be what a wrong heading looks like: once it is known
+    to be off, the odds are even that one of these is the cause, where they are a thousandth otherwise.
+    """
+    off = {camera for each in corrected if each.fault is Fault.CLOCK for camera in each.cameras}
+    return one.fault in _LIKE_CLOCK and off >= set(one.cameras) and matters(one) and log_odds(one) > 0
 
 
 def _unknown(one: Contradiction) -> Finding:
