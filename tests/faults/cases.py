@@ -7,6 +7,8 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import fields as fields_of
+from dataclasses import is_dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from tests.faults.judge import Case, Prepare
 from tests.faults.owners import geopackages, owners
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.pipeline.config import PortConfig, RunConfig
 from v2hdm.records import Calibration
 
 CHECK = "v2hdm check"
@@ -668,6 +671,35 @@ EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kin
 }
 
 
+def measures(options: object, below: str = "") -> Iterator[str]:
+    """The keys of all settings that are numbers with a fraction, also of those that are added later."""
+    for one in fields_of(options):
+        value = getattr(options, one.name)
+        if is_dataclass(value):
+            yield from measures(value, f"{below}{one.name}.")
+        elif isinstance(value, float):
+            yield below + one.name
+
+
+SIMULATED_PARTS = ("calibration", "disturbance", "route")
+SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "roi_near_m", "roi_far_m")
+
+
+def numbers() -> Iterator[Case]:
+    """No measure is NaN, and none but an angle or a time is negative."""
+    for options, below, run in (
+        (RunConfig(), "", ("drive.path=drive",)),
+        (PortConfig(), "simulate.", ("+run=port2",)),
+    ):
+        for key in measures(options, below):
+            if key.startswith("simulate.") and key.split(".")[1] not in SIMULATED_PARTS:
+                continue
+            last = key.rpartition(".")[2]
+            for value in ("nan",) if last in SIGNED else ("nan", "-1e-3"):
+                words = (*run, "workers=1", f"{key}={value}")
+                yield Case(f"number: {key}={value}", "v2hdm map", words, drive(), last)
+
+
 def settings() -> Iterator[Case]:
     """Settings of the doors that Hydra configures."""
     for line, says in SETTINGS.items():
@@ -708,5 +740,5 @@ def _run_file(data: bytes) -> Prepare:
 
 def all_cases() -> list[Case]:
     """The table."""
-    parts = (texts, points, names, images, fields, outputs, owners, geopackages, arguments, settings)
+    parts = (texts, points, names, images, fields, outputs, owners, geopackages, arguments, settings, numbers)
     return [case for part in parts for case in part()]

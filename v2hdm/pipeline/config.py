@@ -144,6 +144,7 @@ _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
         "simulate.disturbance.",
         "roll_pitch_deg heave_m rtk_white_m rtk_correlated_m heading_deg",
     ),
+    (NOT_NEGATIVE, "simulate.calibration.", "survey_sigma_m click_sigma_px centre_sigma_m"),
     (POSITIVE, "simulate.disturbance.", "jitter_correlation_s rtk_correlation_m heading_correlation_s"),
     (SHARE, "simulate.surface.", "albedo wet_fraction"),
     (Within(0, 1e5), "simulate.surface.", "patches oil_stains"),
