@@ -40,7 +40,7 @@ from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import GROUNDS, PLANE, MappingOptions
+from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
 from v2hdm.pipeline.camera_sets import BEST, camera_sets
 from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
@@ -118,7 +118,7 @@ class Job:
     control: bool = False
     read_out_s: float = 0.0
     estimate: bool = False
-    ground: str = PLANE
+    ground: str = AUTO
 
     @property
     def recipe(self) -> Recipe:
@@ -405,7 +405,7 @@ def main() -> None:
     )
     parser.add_argument("--read-out", type=float, default=0.0, help="of rolling shutters, s")
     parser.add_argument("--estimate", action="store_true", help="do not state it, estimate it")
-    parser.add_argument("--ground", choices=GROUNDS, default=PLANE, help="as mapping.ground")
+    parser.add_argument("--ground", choices=GROUNDS, default=AUTO, help="as mapping.ground")
     parser.add_argument("--verbose", action="store_true", help="print all findings")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/right_drives.json"))

@@ -337,7 +337,10 @@ class Surface:
 
         def cost(sizes: FloatArray) -> float:
             prior = self._smoothness(sizes)
-            lower, own = (cholesky(one, lower=True) for one in (whole + prior, prior))
+            try:
+                lower, own = (cholesky(one, lower=True) for one in (whole + prior, prior))
+            except np.linalg.LinAlgError:  # so even that rounding leaves nothing of the ridge
+                return np.inf
             fit = solve_triangular(lower, towards, lower=True)
             odds = np.log(own.diagonal()).sum() - np.log(lower.diagonal()).sum() + fit @ fit / 2
             return float(np.sum((sizes - usual) ** 2) / (2 * _SIZES**2) - odds)

@@ -139,7 +139,7 @@ class MappingOptions:
     mode: str = BATCH
     pose_model: str = AUTO
     estimate_read_out: bool = False
-    ground: str = PLANE
+    ground: str = AUTO
     loss: str = "cauchy"
     loss_scale: float = 2.0
     rounds: int = 2

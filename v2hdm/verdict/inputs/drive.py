@@ -134,7 +134,7 @@ def check_road(drive: Drive) -> Iterator[Finding]:
         fine="the ground is plane as far as the cameras look",
         wrong=f"{worst.station_m:.0f} m along the route, at x {x:.0f} m, y {y:.0f} m, the ground bends "
         f"by {worst.value_m:.2f} m over {worst.distance_m:.0f} m (a ramp, a crest or a banked curve): "
-        "markings there are off; set mapping.ground=auto, leave that stretch out, or end roi_vehicle nearer",
+        "a plane misplaces markings there; leave mapping.ground at auto, or end roi_vehicle nearer",
         status=Status.FAIL if lean_rad > _ROAD_BENT * sigma_rad else Status.WARN,
     )  # fmt: skip
 

@@ -70,7 +70,7 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
         "clock drift", "give images the times at which they were taken, on the clock of the receiver",
     ),
     Fault.CROWN: (
-        "crown", "set mapping.ground=auto, or map the sides of the road's crown by themselves",
+        "crown", "leave mapping.ground at auto, or map the sides of the road's crown by themselves",
     ),
     Fault.COURSE: ("heading", "record the heading of the vehicle, as two antennas or an INS measure it"),
     Fault.STEP: ("position step", "check the receiver's log there, and leave out what has no RTK fix"),
