@@ -38,10 +38,10 @@ def detect_in_pieces(
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order, where that is not known yet.
 
-    The viewer is shown first all that is known, then image by image; ``detect`` takes the place of processes
-    of this machine. Raises V2hdmError as :func:`v2hdm.detection.batch.detect_all`.
+    ``detect`` takes the place of processes of this machine. Raises V2hdmError as
+    :func:`v2hdm.detection.batch.detect_all`.
     """
-    cache, progress, show = context.cache, context.steps("detect"), context.viewer.detected
+    cache, progress = context.cache, context.steps("detect")
     detector_key = cache.key(options, model_key(options))
     masks = cache.get_or_make(
         "own_vehicle",
@@ -59,14 +59,12 @@ def detect_in_pieces(
     if len(todo) < total:
         _log.info("detections in %d of %d images were kept by an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
-    show(_together(pieces))
     begun: _Piece = []
     done = 0
 
     def take(found: ImageDetections) -> None:
         nonlocal done
         done += 1
-        show([found])
         start = found.image - found.image % PIECE
         begun.append(replace(found, image=found.image - start))
         if len(begun) == min(PIECE, total - start):
