@@ -7,7 +7,6 @@ drive they are.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -74,11 +73,6 @@ def detect_in_pieces(
 
     if todo:
         detect(drive, options, todo, context.processes, take)
-    return _together(pieces)
-
-
-def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
-    """The known pieces, by their first images, under the drive's numbers of images."""
     return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
 
 
