@@ -13,3 +13,8 @@ def mounted(centre, pitch_deg=0.0, yaw_deg=0.0, roll_deg=0.0):
     out[:3, :3] = OPTICAL_FROM_BODY @ vehicle_from_body.T
     out[:3, 3] = -out[:3, :3] @ np.asarray(centre)
     return out
+
+
+def apply(dst_from_src, points_src):
+    """Points (..., N, 3) of ``src`` in ``dst``."""
+    return points_src @ np.swapaxes(dst_from_src[..., :3, :3], -1, -2) + dst_from_src[..., None, :3, 3]

@@ -167,8 +167,8 @@ sys.modules.update(dict.fromkeys(missing))
 import v2hdm.detect, v2hdm.detection.batch, v2hdm.detection.road, v2hdm.store
 for one in pkgutil.iter_modules(v2hdm.store.__path__, "v2hdm.store."):
     importlib.import_module(one.name)
-with v2hdm.store.results.growing_folder(Path("drawn"), "--draw") as folder:
-    folder.write("a.jpg", b"a")
+with v2hdm.store.results.growing_folder(Path("drawn"), "--draw") as add:
+    add("a.jpg", b"a")
 try: v2hdm.store.cache.StageCache(Path("cache")).key(1)
 except v2hdm.errors.ConfigError as error: assert "install the map extra, pip" in str(error)
 else: raise AssertionError("the cache needs msgspec")

@@ -254,6 +254,11 @@ class Drive:
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
     @property
+    def route_map(self) -> FloatArray:
+        """Where the vehicle was at the images, (I, 2) m."""
+        return np.array([image.map_from_vehicle[:2, 3] for image in self.images])
+
+    @property
     def visits(self) -> tuple[Visit, ...]:
         """The drives that it was joined of, or itself alone."""
         own = (self.name, self.root, self.pose_noise, self.truth_dir, self.trajectory, self.recorded)

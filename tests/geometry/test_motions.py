@@ -6,6 +6,7 @@ import torch
 from kornia.geometry.liegroup import Se3
 from scipy.linalg import expm
 
+from tests.cameras import apply
 from v2hdm.geometry import ipm, lens, rigid, tensors
 from v2hdm.geometry.tensors import inverse_depth
 from v2hdm.records import CameraInfo
@@ -68,7 +69,7 @@ def test_the_adjoint_carries_a_tangent_through_a_motion(batch):
 
 def test_pitch_lowers_the_nose_and_heading_turns_left():
     nose = np.array([[1.0, 0.0, 0.0]])
-    pitched, turned = (rigid.apply(rigid.exp(0.1 * np.eye(6)[k]), nose) for k in (4, 5))
+    pitched, turned = (apply(rigid.exp(0.1 * np.eye(6)[k]), nose) for k in (4, 5))
     assert pitched[0, 2] < 0
     assert turned[0, 1] > 0
 

@@ -11,12 +11,13 @@ from scipy.sparse import csr_array
 from tests.adjust.scene import make_scene
 from tests.benchmarks.made.draw import draw
 from tests.benchmarks.right_drives import Job, map_one
+from tests.cameras import apply
 from tests.mapping.scene import SceneOptions
 from tests.mapping.scene import make_scene as make_yard
 from v2hdm.adjust import SolveOptions, height_information, solve
 from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.surface import KNOTS_M, Paths, Recorded, Surface
-from v2hdm.geometry.rigid import apply, rotation_from_euler
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import HdMap, PoseNoise, Road
 

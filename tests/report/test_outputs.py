@@ -150,12 +150,12 @@ def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_di
 def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path):
     drawn, photos = tmp_path / "drawn", tmp_path / "photos"
     for text in (b"first", b"second"):
-        with growing_folder(drawn, "--draw") as folder:
-            folder.write("a.jpg", text)
+        with growing_folder(drawn, "--draw") as add:
+            add("a.jpg", text)
     assert (drawn / "a.jpg").read_bytes() == b"second"
     (drawn / "b.jpg").write_bytes(b"mine")
-    with growing_folder(drawn, "--draw") as folder, pytest.raises(ConfigError, match="no file of ours"):
-        folder.write("b.jpg", b"ours")
+    with growing_folder(drawn, "--draw") as add, pytest.raises(ConfigError, match="no file of ours"):
+        add("b.jpg", b"ours")
     assert (drawn / "b.jpg").read_bytes() == b"mine"
     photos.mkdir()
     (photos / "a.jpg").write_bytes(b"mine")
@@ -165,19 +165,19 @@ def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path):
 
 def test_a_file_stays_ours_where_the_work_was_cut_off_before_or_after_its_replacement(tmp_path, monkeypatch):
     folder = tmp_path / "drawn"
-    with growing_folder(folder, "--draw") as growing:
-        growing.write("a.jpg", b"first")
-        growing.write("b.jpg", b"first")
+    with growing_folder(folder, "--draw") as add:
+        add("a.jpg", b"first")
+        add("b.jpg", b"first")
     monkeypatch.setattr(Path, "replace", lambda *_: 1 / 0)
     for name in ("a.jpg", "b.jpg"):
-        with growing_folder(folder, "--draw") as growing, pytest.raises(ZeroDivisionError):
-            growing.write(name, b"second")
+        with growing_folder(folder, "--draw") as add, pytest.raises(ZeroDivisionError):
+            add(name, b"second")
     monkeypatch.undo()
     (folder / "b.jpg").write_bytes(b"second")
     assert (folder / "a.jpg").read_bytes() == b"first"
-    with growing_folder(folder, "--draw") as growing:
-        growing.write("a.jpg", b"third")
-        growing.write("b.jpg", b"third")
+    with growing_folder(folder, "--draw") as add:
+        add("a.jpg", b"third")
+        add("b.jpg", b"third")
 
 
 def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path):
@@ -192,12 +192,12 @@ def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path):
 
 
 def test_a_list_never_ends_in_half_a_line(tmp_path, monkeypatch):
-    with growing_folder(tmp_path / "drawn", "--draw") as folder:
-        folder.write("a.jpg", b"first")
+    with growing_folder(tmp_path / "drawn", "--draw") as add:
+        add("a.jpg", b"first")
     before = (tmp_path / "drawn" / LIST).read_bytes()
     refused = pytest.raises(ConfigError, match="cannot be written")
-    with refused, full_disk(len(before) + 9), growing_folder(tmp_path / "drawn", "--draw") as folder:
-        folder.write("b.jpg", b"second")
+    with refused, full_disk(len(before) + 9), growing_folder(tmp_path / "drawn", "--draw") as add:
+        add("b.jpg", b"second")
     assert (tmp_path / "drawn" / LIST).read_bytes() == before
 
 

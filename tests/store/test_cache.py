@@ -132,7 +132,7 @@ def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_n
         "for one in pkgutil.iter_modules(v2hdm.store.__path__, 'v2hdm.store.'):\n"
         "    importlib.import_module(one.name)\n"
         "from v2hdm.store.cache import StageCache; from v2hdm.store.results import growing_folder\n"
-        "with growing_folder(Path(sys.argv[1]) / 'drawn', '--draw') as folder: folder.write('a.jpg', b'a')\n"
+        "with growing_folder(Path(sys.argv[1]) / 'drawn', '--draw') as add: add('a.jpg', b'a')\n"
         "from v2hdm.errors import ConfigError\n"
         "try: StageCache(Path(sys.argv[1])).key(1)\n"
         "except ConfigError as error: print(error)\n"

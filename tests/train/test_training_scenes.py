@@ -1,6 +1,7 @@
 """Random scenes, views and hardships of training: reproducible, varied, labelled where the paint is."""
 
 from dataclasses import fields
+from functools import partial
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ from train.scenes.paint import (
 from train.scenes.remains import with_erased
 from train.scenes.scenes import TrainingSample, image_line, image_points, random_scene, training_sample
 from train.scenes.symbols import hollow_diamond, lines_across, with_crossing
-from train.scenes.traffic import traffic
+from train.scenes.traffic import reflectance, traffic
 from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
 from train.scenes.weather import GROUNDS, photo_tile
 from train.scenes.windscreen import before_lens
@@ -358,7 +359,7 @@ def test_erased_markings_are_no_paint_and_vehicles_bear_pictures():
 def test_a_picture_lies_on_its_face_from_the_upper_left_as_seen_from_outside():
     picture = np.zeros((2, 2, 3), np.uint8)
     picture[0, 0], picture[0, 1], picture[1, 0] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
-    box = Box(centre_map=(6.0, 0.0), size_m=(2.0, 2.0, 2.0), pictures=(None, picture))
+    box = Box(centre_map=(6.0, 0.0), size_m=(2.0, 2.0, 2.0), pictures=(None, partial(reflectance, picture)))
     info = CameraInfo("c", 120, 80, np.array([[100.0, 0, 60], [0, 100.0, 40], [0, 0, 1]]))
     seen = Renderer(Scene(boxes=(box,))).render(
         info, looking(np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0), np.random.default_rng(0)

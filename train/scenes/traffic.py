@@ -5,12 +5,14 @@ Networks took the warning stripes of a lorry for a crosswalk, and its windows an
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
-from v2hdm.simulate.render.scene import Bgr, Box
+from v2hdm.simulate.render.scene import Bgr, Box, Float32
 
 Picture = NDArray[np.uint8]
 
@@ -52,6 +54,20 @@ def _plain(size_m: tuple[float, float], albedo_bgr: Bgr) -> Picture:
     """A picture of one colour, of a width and height."""
     columns, rows = (max(int(m * _PX_PER_M), 2) for m in size_m)
     return np.full((rows, columns, 3), np.clip(np.array(albedo_bgr) * 255, 0, 255), dtype=np.uint8)
+
+
+def reflectance(
+    picture: Picture, sides_m: FloatArray, along_m: Float32, up_m: Float32, footprint_m: Float32
+) -> Float32:
+    """Reflectance (3, h, w) of a picture that fills a side of a box; see :data:`scene.Picture`."""
+    # Fewer texels than pixels would shimmer: the picture is first averaged to the size it is seen at.
+    most = np.ceil(sides_m / max(float(np.median(footprint_m)), 1e-4)).astype(int)
+    columns, rows = (int(n) for n in np.clip(most, 1, picture.shape[1::-1]))
+    averaged = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    u = along_m * np.float32(columns / sides_m[0]) - np.float32(0.5)
+    v = np.float32(rows - 0.5) - up_m * np.float32(rows / sides_m[1])
+    seen = cv2.remap(averaged, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.moveaxis(seen.astype(np.float32) * np.float32(1 / 255), 2, 0)
 
 
 def _fill(picture: Picture, polygon_m: FloatArray, albedo_bgr: Bgr) -> None:
@@ -159,8 +175,9 @@ def _box(
     albedo_bgr: Bgr,
     base_m: float = 0.0,
 ) -> Box:
+    sides = tuple(None if one is None else partial(reflectance, one) for one in pictures)
     return Box(
-        centre_map=at, size_m=size_m, yaw_rad=yaw, albedo_bgr=albedo_bgr, base_m=base_m, pictures=pictures
+        centre_map=at, size_m=size_m, yaw_rad=yaw, albedo_bgr=albedo_bgr, base_m=base_m, pictures=sides
     )
 
 

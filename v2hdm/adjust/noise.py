@@ -26,6 +26,7 @@ from v2hdm.adjust.layout import state_prior
 from v2hdm.adjust.problem import POSE_STATES, Drift, PoseSigma, Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import factorise
+from v2hdm.geometry.planar import length_along
 from v2hdm.records import FloatArray
 
 _SPREAD = math.log(2.0)
@@ -138,9 +139,7 @@ def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, 
     moved = moved[moved > _LEAST_STEP_M]
     step_m = float(np.median(moved)) if len(moved) else _LEAST_STEP_M
     for own in (visit == number for number in range(problem.visit_count)):
-        place = np.concatenate(
-            [[0.0], np.cumsum(np.linalg.norm(np.diff(poses[own][:, :2, 3], axis=0), axis=1))]
-        )
+        place = length_along(poses[own][:, :2, 3])
         grid = np.arange(0.0, place[-1] + step_m / 2, step_m)
         nearest = np.rint(np.interp(grid, place, np.arange(len(place)))).astype(np.int64)
         even = errors[:, own][:, nearest]

@@ -89,7 +89,7 @@ def _detect(parsed: argparse.Namespace) -> None:
     failure = None
     made = f"v2hdm detect of {parsed.source if live else Path(parsed.source).resolve()}"
     folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", made)
-    with folder as drawings, _lines(parsed.output) as stream:
+    with folder as write_drawing, _lines(parsed.output) as stream:
         try:
             for frame, camera, road in frames:
                 record = as_record(frame, camera, road)
@@ -99,11 +99,11 @@ def _detect(parsed: argparse.Namespace) -> None:
                 if parsed.live:
                     dropped += frame.dropped
                     age_s.append(time.time() - (frame.stamp_s or 0.0))
-                if drawings is not None:
+                if write_drawing is not None:
                     markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
                     drawn = draw_detections(frame.pixels, markings, lanes)
                     _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
-                    drawings.write(f"{frame.name}.jpg", packed.tobytes())
+                    write_drawing(f"{frame.name}.jpg", packed.tobytes())
         except KeyboardInterrupt:
             if not live:
                 raise

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.main import parser_of, result_of, steps_of
-from v2hdm.errors import DriveError, MapFileError
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -20,14 +19,10 @@ def run(arguments: Sequence[str]) -> None:
     parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
     parser.add_argument("--range", type=float, metavar="M", default=16.0, help="farthest label (16)")
     parsed = parser.parse_args(arguments)
-    from v2hdm.io.drive.of_result import drive_of
+    from v2hdm.io.drive.of_result import single_drive_of
     from v2hdm.labels import FILE, write_labels
 
-    drive = drive_of(parsed.result, parsed.drive)
-    if drive is None:
-        raise DriveError(f"{parsed.result}: its drive is not where it was; give its folder with --drive")
-    if drive.joined:
-        raise MapFileError(f"{parsed.result} is of several drives; labels are of one: map them one by one")
+    drive = single_drive_of(parsed.result, parsed.drive, "labels are")
     folder = parsed.output or Path("outputs") / f"{drive.name}-labels"
     made = f"v2hdm labels of {parsed.result.resolve()}"
     with result_of(folder, made, {"result": str(parsed.result), "range_m": parsed.range}) as unfinished:

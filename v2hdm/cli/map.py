@@ -28,18 +28,15 @@ def _map(job: Job) -> int:
     from rich.console import Console
     from rich.logging import RichHandler
 
-    from v2hdm.pipeline.config import run_name
     from v2hdm.pipeline.context import logging_to
     from v2hdm.pipeline.run import run
     from v2hdm.progress import patient, progress_bars
     from v2hdm.report.terminal import changes_table, results_table
-    from v2hdm.viewer import RerunViewer, check_viewer
 
     config, console = job.settings, Console(file=patient(sys.stdout))
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
-    viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
     with logging_to(handler), progress_bars(console) as progress:
-        result = run(config, job.yaml, progress, viewer)
+        result = run(config, job.yaml, progress)
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)

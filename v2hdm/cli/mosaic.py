@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.main import parser_of, steps_of
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.errors import MapFileError
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -23,7 +23,7 @@ def run(arguments: Sequence[str]) -> None:
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
-    from v2hdm.io.drive.of_result import drive_of
+    from v2hdm.io.drive.of_result import single_drive_of
     from v2hdm.mosaic.result import write_mosaic
     from v2hdm.pipeline.config import check_device
     from v2hdm.store.results import added_to
@@ -32,11 +32,7 @@ def run(arguments: Sequence[str]) -> None:
     check_device(parsed.device)
     if not parsed.result.is_dir():
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
-    drive = drive_of(parsed.result, parsed.drive)
-    if drive is None:
-        raise DriveError(f"{parsed.result}: its drive is not where it was; give its folder with --drive")
-    if drive.joined:
-        raise MapFileError(f"{parsed.result} is of several drives; a mosaic shows one: map them one by one")
+    drive = single_drive_of(parsed.result, parsed.drive, "a mosaic is")
     with added_to(parsed.result, "RESULT") as folder:
         steps = steps_of("put images on the ground")
         found = write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)["sharpness"]

@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, Job
 from v2hdm.geometry.ipm import extrinsic_from_ipm
@@ -71,7 +69,7 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
         "started_from": " and ".join(sorted({camera.initial_ipm for camera in drive.cameras.values()})),
         "truth": _plain_map(truth.map.markings),
         "true_lanes": [lane.points_map for lane in truth.map.lanes],
-        "route": np.array([image.map_from_vehicle[:2, 3] for image in drive.images]),
+        "route": drive.route_map,
         "expected": {name: driven_past(drive, truth, members) for name, members in sets.items()},
         "maps": {name: {} for name in sets},
         "lanes": {}, "extrinsics": {}, "failures": [],

@@ -16,7 +16,7 @@ from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, 
 from v2hdm.pipeline.run import take_or_run
 from v2hdm.progress import Progress, patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
-from v2hdm.store.results import GrowingFolder, growing_folder
+from v2hdm.store.results import WriteFile, growing_folder
 from v2hdm.workers import side_by_side
 
 ALL = "fleet"  # in place of a drive's name, for the progress of the fleet
@@ -61,8 +61,8 @@ def run_fleet(
     settings = [*overrides, "resume=false"] if options.again else overrides
     site, share = options.site, options.share
     todo = plan(files, settings, share) if site is None else plan_site(files, settings, site)
-    with growing_folder(options.folder, "--table", "v2hdm fleet") as folder:
-        table = _Table(folder, todo.sources, progress)
+    with growing_folder(options.folder, "--table", "v2hdm fleet") as write:
+        table = _Table(write, todo.sources, progress)
         for row in todo.refused:
             table.add(row)
         _map_all(todo.jobs, options.workers or os.cpu_count() or 1, table, progress)
@@ -72,8 +72,8 @@ def run_fleet(
 class _Table:
     """The rows so far, on disk as well."""
 
-    def __init__(self, folder: GrowingFolder, sources: Sequence[str], progress: DriveProgress) -> None:
-        self._folder, self._sources, self._progress = folder, sources, progress
+    def __init__(self, write: WriteFile, sources: Sequence[str], progress: DriveProgress) -> None:
+        self._write, self._sources, self._progress = write, sources, progress
         self._rows: dict[str, Row] = {}
 
     @property
@@ -85,9 +85,9 @@ class _Table:
         """Add the row of a drive, and the traceback of a bug where there is one."""
         self._rows[row.source] = row
         if trace:
-            self._folder.write(f"{row.drive}.traceback.txt", trace.encode())
-        self._folder.write("fleet.csv", as_csv(self.rows))
-        self._folder.write("fleet.json", as_json(self.rows))
+            self._write(f"{row.drive}.traceback.txt", trace.encode())
+        self._write("fleet.csv", as_csv(self.rows))
+        self._write("fleet.json", as_json(self.rows))
         self._progress(row.drive, row.status, 1, 1)
         self._progress(ALL, "drives", len(self._rows), len(self._sources))
 

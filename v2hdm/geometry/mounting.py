@@ -14,8 +14,8 @@ from v2hdm.geometry.rigid import (
 )
 from v2hdm.records import FloatArray
 
-# Columns: the right, down and forward of a camera that looks along x, in a frame of forward, left and up.
-_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Columns: the right, down and forward of a camera that looks along x, in a frame of forward, left and up."""
 
 
 def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
@@ -23,13 +23,13 @@ def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
 
     The order is that of REP-103: about x, then y, then z.
     """
-    return euler_from_rotation(cam_from_vehicle[:3, :3].T @ _LEVEL.T)
+    return euler_from_rotation(cam_from_vehicle[:3, :3].T @ LEVEL.T)
 
 
 def cam_from_mounting(xyz_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
     """``cam_from_vehicle`` (4, 4) of a camera with centre ``xyz_m`` (3,) and :func:`mounting_angles` (3,)."""
     turn = rotation_from_euler(*np.asarray(angles_rad)[:, None])[0]
-    return inverse(make_transform(turn @ _LEVEL, xyz_m))
+    return inverse(make_transform(turn @ LEVEL, xyz_m))
 
 
 def angle_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Polygons in a plane (their area, points inside, the part that two of them share), and polylines."""
+"""Polygons in a plane (their area, points inside, the part that two of them share), polylines, angles."""
 
 from __future__ import annotations
 
@@ -73,6 +73,17 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
 def length_along(line: FloatArray) -> FloatArray:
     """How far along a polyline (N, D) each of its vertices (N,) lies."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def points_along(line: FloatArray, at: FloatArray) -> FloatArray:
+    """Points (M, D) as far along a polyline (N, D) as ``at`` (M,) says, from end to end of it."""
+    return np.column_stack([np.interp(at, length_along(line), axis) for axis in line.T])
+
+
+def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Angles (N,), rad within +-pi, from vectors (N, 2) to others, counter-clockwise."""
+    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    return np.asarray(np.arctan2(cross, (first * second).sum(axis=1)))
 
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:

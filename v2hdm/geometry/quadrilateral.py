@@ -113,15 +113,13 @@ class Alignment(NamedTuple):
     """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift.
 
     ``shift``: corner c of a matches corner (c + shift) mod 4 of b; ``offset`` (..., 2) is the mean
-    displacement of b's corners; ``deformation_m`` the largest deviation of a corner from that mean;
-    ``common`` the number of corners valid in both (fewer than two: nothing can be said, the
-    deformation is infinite).
+    displacement of b's corners; ``deformation_m`` the largest deviation of a corner from that mean, infinite
+    where fewer than two corners are valid in both.
     """
 
     shift: IntArray
     offset: FloatArray
     deformation_m: FloatArray
-    common: IntArray
 
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
@@ -189,7 +187,7 @@ def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) 
     deviation = np.linalg.norm(difference - mean[..., None, :], axis=-1)
     worst = np.max(np.where(both, deviation, 0.0), axis=-1)
     common, worst = (np.take_along_axis(each, chosen, axis=-1)[..., 0] for each in (common, worst))
-    return Alignment(shift, offset, np.where(common >= 2, worst, np.inf), common)
+    return Alignment(shift, offset, np.where(common >= 2, worst, np.inf))
 
 
 def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:

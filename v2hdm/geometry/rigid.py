@@ -40,12 +40,6 @@ def camera_centre(cam_from_frame: FloatArray) -> FloatArray:
     return np.asarray(-(np.swapaxes(rotation, -1, -2) @ cam_from_frame[..., :3, 3:])[..., 0])
 
 
-def apply(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
-    """Points (..., N, 3) of ``src`` in ``dst``."""
-    rotation = np.swapaxes(dst_from_src[..., :3, :3], -1, -2)
-    return np.asarray(points_src @ rotation + dst_from_src[..., None, :3, 3])
-
-
 def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
     """Ground points (..., 2) m of the map as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
     offset = np.concatenate([points_map, np.zeros((*np.shape(points_map)[:-1], 1))], axis=-1)

@@ -13,7 +13,7 @@ import numpy as np
 from v2hdm.ground.adjust import CENTRE, Adjusted, adjust, tangent_covariance
 from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import Motion, changing_pairs, motion_of, spread_pairs
-from v2hdm.ground.patches import Matcher, Round
+from v2hdm.ground.patches import STRIP_M, Matcher, Round
 from v2hdm.ground.prior import Observations, Stated, state_sigmas
 from v2hdm.ground.results import (
     GroundEstimate,
@@ -52,6 +52,10 @@ _OBSERVABLE = {
 _LEAST_TURN_RADPS = 0.05
 _STRETCHES = 8  # enough to estimate a spread, few enough that each has several pairs
 _WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two are mostly the survey's
+# Distance between the images of a pair: the error of a position weighs the less the longer it is; beyond, the
+# ground changes its looks and leaves the region that both images show.
+_APART_M = (2.0, 4.0)
+_GRID_M = 0.04  # spacing of the resampled ground
 # Distance between the images of a pair that shows the clock: motion changes within it.
 _CLOCK_APART_M = (0.8, 4.0)
 _CLOCK_LOOSENED = 2.0  # factor on the stated noise of headings up to which a clock is separable from them
@@ -93,7 +97,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     options = options or GroundOptions()
     motion = motion_of(drive, camera, Reading.AS_GIVEN)
     stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
-    matcher = Matcher(drive, camera, motion, options)
+    matcher = Matcher(drive, camera, motion)
     readings = try_readings(drive, camera, matcher, stated, options.readings)
     out, start = _nothing(camera, readings), readings.start
     if readings.best is Reading.AS_GIVEN:
@@ -101,7 +105,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
         if start.mount is not None:
             solved = _solve(matcher, stated, start.mount, options)
         if isinstance(solved, _Solved):
-            out = _found(out, solved, options)
+            out = _found(out, solved, options.free)
         elif out.status is GroundStatus.NO_MATCH and not contradicts(matcher, stated.guess, *solved):
             out = replace(out, status=GroundStatus.NO_TEXTURE)
     return replace(out, seconds=time.perf_counter() - began_s)
@@ -127,16 +131,14 @@ class _Lost(NamedTuple):
 def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | _Lost:
     """Match and adjust in turn, each round from the last one's solution."""
     path_m = stated.path_m()
-    pairs = spread_pairs(path_m, options.pairs, options.shortest_m, options.longest_m)
+    pairs = spread_pairs(path_m, options.pairs, *_APART_M)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
     if free is not None:
         moves = stated.motion.moves_ground_mps()
         pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, *_CLOCK_APART_M)])
     poses = stated.poses()
     for stage in _STAGES:
-        matched = matcher.match(
-            mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m
-        )
+        matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * _GRID_M)
         if len(matched) < _LEAST_MATCHES:
             return _Lost(pairs[:: stage.every], matched.share)
         used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
@@ -157,19 +159,19 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
     return _Solved(matched, stated, adjusted, clock)
 
 
-def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> GroundEstimate:
+def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> GroundEstimate:
     mount, matched, adjusted = solved.adjusted.mount, solved.matched, solved.adjusted
     seen = matched.observations
     factor = _scatter(seen, solved.stated, adjusted)
     # Ground that is no plane is tilted and lifted for all pairs alike.
-    tilt, pitch = _FLATNESS_M / (2 * options.strip_m), _FLATNESS_M / (2 * options.longest_m)
+    tilt, pitch = _FLATNESS_M / (2 * STRIP_M), _FLATNESS_M / (2 * _APART_M[1])
     flatness = np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
     covariance = tangent_covariance(mount, factor * adjusted.covariance[:6, :6] + flatness)
     return replace(
         nothing,
         status=GroundStatus.FOUND,
         calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
-        parameters=_free_parameters(options.free, seen, solved, factor),
+        parameters=_free_parameters(free, seen, solved, factor),
         median_residual=float(np.median(adjusted.residual)),
         innovations=_innovations(adjusted, solved.stated.drive.pose_noise),
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.ground.results import Reading
@@ -58,8 +59,7 @@ def motion_of(drive: Drive, camera: str, reading: Reading) -> Motion:
     image = np.array([k for k, entry in enumerate(drive.images) if entry.camera == camera], dtype=np.int64)
     stamp_s = np.array([drive.images[k].stamp_s for k in image])
     trajectory = _read_as(drive.trajectory or trajectory_of_images(drive), reading)
-    position = trajectory.map_from_vehicle[:, :2, 3]
-    path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    path_m = length_along(trajectory.map_from_vehicle[:, :2, 3])
     return Motion(image, stamp_s, trajectory, path_m, _velocity(trajectory))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,13 +15,14 @@ from v2hdm.geometry.rigid import ground_in_vehicle
 from v2hdm.ground.model import Mount
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.prior import Observations
-from v2hdm.ground.results import GroundOptions
 from v2hdm.io.safe.pixels import read_pixels
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 
 ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
+STRIP_M = 2.0  # ground so far to either side of the driven path is taken for road
+_PATCH_M, _STEP_M = 0.9, 0.6  # side of a patch; distance of the next, which it overlaps by a third
 _LEAST_CORRELATION = 0.5  # normalised cross-correlation below which two patches are not the same ground
 # Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself.
 _LEAST_ROUNDNESS = 0.1
@@ -126,33 +127,33 @@ def patch_centres(
     poses: tuple[FloatArray, FloatArray],
     roi_vehicle: FloatArray,
     path_map: FloatArray,
-    options: GroundOptions,
 ) -> FloatArray:
     """Centres (N, 2) in the map of patches within the region of both poses and beside the driven path.
 
     They lie on a lattice that is aligned with the first pose.
     """
-    pose = poses[0]
-    low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
-    ahead, left = np.meshgrid(*(np.arange(a, b, options.step_m) for a, b in zip(low, high, strict=True)))
-    vehicle = np.column_stack([ahead.ravel(), left.ravel(), np.zeros(ahead.size)])
-    centres = (vehicle @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+    pose, lattice = poses[0], _lattice(roi_vehicle)
+    centres = lattice @ pose[:2, :2].T + pose[:2, 3]
     inside = np.ones(len(centres), dtype=np.bool_)
     for each in poses:
         inside &= inside_convex(roi_vehicle, ground_in_vehicle(each, centres))
     centres = centres[inside]
     if not len(centres):
         return centres
-    near = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= options.strip_m
+    near = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= STRIP_M
     return np.asarray(centres[near])
 
 
-def match_pair(
-    first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions
-) -> Matches:
+def _lattice(roi_vehicle: FloatArray) -> FloatArray:
+    """Places (N, 2) of patches over the rectangle around a region."""
+    low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
+    ahead, left = np.meshgrid(*(np.arange(a, b, _STEP_M) for a, b in zip(low, high, strict=True)))
+    return np.column_stack([ahead.ravel(), left.ravel()])
+
+
+def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, grid_m: float) -> Matches:
     """Find patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
-    grid_m = options.grid_m
-    half = round(options.patch_m / 2 / grid_m)
+    half = round(_PATCH_M / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
     sheet, cells = Sheet.around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
     first_grey, first_seen = sheet.texture(first)
@@ -180,19 +181,17 @@ def match_pair(
     return _on_one_plane(Matches(first_px, second_px, sought))
 
 
-def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, options: GroundOptions) -> Matches:
+def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, grid_m: float) -> Matches:
     """Find patches of a region of the first image in the second wherever they are, by no pose at all.
 
     The mounting only says how the ground is laid out; both views are at the same pose.
     """
-    low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
-    ahead, left = np.meshgrid(*(np.arange(a, b, options.step_m) for a, b in zip(low, high, strict=True)))
-    centres = np.column_stack([ahead.ravel(), left.ravel()])
+    centres = _lattice(roi_vehicle)
     centres = centres[inside_convex(roi_vehicle, centres)]
     if not len(centres):
         return Matches.none_of(0)
-    half, wide = (round(size_m / options.grid_m) for size_m in (options.patch_m / 2, _AROUND_M))
-    sheet, cells = Sheet.around(centres, first.map_from_vehicle, half + wide, options.grid_m)
+    half, wide = (round(size_m / grid_m) for size_m in (_PATCH_M / 2, _AROUND_M))
+    sheet, cells = Sheet.around(centres, first.map_from_vehicle, half + wide, grid_m)
     grey, seen = sheet.texture(first)
     other, other_seen = sheet.texture(second)
     other[~other_seen] = 0.0
@@ -271,12 +270,11 @@ class Round:
 class Matcher:
     """Matches ground between images of one camera; images are read once and kept."""
 
-    def __init__(self, drive: Drive, camera: str, motion: Motion, options: GroundOptions):
+    def __init__(self, drive: Drive, camera: str, motion: Motion):
         self._drive = drive
         self._image = motion.image
         self._roi = np.asarray(drive.cameras[camera].roi_vehicle, dtype=np.float64)
         self._path = _path_of(motion)
-        self._options = options
         self._grey: dict[int, ImageArray] = {}
 
     def under(self, motion: Motion, turned: bool = False) -> Matcher:
@@ -289,12 +287,11 @@ class Matcher:
         self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float
     ) -> Round:
         """Match every pair (P, 2) of rows of ``poses`` on a grid that is laid out from ``mount``."""
-        options = replace(self._options, grid_m=grid_m)
         found: list[Matches] = []
         for first, second in pairs.tolist():
-            centres = patch_centres((poses[first], poses[second]), self._roi, self._path, options)
+            centres = patch_centres((poses[first], poses[second]), self._roi, self._path)
             one, other = (View(self._read(k), mount, poses[k]) for k in (first, second))
-            own = match_pair(one, other, centres, search_m, options) if len(centres) else Matches.none_of(0)
+            own = match_pair(one, other, centres, search_m, grid_m) if len(centres) else Matches.none_of(0)
             found.append(own)
         pair = np.repeat(np.arange(len(pairs)), [len(each) for each in found])
         sought = sum(each.sought for each in found)
@@ -305,9 +302,9 @@ class Matcher:
 
     def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> tuple[int, float]:
         """How many patches of first images are found again in the second ones, anywhere, and their share."""
-        options, roi, here = replace(self._options, grid_m=grid_m), self._roi, np.eye(4)
+        roi, here = self._roi, np.eye(4)
         found = [
-            match_anywhere(View(self._read(a), mount, here), View(self._read(b), mount, here), roi, options)
+            match_anywhere(View(self._read(a), mount, here), View(self._read(b), mount, here), roi, grid_m)
             for a, b in pairs.tolist()
         ]
         count, sought = sum(map(len, found)), sum(one.sought for one in found)

@@ -60,7 +60,7 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
             f"map.base: the origin of {path} is {base.hd_map.origin} and that of drive {drive.name} "
             f"{drive.origin}: their coordinates differ; bring the drive's poses into the map's frame"
         )
-    route = cKDTree([image.map_from_vehicle[:2, 3] for image in drive.images])
+    route = cKDTree(drive.route_map)
     centres = np.array([one.corners_map.mean(axis=0) for one in base.hd_map.markings])
     nearest_m = float(route.query(centres)[0].min())
     if nearest_m > _SITE_M:

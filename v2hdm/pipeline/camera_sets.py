@@ -87,8 +87,6 @@ def map_camera_sets(
     else:
         for job in todo:
             take(work(job))
-    for name in sets:
-        context.viewer.mapped(name, found[name].methods)
     return {name: found[name] for name in sets}
 
 

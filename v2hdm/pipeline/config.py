@@ -82,7 +82,6 @@ class RunConfig:
         accuracy_goal_cm: the radius, cm, within which 95 % of the corners, and the calibrations, have to be
             known at 95 %, else the verdict is WARN (docs/verdict.md).
         mosaic: whether the ground is shown from above, too (docs/report.md).
-        viewer: ``rerun`` shows and records the run while it goes on (docs/report.md), ``none`` does not.
         export: formats of the map: ``geojson``, ``gpkg``, ``lanelet2``, ...; of the ground: ``geotiff``,
             ``opencrg`` (docs/exports.md).
         crs: the system of their coordinates, such as ``EPSG:25832``, or ``local``; ``map.geojson`` keeps its
@@ -105,7 +104,6 @@ class RunConfig:
     accuracy_goal_cm: float = ACCURACY_GOAL_CM
     all_maps: bool = False
     mosaic: bool = False
-    viewer: str = "none"
     export: list[str] = field(default_factory=lambda: ["geojson"])
     crs: str | None = None
 

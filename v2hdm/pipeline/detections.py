@@ -7,7 +7,6 @@ drive they are.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -38,10 +37,10 @@ def detect_in_pieces(
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order, where that is not known yet.
 
-    The viewer is shown first all that is known, then image by image; ``detect`` takes the place of processes
-    of this machine. Raises V2hdmError as :func:`v2hdm.detection.batch.detect_all`.
+    ``detect`` takes the place of processes of this machine. Raises V2hdmError as
+    :func:`v2hdm.detection.batch.detect_all`.
     """
-    cache, progress, show = context.cache, context.steps("detect"), context.viewer.detected
+    cache, progress = context.cache, context.steps("detect")
     detector_key = cache.key(options, model_key(options))
     masks = cache.get_or_make(
         "own_vehicle",
@@ -59,14 +58,12 @@ def detect_in_pieces(
     if len(todo) < total:
         _log.info("detections in %d of %d images were kept by an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
-    show(_together(pieces))
     begun: _Piece = []
     done = 0
 
     def take(found: ImageDetections) -> None:
         nonlocal done
         done += 1
-        show([found])
         start = found.image - found.image % PIECE
         begun.append(replace(found, image=found.image - start))
         if len(begun) == min(PIECE, total - start):
@@ -76,11 +73,6 @@ def detect_in_pieces(
 
     if todo:
         detect(drive, options, todo, context.processes, take)
-    return _together(pieces)
-
-
-def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
-    """The known pieces, by their first images, under the drive's numbers of images."""
     return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
 
 

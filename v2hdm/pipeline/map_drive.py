@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -137,14 +136,13 @@ def _mapped(
     settings = detector.options if isinstance(detector, Detector) else detector
     settings = settings or DetectorOptions.for_mapping()
     try:
-        with closing(context.viewer):
-            with compiled_meanwhile(survey.mapping.device):
-                detections = _detect(checked.drive, begun.contents, settings, context)
-            with context.timed("map"):
-                key = begun.contents.key(checked.drive)
-                sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
-            with context.timed("wear"):
-                sets = _with_wear(sets, checked.drive, earlier, context)
+        with compiled_meanwhile(survey.mapping.device):
+            detections = _detect(checked.drive, begun.contents, settings, context)
+        with context.timed("map"):
+            key = begun.contents.key(checked.drive)
+            sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
+        with context.timed("wear"):
+            sets = _with_wear(sets, checked.drive, earlier, context)
     except (MappingError, AdjustError) as failure:
         if not checked.has_failed:
             raise
@@ -171,7 +169,6 @@ def _detect(
     if unknown is not None:
         _log.warning("%s", unknown)
     with context.timed("detect"):
-        context.viewer.begun(context.folder, drive)
         detections = detect_in_pieces(drive, contents, options, context, context.detect or detect_images)
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)

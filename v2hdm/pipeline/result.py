@@ -15,6 +15,7 @@ from v2hdm import __version__
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError, MappingError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
+from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import inverse
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.calibration.reading import Provenance
@@ -48,7 +49,6 @@ from v2hdm.verdict import Verdict
 def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
     """The beginning of ``metrics.json``: name, version, date (UTC), the drive at ``paths`` as it was read."""
     stamp_s = [image.stamp_s for image in drive.images]
-    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     return {
         "name": name,
         "version": __version__,
@@ -56,7 +56,7 @@ def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOp
         "drive": {
             **told_of(drive, paths, options),
             "duration_s": round(float(np.ptp(stamp_s)), 3),
-            "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
+            "length_m": round(float(length_along(drive.route_map)[-1]), 2),
             "position_sigma_m": drive.pose_noise.position_m,
             "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
         },
@@ -265,9 +265,8 @@ def _write_map(
 
 def _route(drive: Drive) -> FloatArray:
     """Positions (N, 2) of the vehicle, with a nan between one visit and the next."""
-    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     ends = np.flatnonzero(np.diff([image.visit for image in drive.images])) + 1
-    return np.insert(places, ends, np.nan, axis=0)
+    return np.insert(drive.route_map, ends, np.nan, axis=0)
 
 
 _BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")
@@ -275,7 +274,7 @@ _BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")
 
 def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
     """The map with every lane line in the direction in which the drive passed it: that of its lanelets."""
-    route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    route_map = drive.route_map
     ahead = np.array([image.map_from_vehicle[:2, 0] for image in drive.images])
     lanes = []
     for lane in hd_map.lanes:

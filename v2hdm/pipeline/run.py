@@ -22,7 +22,7 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.formats import check_crs
 from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit, run_name
-from v2hdm.pipeline.context import Context, Unwatched, Viewer, log_file, logging_to
+from v2hdm.pipeline.context import Context, log_file, logging_to
 from v2hdm.pipeline.keys import Contents, base_files, made_of_drives, result_key
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive
@@ -193,36 +193,30 @@ def _finished_at(place: RemoteFolder, config: RunConfig) -> RunResult | None:
     return None
 
 
-def run(
-    config: RunConfig, config_yaml: str = "", progress: Progress = silent, viewer: Viewer | None = None
-) -> RunResult:
+def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
     """Map one drive, or several together, and write the results to ``<output>/<name>/``, whole or not at all.
 
     Args:
         config: what to do.
         config_yaml: the configuration as text, kept beside the results.
         progress: shows how far the long steps are.
-        viewer: shown images, detections and maps as they come, also where nothing has changed since.
 
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
-    return take_or_run(config, config_yaml, progress, viewer)[0]
+    return take_or_run(config, config_yaml, progress)[0]
 
 
-def take_or_run(
-    config: RunConfig, config_yaml: str, progress: Progress, viewer: Viewer | None = None
-) -> tuple[RunResult, bool]:
+def take_or_run(config: RunConfig, config_yaml: str, progress: Progress) -> tuple[RunResult, bool]:
     """As :func:`run`, and whether a finished result of the same was taken."""
 
     def work(local: RunConfig, cache: StageCache) -> RunResult:
         from v2hdm.detection.network import check_device
 
         check_device(local.detector.device)
-        context = Context(progress=progress, viewer=viewer or Unwatched())
-        return map_and_save(local, cache, config_yaml, context, made_of(config))
+        return map_and_save(local, cache, config_yaml, Context(progress=progress), made_of(config))
 
-    return take_or_make(config, work, config.resume and viewer is None, progress)
+    return take_or_make(config, work, config.resume, progress)
 
 
 def made_of(config: RunConfig) -> str:
@@ -253,7 +247,7 @@ def map_and_save(
             def accept(drive: Drive) -> None:
                 check_crs(config.crs, [one for one in config.export if one != "geojson"], drive.origin, "crs")
 
-            context = replace(context, cache=cache, workers=config.workers, folder=folder, accept=accept)
+            context = replace(context, cache=cache, workers=config.workers, accept=accept)
             found = map_drive(
                 _drive_folders(config, context),
                 name=name,

@@ -81,18 +81,13 @@ def compare_survey(survey: Survey, drive: Drive, best: MethodResult) -> CheckTab
         return None
     assert best.corners is not None
     hd_map, reach_m = with_heights(best.hd_map, drive.road), survey.mapping.survey.reach_m
-    return compare(hd_map, survey.check, reach_m, best.corners.covariance, route_of(drive))
+    return compare(hd_map, survey.check, reach_m, best.corners.covariance, drive.route_map)
 
 
 def check_survey(survey: Survey, best: MethodResult, compared: CheckTable | None) -> list[Finding]:
     """The findings on a survey, and on its check points where they were compared."""
     findings = check_frame(survey.found(best)) if survey.points else []
     return findings if compared is None else [check_points(compared), *findings]
-
-
-def route_of(drive: Drive) -> FloatArray:
-    """The route (F, 2) of the vehicle, m."""
-    return np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
 
 
 def _check_near(
@@ -103,7 +98,7 @@ def _check_near(
     range_m: float,
 ) -> None:
     """Warn of points that no image can show; refuse a survey that has no others."""
-    route = KDTree(route_of(drive))
+    route = KDTree(drive.route_map)
     away_m = route.query(_positions(points))[0]
     far = np.flatnonzero(away_m > range_m)
     if len(far) < len(points):

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
+from v2hdm.geometry.planar import length_along
 from v2hdm.records import FloatArray, HdMap, Trajectory, Truth
 from v2hdm.report import metrics, style
 
@@ -156,7 +157,7 @@ def save_route(path: Path, trajectory: Trajectory) -> None:
 def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     """Arrows at even distances along the path, each a twentieth of the route's extent long."""
     place = poses[:, :2, 3]
-    way = metrics.way_along(place)
+    way = length_along(place)
     chosen = np.unique(np.searchsorted(way, np.linspace(0, way[-1], _ARROWS)))
     length = 0.05 * max(float(np.ptp(place, axis=0).max()), 1e-9)
     look: dict[str, Any] = {

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from v2hdm.catalogue import CORNERED_CLASSES
-from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.planar import inside_convex, length_along, points_along
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
 
@@ -176,9 +176,7 @@ def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
     """Points (M, 2) every ``step_m`` along a polyline (N, 2), its first point included."""
     if len(points) < 2:
         return points
-    along = way_along(points)
-    at = np.arange(0.0, along[-1] + 1e-9, step_m)
-    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
+    return points_along(points, np.arange(0.0, length_along(points)[-1] + 1e-9, step_m))
 
 
 def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
@@ -200,16 +198,6 @@ def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
     joined = np.sqrt(length2) <= 1.5 * SAMPLE_STEP_M
     lateral = np.linalg.norm(points - (first + share[:, None] * span), axis=1)
     return np.asarray(np.where(joined, lateral, distance[:, 0]))
-
-
-def way_along(points: FloatArray) -> FloatArray:
-    """Distance (N,) along a polyline (N, 2) from its first point."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-
-
-def length_m(points: FloatArray) -> float:
-    """Length of a polyline (N, 2)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def runs(points: FloatArray, keep: BoolArray) -> list[FloatArray]:
@@ -244,7 +232,7 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
     if truth is not None:
         figures["lanes"] = asdict(lane_metrics(hd_map.lanes, truth))
     else:
-        length = float(sum(length_m(lane.points_map) for lane in hd_map.lanes))
+        length = float(sum(length_along(lane.points_map)[-1] for lane in hd_map.lanes))
         figures["lanes"] = {"lanes": len(hd_map.lanes), "length_m": length}
     return figures
 

@@ -12,9 +12,10 @@ import numpy as np
 
 from v2hdm.geometry.ipm import apply_in_front, project_ground
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, HdMap
-from v2hdm.report.metrics import runs, way_along
+from v2hdm.report.metrics import runs
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
 
@@ -52,12 +53,12 @@ def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> Non
 
 def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]:
     """The dashes of a polyline: pieces of it that are ``dash_px`` long."""
-    way = way_along(line)
+    way = length_along(line)
     out = []
     for start in np.arange(0.0, way[-1], dash_px + gap_px):
         end = min(start + dash_px, way[-1])
         between = (way > start) & (way < end)
-        ends = np.column_stack([np.interp([start, end], way, line[:, axis]) for axis in (0, 1)])
+        ends = points_along(line, np.array([start, end]))
         out.append(np.vstack([ends[:1], line[between], ends[1:]]))
     return out
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import cKDTree
 
-from v2hdm.geometry.planar import length_along
+from v2hdm.geometry.planar import angle_between, length_along, points_along
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
@@ -128,8 +129,8 @@ def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int
     gap = end[b] - end[a]
     gap_m = np.linalg.norm(gap, axis=1)
     limit_m = np.where(dashed[a] & dashed[b], options.max_dash_gap_m, options.max_break_m)
-    leaving = _signed_angle(outward[a], gap)
-    arriving = _signed_angle(gap, -outward[b])
+    leaving = angle_between(outward[a], gap)
+    arriving = angle_between(gap, -outward[b])
     # The chord of an arc meets both tangents at one angle.
     slack = np.arctan2(_END_SIGMA_M, np.maximum(gap_m, 1e-6))
     fits = (gap_m <= limit_m) & (a // 2 != b // 2)
@@ -149,12 +150,6 @@ def _outward(points: FloatArray) -> FloatArray:
 
 def _unit(way: FloatArray) -> FloatArray:
     return np.asarray(way / max(float(np.linalg.norm(way)), 1e-9))
-
-
-def _signed_angle(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Angle (P,) from directions ``source`` to ``target`` (P, 2), in (-pi, pi]."""
-    cross = source[:, 0] * target[:, 1] - source[:, 1] * target[:, 0]
-    return np.asarray(np.arctan2(cross, np.sum(source * target, axis=1)))
 
 
 def _runs(count: int, joints: list[tuple[int, int, int, int]]) -> list[list[tuple[int, bool]]]:
@@ -191,14 +186,9 @@ def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArr
     """Vertices (N, 2) of the Hermite cubic from the end of ``before`` to the start of ``after``."""
     start, stop = before[-1], after[0]
     gap_m = float(np.linalg.norm(stop - start))
-    t = np.linspace(0.0, 1.0, max(int(np.ceil(gap_m / spacing_m)), 1) + 1)[1:-1, None]
+    t = np.linspace(0.0, 1.0, max(int(np.ceil(gap_m / spacing_m)), 1) + 1)[1:-1]
     leave, arrive = gap_m * _outward(before), -gap_m * _outward(after[::-1])
-    return np.asarray(
-        (2 * t**3 - 3 * t**2 + 1) * start
-        + (t**3 - 2 * t**2 + t) * leave
-        + (3 * t**2 - 2 * t**3) * stop
-        + (t**3 - t**2) * arrive
-    )
+    return np.asarray(CubicHermiteSpline([0.0, 1.0], [start, stop], [leave, arrive])(t))
 
 
 _MAX_BRIDGE_M = 25.0  # longest gap that images' whole lines bridge, m
@@ -310,6 +300,5 @@ def _resample(points: FloatArray, spacing_m: float) -> FloatArray:
     # Binomial smoothing takes out the nodes' own lateral noise.
     inner = 0.25 * points[:-2] + 0.5 * points[1:-1] + 0.25 * points[2:]
     points = np.concatenate([points[:1], inner, points[-1:]])
-    along = length_along(points)
-    at = np.linspace(0.0, along[-1], max(round(float(along[-1]) / spacing_m), 1) + 1)
-    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
+    length_m = float(length_along(points)[-1])
+    return points_along(points, np.linspace(0.0, length_m, max(round(length_m / spacing_m), 1) + 1))

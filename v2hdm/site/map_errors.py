@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from v2hdm.geometry.planar import length_along
+from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
 _UNKNOWN_SIGMA_M = 0.02
@@ -223,8 +223,7 @@ def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
     """The earlier line of the same class that most of a new line lies on."""
     shares = []
     for one in lanes:
-        place, along = _stations(lane.points_map, one.points_map), length_along(one.points_map)
-        foot = np.column_stack([np.interp(place, along, axis) for axis in one.points_map.T])
+        foot = points_along(one.points_map, _stations(lane.points_map, one.points_map))
         near = np.linalg.norm(lane.points_map - foot, axis=1) <= _SAME_LINE_M
         shares.append(near.mean() * (one.kind == lane.kind))
     best = int(np.argmax(shares)) if shares else 0

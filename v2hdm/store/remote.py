@@ -279,8 +279,12 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
     found = {name: _entries(place, name, place.read(name)) for name in (LIST, UNFINISHED) if name in there}
     if there and not found:
         raise ConfigError(f"{place} holds objects that are no results of ours: give another place")
-    if UNFINISHED in found and found[UNFINISHED][0] not in ("", writer):
-        raise _of_another(place, found[UNFINISHED][0])
+    holder = found[UNFINISHED][0] if UNFINISHED in found else writer
+    if holder not in ("", writer):
+        raise ConfigError(
+            f"{place} is being written by {holder}, or was when that was stopped; wait for it, start it "
+            f"there again, or, where it is dead, remove {UNFINISHED}"
+        )
     entries = [one for _, listed in found.values() for one in listed]
     ours: dict[str, _Entry] = {}
     for name in {one.file for one in entries} & set(there):
@@ -293,7 +297,7 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
 
 
 def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: str, report: Report) -> None:
-    """Put a result in the place of an earlier one, whose objects that stay the same stay.
+    """Put a result in the place of an earlier one, which goes first.
 
     ``contents`` are objects by name, as bytes or as files. The same ``writer`` may go on after it was
     stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where a name is taken.
@@ -304,21 +308,16 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
         raise _foreign(place, name)
     begun = _listing([*ours.values(), *new.values()], writer)
     if not place.create(UNFINISHED, begun):
-        holder, _ = _entries(place, UNFINISHED, place.read(UNFINISHED))
-        if holder not in ("", writer):
-            raise _of_another(place, holder)
+        refuse_upload(place, writer)  # where another has begun just now
         place.write(UNFINISHED, begun)
     if place.read(LIST) != listing:
         place.remove(UNFINISHED)
         raise ConfigError(f"{place}: another process has just put a result there; start again")
-    place.remove(LIST)
-    for name in sorted(set(ours) - set(new)):
+    for name in (LIST, *ours):
         place.remove(name)
     for number, (name, content) in enumerate(contents.items()):
         report(number, len(contents))
-        if name in ours and ours[name].sha256 != new[name].sha256:
-            place.write(name, content)
-        elif name not in ours and not place.create(name, content):
+        if not place.create(name, content):
             raise _foreign(place, name)
     there, put = place.listed(), []
     for name, one in new.items():
@@ -354,13 +353,6 @@ def _listing(entries: Iterable[_Entry], writer: str = "") -> bytes:
 
 def _foreign(place: RemoteFolder, name: str) -> ConfigError:
     return ConfigError(f"{place}/{name}: is no object of ours; move it, or give another place")
-
-
-def _of_another(place: RemoteFolder, writer: str) -> ConfigError:
-    return ConfigError(
-        f"{place} is being written by {writer}, or was when that was stopped; wait for it, start it there "
-        f"again, or, where it is dead, remove {UNFINISHED}"
-    )
 
 
 def _digest(data: bytes) -> str:

@@ -15,7 +15,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from v2hdm.store.lock import HOST, take_lock
 _log = logging.getLogger(__name__)
 
 _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
+WriteFile = Callable[[str, bytes], None]  # called with a name and the content
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)  # the disk is at fault
 
 
@@ -289,23 +289,16 @@ def listed_files(folder: Path, option: str, made: str) -> Iterator[Callable[[Pat
         yield name_of
 
 
-@dataclass(frozen=True)
-class GrowingFolder:
-    """A folder whose files are written one by one, each at once."""
-
-    _there: _Target
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write the file ``name``; raises ConfigError where that is not ours or cannot be."""
-        with self._there.explained(), whole_file(self._there.path / name) as partial:
-            partial.write_bytes(data)
-
-
 @contextmanager
-def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[GrowingFolder]:
-    """``folder`` to write single files into, each listed first; errors as :func:`listed_files`."""
+def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[WriteFile]:
+    """Yield what writes a named file into ``folder``, listed first; errors as :func:`listed_files`."""
     with _locked(folder, option) as there:
         target = there.path
+
+        def write(name: str, data: bytes) -> None:
+            with there.explained(), whole_file(target / name) as partial:
+                partial.write_bytes(data)
+
         with there.explained():
             is_new = there.listed() is None
             target.mkdir(exist_ok=True)
@@ -313,7 +306,7 @@ def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[Growin
                 _write_list(target, made)
         try:
             with listed_files(folder, option, made):
-                yield GrowingFolder(there)
+                yield write
         finally:
             if is_new and not any((target / name).is_file() for name in files_of_result(target)):
                 (target / LIST).unlink(missing_ok=True)

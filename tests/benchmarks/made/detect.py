@@ -9,9 +9,10 @@ from functools import partial
 import numpy as np
 
 from tests.benchmarks.made.world import World
+from tests.cameras import apply
 from v2hdm.association.sightings import row_shares
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.rigid import apply, camera_centre
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     DIAMOND,
     LANE_DASH,

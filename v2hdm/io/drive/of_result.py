@@ -57,6 +57,19 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     return drive
 
 
+def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:
+    """The drive of the result in ``folder``, as :func:`drive_of`; refused where it is gone, or several.
+
+    ``what`` says what is made of one drive alone.
+    """
+    drive = drive_of(folder, path)
+    if drive is None:
+        raise DriveError(f"{folder}: its drive is not where it was; give its folder with --drive")
+    if drive.joined:
+        raise MapFileError(f"{folder} is of several drives; {what} of one: map them one by one")
+    return drive
+
+
 def _options(stated: Mapping[str, Any]) -> ReadOptions:
     known = {one.name: stated[one.name] for one in fields(ReadOptions) if one.name in stated}
     try:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
 
@@ -216,8 +217,7 @@ def along_route(points_map: FloatArray) -> Stations:
             x0, y0 = x, y
     starts = np.array([*first, len(points_map)])
     centres = _means(points_map, starts)
-    steps_m = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    return Stations(starts, centres, np.concatenate([[0.0], np.cumsum(steps_m)]))
+    return Stations(starts, centres, length_along(centres))
 
 
 def local_lines(stations: Stations, values: FloatArray, width_m: float) -> FloatArray:
@@ -280,8 +280,7 @@ def unevenness(road: Road, reach_m: float) -> Unevenness:
 
     The ground is known along the path by its heights, beside it by its slope, so that its cross-fall counts.
     """
-    steps_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
-    station_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    station_m = length_along(road.points_map)
     # Unit vectors to the left of the path, zero where it is a point.
     ahead = np.gradient(road.points_map, axis=0) if len(station_m) > 1 else np.zeros((1, 2))
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])

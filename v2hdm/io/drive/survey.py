@@ -173,9 +173,7 @@ def _other_systems(table: SurveyTable, origin: GeodeticOrigin | None) -> list[st
     if authority.upper() == "EPSG" and code.isdecimal():
         systems = [f"EPSG:{int(code) - 1}", f"EPSG:{int(code) + 1}"]
     if origin is not None and table.frame is not Frame.GEODETIC:
-        utm = 32600 if origin.latitude_deg >= 0 else 32700
-        utm = 25800 if origin.datum.upper().startswith("ETRS") else utm
-        systems.append(f"EPSG:{utm + int((origin.longitude_deg + 180) // 6) % 60 + 1}")
+        systems.append(geodetic.utm_of(origin))
     return [crs for crs in systems if crs != table.crs]
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.mounting import LEVEL
 from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import FloatArray, Trajectory
@@ -71,7 +72,6 @@ class Readings:
     antenna: bool = field(default=False)
 
 
-_VEHICLE_FROM_CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _UPRIGHT = 0.5  # least cosine between the poses' z axis and up for poses of a ground vehicle
 _ROTATION_TOLERANCE = 1e-3
 
@@ -100,8 +100,7 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
     if wrong.any():
         raise DriveError(f"{path}: line {int(np.argmax(wrong)) + 1}: its 3 x 3 part is no rotation; mend it")
     if axes == "camera":
-        turn = _VEHICLE_FROM_CAMERA_AXES
-        rotation, points = turn @ rotation @ turn.T, points @ turn.T
+        rotation, points = LEVEL @ rotation @ LEVEL.T, points @ LEVEL.T
     elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
         raise DriveError(f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's")
     rows = in_order(stamp_s, str(path))

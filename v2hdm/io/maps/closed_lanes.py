@@ -8,6 +8,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
+from v2hdm.geometry.planar import length_along
 from v2hdm.records import FloatArray, IntArray
 
 LANE_WIDTH_M = (2.55, 5.1)
@@ -49,7 +50,7 @@ class _Cuts:
     """Vertices at which a line is cut, at least the width of a narrow lane apart along it."""
 
     def __init__(self, line: FloatArray) -> None:
-        self._along_m = np.insert(np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)), 0, 0.0)
+        self._along_m = length_along(line)
         self.vertices: list[int] = []
 
     def at(self, vertex: int) -> int:
@@ -113,7 +114,7 @@ def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
                     continue
                 run = slice(begin, end + 1)
                 met = lines_map[other[begin]][nearest[run]]
-                if min(_length(line[run]), _length(met)) > gap_m[run].max():
+                if min(length_along(line[run])[-1], length_along(met)[-1]) > gap_m[run].max():
                     own = np.arange(begin, end + 1)
                     runs.append(_Run(number, own, int(other[begin]), nearest[run], side))
     return runs
@@ -183,7 +184,3 @@ def _stretches(other: IntArray, gap_m: FloatArray) -> list[tuple[int, int]]:
     meets = np.where(gap_m > LANE_WIDTH_M[0], other, -1)
     runs = [(key, list(group)) for key, group in groupby(range(len(meets)), key=lambda k: int(meets[k]))]
     return [(run[0], run[-1]) for key, run in runs if key >= 0 and len(run) > 1]
-
-
-def _length(points: FloatArray) -> float:
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())

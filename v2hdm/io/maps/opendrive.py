@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.geometry.geodetic import crs_of
+from v2hdm.geometry.planar import length_along
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, FloatArray, HdMap
@@ -43,7 +44,7 @@ class _Road:
     @property
     def s_m(self) -> FloatArray:
         """The distance of each vertex along the line (N,)."""
-        return np.insert(np.cumsum(np.linalg.norm(self.steps, axis=1)), 0, 0.0)
+        return length_along(self.xyz[:, :2])
 
     def nearest(self, point: FloatArray) -> tuple[float, int, float]:
         """Distance of a point (2,), the segment that it is nearest to, and how far along that, m."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
+from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.calibration.reading import read_calibration
@@ -23,7 +24,6 @@ from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
-from v2hdm.report.metrics import way_along
 from v2hdm.store.files import load_json, load_yaml, read_text, take_number
 
 BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
@@ -43,7 +43,7 @@ class Route:
     @property
     def way_m(self) -> FloatArray:
         """How far the vehicle has driven (F,), m."""
-        return way_along(self.map_from_vehicle[:, :2, 3])
+        return length_along(self.map_from_vehicle[:, :2, 3])
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from v2hdm.geometry.mounting import angle_sigmas, centre_sigmas, mounting_angles
+from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
-from v2hdm.report.metrics import corner_errors, length_m, match_markings
+from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
 from v2hdm.report.page.layers import SIGMAS_95, ellipses
 from v2hdm.report.terminal import AGAINST_TRUTH, METHODS, WITHOUT_TRUTH
@@ -211,7 +212,7 @@ def content_table(facts: Facts) -> Table | None:
     for form, every in drawn.items():
         for name, own in _by_kind(every).items():
             lanes = [one for one in own if isinstance(one, Lane)]
-            length = number(sum(length_m(one.points_map) for one in lanes) if lanes else None, 1)
+            length = number(sum(length_along(one.points_map)[-1] for one in lanes) if lanes else None, 1)
             sightings = number(float(np.median([one.sightings for one in own])), 0)
             rows.append([name_of(name), form, str(len(own)), length, sightings])
     return table(("class", "as", "count", "length (m)", "sightings"), rows, words=2)

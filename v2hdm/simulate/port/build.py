@@ -13,8 +13,9 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.mounting import cam_from_mounting
 from v2hdm.geometry.planar import winding
-from v2hdm.geometry.rigid import camera_centre, make_transform, rotation_from_euler
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.config import (
     CalibrationConfig,
@@ -231,10 +232,6 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
     return parts.GroundMarks(factor=factor, origin_map=(float(low[0]), float(low[1])), resolution_m=_RASTER_M)
 
 
-# Columns: the camera's x, y and z axes (right, down, forward) in a frame with x forward, y left, z up.
-_FORWARD_LEFT_UP_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-
-
 def camera_info(name: str, config: CameraConfig) -> CameraInfo:
     """The intrinsics of a configured camera."""
     focal = config.focal_px
@@ -247,9 +244,8 @@ def camera_info(name: str, config: CameraConfig) -> CameraInfo:
 
 def cam_from_vehicle(mount: MountConfig) -> FloatArray:
     """The extrinsic (4 x 4) of a mount: the camera looks along x, then turns by yaw, pitch and roll."""
-    angles = (np.deg2rad([a]) for a in (mount.roll_deg, mount.pitch_deg, mount.yaw_deg))
-    turned = (rotation_from_euler(*angles)[0] @ _FORWARD_LEFT_UP_FROM_OPTICAL).T
-    return make_transform(turned, -turned @ (mount.x_m, mount.y_m, mount.z_m))
+    angles_rad = np.deg2rad([mount.roll_deg, mount.pitch_deg, mount.yaw_deg])
+    return cam_from_mounting(np.array([mount.x_m, mount.y_m, mount.z_m]), angles_rad)
 
 
 def calibrate(

@@ -9,7 +9,7 @@ From radiance to a recorded image: blur of lens and motion, exposure, noise, sRG
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Any
@@ -28,6 +28,7 @@ from v2hdm.simulate.render.scene import (
     Box,
     Float32,
     Light,
+    Picture,
     Scene,
     Shadow,
     box_footprint,
@@ -45,12 +46,17 @@ _FARTHEST_M = 250.0
 
 @dataclass(frozen=True)
 class _Face:
-    """A rectangle: its corners (4, 3), its axes from the first corner with their lengths, its normal."""
+    """A rectangle: its corners (4, 3), its normal, and whether it is a side of its box."""
 
     corners_map: FloatArray
     normal: FloatArray
     upright: bool
-    picture: NDArray[np.uint8] | None = None
+    picture: Picture | None = None
+
+    @property
+    def sides_m(self) -> FloatArray:
+        """Lengths (2,) of the edges from the first corner to the second and to the last."""
+        return np.asarray(np.linalg.norm(self.corners_map[[1, 3]] - self.corners_map[0], axis=1))
 
 
 def draw_boxes(
@@ -121,30 +127,12 @@ def _draw_face(
             continue
         if box.corrugated and face.upright:
             waves = np.sin(seen[1] * np.float32(2 * np.pi / _CORRUGATION_M))
-        albedo = _albedo(box, face, *seen[1:])
+        albedo = box.albedo_bgr if face.picture is None else face.picture(face.sides_m, *seen[1:])
         parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
         colour = np.stack(parts).reshape(3, *(parts[0].shape or (1, 1)))  # (3, 1, 1) where it is one tone
         kernels.draw_face(
             window, seen, _DIRT_TILE.padded, scale, waves, face.upright, colour, radiance, hidden
         )
-
-
-def _albedo(
-    box: Box, face: _Face, along_m: Float32, up_m: Float32, footprint_m: Float32
-) -> Sequence[float] | Float32:
-    """Reflectance of a face in blue, green and red: its box's colour, or its picture's (3, h, w)."""
-    if face.picture is None:
-        return box.albedo_bgr
-    origin, first, _, last = face.corners_map
-    sides_m = np.array([np.linalg.norm(first - origin), np.linalg.norm(last - origin)])
-    # Fewer texels than pixels would shimmer: the picture is first averaged to the size it is seen at.
-    most = np.ceil(sides_m / max(float(np.median(footprint_m)), 1e-4)).astype(int)
-    columns, rows = (int(n) for n in np.clip(most, 1, face.picture.shape[1::-1]))
-    picture = cv2.resize(face.picture, (columns, rows), interpolation=cv2.INTER_AREA)
-    u = along_m * np.float32(columns / sides_m[0]) - np.float32(0.5)
-    v = np.float32(rows - 0.5) - up_m * np.float32(rows / sides_m[1])
-    shown = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.moveaxis(shown.astype(np.float32) * np.float32(1 / 255), 2, 0)
 
 
 def _plane_of(face: _Face, view: View) -> Float32:

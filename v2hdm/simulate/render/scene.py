@@ -95,6 +95,10 @@ Bgr = tuple[float, float, float]
 Shade = Callable[[Any, Any, NDArray[np.float32]], None]
 """Lowers the sun's visibility (H, W) on the ground, of which a view and its ground field are given."""
 
+Picture = Callable[[FloatArray, Float32, Float32, Float32], Float32]
+"""Reflectance (3, h, w) in blue, green and red of pixels on a side of a box: of that side's length and height
+(2,), and of each pixel's place (h, w) along and up it and the length that it covers; all m."""
+
 WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
 YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
 
@@ -159,8 +163,8 @@ class Box:
     """An upright cuboid that hides what lies behind it and casts a shadow: container, truck, wall, pole.
 
     ``centre_map`` is the centre of its footprint, ``size_m`` its length, width and height,
-    ``base_m`` the height of its lower side. ``pictures`` (h, w, 3) uint8 fill its left, rear, right and front
-    side and its top, as seen from outside: reflectance in 255ths, in place of the colour; None leaves that.
+    ``base_m`` the height of its lower side. ``pictures`` are of its left, rear, right and front side and its
+    top, as seen from outside, in place of the colour; None leaves that.
     """
 
     centre_map: tuple[float, float]
@@ -169,7 +173,7 @@ class Box:
     albedo_bgr: Bgr = (0.3, 0.3, 0.3)
     base_m: float = 0.0
     corrugated: bool = False
-    pictures: tuple[NDArray[np.uint8] | None, ...] = ()
+    pictures: tuple[Picture | None, ...] = ()
     seed: int = 0
 
 

@@ -12,9 +12,10 @@ from enum import Enum
 
 import numpy as np
 
+from v2hdm.geometry.planar import angle_between
 from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
 from v2hdm.records import BoolArray, FloatArray
-from v2hdm.verdict.inputs.poses import STEEPEST_DEG, Chords, Motion, angle_between
+from v2hdm.verdict.inputs.poses import STEEPEST_DEG, Chords, Motion
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 # Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m.

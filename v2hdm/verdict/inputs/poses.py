@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from v2hdm.geometry.planar import angle_between, length_along
 from v2hdm.ground.motion import trajectory_of_images
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
@@ -128,12 +129,6 @@ class Motion:
         return start + 1 + int(reached[0]) if len(reached) else None
 
 
-def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Angles (N,), rad within +-pi, from plane vectors (N, 2) to others, counter-clockwise."""
-    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    return np.asarray(np.arctan2(cross, (first * second).sum(axis=1)))
-
-
 def check_path(motion: Motion) -> list[Finding]:
     """Whether the path is one that a road vehicle drives in metres and seconds."""
     if not len(motion.chords):
@@ -169,7 +164,7 @@ def _hardly_moves(motion: Motion) -> Finding:
 
 def _is_smooth(motion: Motion) -> bool:
     """Whether most chords are driven at a vehicle's speed and about as long as the way between their ends."""
-    way = np.concatenate([[0.0], np.cumsum(motion.step_m)])
+    way = length_along(motion.position[:, :2])
     chords = motion.chords
     straight = motion.speed_mps * (motion.stamp_s[chords.last] - motion.stamp_s[chords.first])
     directed = straight > 0.8 * (way[chords.last] - way[chords.first])

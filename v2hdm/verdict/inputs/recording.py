@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TypeVar
 
@@ -157,7 +158,8 @@ def _shared(drive: Drive) -> list[Finding]:
 
 def _frozen(name: str, images: Sequence[Image]) -> Finding:
     """The share of images that repeat the one before while the vehicle moves."""
-    moving = [k for k in range(1, len(images)) if _distance_m(images[k - 1], images[k]) > _MOVED_M]
+    steps_m = np.diff([image.map_from_vehicle[:2, 3] for image in images], axis=0)
+    moving = (np.flatnonzero(np.linalg.norm(steps_m, axis=1) > _MOVED_M) + 1).tolist()
     if not moving:
         says = "the vehicle does not move between the images, so that repeated ones cannot be told"
         return passed("frozen images", name, says)
@@ -169,13 +171,15 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         if len(alike) > 1:  # one alone may be a dropped frame
             share, at = len(alike) / len(sampled), alike
     if share <= _FROZEN:
-        begin, length = _longest_run(copied)
-        if length >= _STUCK:
+        # Successive numbers are as far from their places among all.
+        runs = [[k for _, k in run] for _, run in groupby(enumerate(copied), lambda one: one[1] - one[0])]
+        longest = max(runs, key=len, default=[])
+        if len(longest) >= _STUCK:
             says = (
-                f"{length + 1} images in a row from {images[begin - 1].stamp_s:.2f} s on are one and the "
-                "same while the vehicle moves: the camera froze there; drop the repeats from the list"
+                f"{len(longest) + 1} images in a row from {images[longest[0] - 1].stamp_s:.2f} s on are one "
+                "and the same while the vehicle moves: the camera froze there; drop the repeats from the list"
             )
-            return Finding("frozen images", Status.WARN, float(length), _STUCK - 1.0, "", says, name)
+            return Finding("frozen images", Status.WARN, float(len(longest)), _STUCK - 1.0, "", says, name)
     where = f", first at {images[at[0]].stamp_s:.2f} s" if at else ""
     return judge(
         "frozen images", name, share, _FROZEN, "",
@@ -183,17 +187,6 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         wrong=f"{100 * share:.0f} % of the images repeat the one before while the vehicle moves{where}: the "
         "camera froze, or one file is listed several times; drop the repeats from the list",
     )  # fmt: skip
-
-
-def _longest_run(numbers: Sequence[int]) -> tuple[int, int]:
-    """The first of the most successive ``numbers`` and how many these are."""
-    best, begin = (0, 0), 0
-    for k, number in enumerate(numbers):
-        if k and number != numbers[k - 1] + 1:
-            begin = k
-        if k + 1 - begin > best[1]:
-            best = numbers[begin], k + 1 - begin
-    return best
 
 
 def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Finding]:
@@ -218,10 +211,6 @@ def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Fi
             "camera's exposure for the road",
             status=Status.WARN,
         )  # fmt: skip
-
-
-def _distance_m(first: Image, second: Image) -> float:
-    return float(np.linalg.norm(second.map_from_vehicle[:2, 3] - first.map_from_vehicle[:2, 3]))
 
 
 def _same_file(first: Path, second: Path) -> bool:
