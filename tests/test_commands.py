@@ -4,6 +4,7 @@ import errno
 import io
 import os
 import re
+import resource
 import subprocess
 import sys
 import tomllib
@@ -92,6 +93,30 @@ def test_help_that_nobody_reads_to_its_end_is_no_error(arguments):
             [sys.executable, "-m", *arguments], cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, timeout=60
         )
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    ("dies", "says"),
+    [
+        (
+            "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+            "ended by signal 11 under ulimit -v; the memo",
+        ),
+        ("raise ImportError('a.so: failed to map segment from shared object')", "the memory is not enough"),
+        ("raise RuntimeError('std::bad_alloc')", "the memory is not enough"),
+    ],
+)
+def test_libraries_that_die_for_want_of_memory_are_one_line_and_exit_code_2(dies, says, tmp_path):
+    (tmp_path / "cv2.py").write_text(dies)
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    done = subprocess.run(
+        [sys.executable, "-m", "v2hdm", "detect", "a.jpg"],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (2**40, most)),
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert done.stderr.startswith(f"error: {says}")
 
 
 class FullDisk(io.StringIO):

@@ -2,10 +2,13 @@
 
 import os
 import re
+import subprocess
+import sys
 import tarfile
 import tomllib
 import zipfile
 from email.parser import Parser
+from pathlib import Path
 
 import pytest
 import yaml
@@ -107,6 +110,13 @@ def test_the_workflow_runs_what_a_change_must_pass():
     steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
     assert [step["run"] for step in steps if "run" in step] == [".ci/run"]
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
+
+
+def test_an_audit_that_reaches_no_advisories_says_so():
+    place = f"BIN={Path(sys.executable).parent}", "ADVISORIES=http://127.0.0.1:9/"
+    command = ["make", "--old-file", ".venv/.installed-dev", *place, "audit"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "audit skipped: no advisories at http://127.0.0.1:9/\n"
 
 
 @pytest.mark.parametrize("name", ["fast", "fleet"])

@@ -41,12 +41,15 @@ class AdjustError(V2hdmError):
 EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
 
+_NO_MEMORY = ("bad_alloc", "llocate memory", "ailed to allocate", "map segment", "nsufficient memory")
+"""From what torch, onnxruntime, OpenCV and the loader of libraries say of it, none by a MemoryError."""
+
 
 def describe(error: BaseException) -> str | None:
     """An error in one line, as a user reads it; None for what is a bug of ours."""
     if isinstance(error, V2hdmError):
         return str(error)
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
         return "the memory is not enough for this; give less at once, or fewer workers"
     # Disks that are full, gone or read-only can fail any call.
     if isinstance(error, OSError) and not isinstance(error, ConnectionError):

@@ -135,6 +135,16 @@ def video(tmp_path_factory):
     return path
 
 
+def test_images_of_one_name_are_drawn_one_by_one(bench, tmp_path):
+    source, drawn = tmp_path / "source", tmp_path / "drawn"
+    source.mkdir()
+    for name in ("a.png", "a.b.png", "a_b.png", "a.tif", "A.png"):
+        (source / name).symlink_to(bench.folder / "0.png")
+    for _ in range(2):
+        assert bench.run(source, "--draw", drawn) == 0
+        assert len(list(drawn.glob("*.jpg"))) == 5
+
+
 def test_a_video_gives_a_line_a_frame_with_its_time(bench, video, tmp_path, capsys):
     assert bench.run(video, "--draw", tmp_path) == 0
     records = lines(capsys.readouterr().out)

@@ -274,6 +274,13 @@ def test_a_pose_whose_quality_is_left_blank_has_no_fix(tmp_path):
     assert read_table(path, {}, tmp_path, "here").sigma_m.tolist() == [0.02, np.inf, np.inf]
 
 
+def test_positions_that_do_not_say_how_sure_they_are_are_left_out_among_those_that_do(tmp_path, caplog):
+    lines = [f"{k / 10},{k / 10},0,0,{'' if k in (3, 4) else 0.02}" for k in range(20)]
+    (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,yaw_deg,sigma_m", *lines]))
+    assert len(read({"csv": "route.csv"}, tmp_path).trajectory.stamp_s) == 18
+    assert "left out 2 of 20 positions" in caplog.text
+
+
 @pytest.mark.parametrize("axes", ["vehicle", "camera"])
 def test_rows_of_kitti_have_their_times_beside_them(axes, tmp_path):
     stamp_s, points, yaw = curve()

@@ -22,6 +22,7 @@ from tests.calibration.site import INFO
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
 from tests.faults.judge import Case, Prepare
 from tests.faults.owners import geopackages, owners
+from tests.faults.small import small
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.pipeline.config import PortConfig, RunConfig
@@ -640,7 +641,7 @@ SETTINGS = _plainly(
     "drive.path=straße": "wants quotes",
     "mapping=null": "mapping",
     "drive.cameras=front": "drive.cameras",
-    "--config-name=x": "'x'",
+    "--config-name=x": "no option --config-name=x",
 }
 SIMULATED = _plainly(
     "simulate.seed=-1 simulate.cameras.front.width=0 simulate.cameras.front.width=100000 "
@@ -740,5 +741,8 @@ def _run_file(data: bytes) -> Prepare:
 
 def all_cases() -> list[Case]:
     """The table."""
-    parts = (texts, points, names, images, fields, outputs, owners, geopackages, arguments, settings, numbers)
+    parts = (
+        texts, points, names, images, fields, outputs, owners, geopackages, small, arguments, settings,
+        numbers,
+    )  # fmt: skip
     return [case for part in parts for case in part()]

@@ -1,5 +1,6 @@
 """Whatever a user gives ends in a value or in one line that says what is wrong."""
 
+import os
 import tarfile
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from tests.faults.judge import HYDRA_DOORS, judge
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import DriveError, V2hdmError
-from v2hdm.io.safe.texts import parse_json, parse_yaml, shown, take_name
+from v2hdm.io.safe.pixels import read_header
+from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text, shown, take_name
 
 CASES = all_cases()
 QUICK = [case for number, case in enumerate(CASES) if case.door not in HYDRA_DOORS or number % 8 == 0]
@@ -138,6 +140,14 @@ def test_what_is_whole_is_read(tmp_path, name):
     write, read = READERS[name]
     write(tmp_path / "file")
     assert read(tmp_path / "file") is not None
+
+
+@pytest.mark.parametrize("read", [lambda path: read_text(path, DriveError), read_header])
+def test_a_file_larger_than_any_is_refused_before_it_is_read(read, tmp_path):
+    (tmp_path / "a").touch()
+    os.truncate(tmp_path / "a", 1 << 32)
+    with pytest.raises(DriveError, match="4295 MB"):
+        read(tmp_path / "a")
 
 
 def test_every_text_of_the_table_is_refused_by_the_gate_or_by_its_form():

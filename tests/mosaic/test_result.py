@@ -121,7 +121,7 @@ def test_what_is_no_result_ends_in_one_line(spoil, says, result, tmp_path, capsy
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("resolution", ["0", "-1", "2"])
+@pytest.mark.parametrize("resolution", ["0", "-1", "2", "1e-9", "nan", "inf"])
 def test_a_resolution_that_makes_no_mosaic_is_one_line(resolution, result, capsys):
     assert run(["mosaic", str(result), f"--resolution={resolution}"]) == 2
     assert "resolution of" in capsys.readouterr().err

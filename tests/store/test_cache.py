@@ -1,5 +1,7 @@
 """The stage cache gives back what was put or nothing, and stays below its limit."""
 
+import errno
+import fcntl
 import json
 import logging
 import os
@@ -30,7 +32,7 @@ from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
 from v2hdm.store.cache import CodecError, StageCache, decode, encode
 from v2hdm.store.folders import LIST, note_use
-from v2hdm.store.lock import IN_USE, in_use
+from v2hdm.store.lock import IN_USE, in_use, take_lock
 from v2hdm.store.pruning import DRIVES, items_of, prune
 from v2hdm.store.results import result_folder
 
@@ -297,6 +299,16 @@ def test_a_lock_that_cannot_be_looked_at_counts_as_held(cache):
     held.mkdir()  # opened, it is an error that is not its absence
     os.utime(held, (1001, 1001))
     assert [item.path.stem for item in prune(cache, 0)] == KEYS[:1]
+
+
+def test_a_file_system_without_locks_is_reported(tmp_path, monkeypatch, caplog):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with (tmp_path / "a.lock").open("w") as stream:
+        assert take_lock(stream)
+    assert "a.lock: no lock can be held here" in caplog.text
 
 
 def test_what_killed_runs_have_left_goes(cache):

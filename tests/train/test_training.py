@@ -100,6 +100,21 @@ def test_a_missing_and_a_damaged_checkpoint_are_named(tmp_path):
         load_checkpoint(tmp_path / "last.pt")
 
 
+class Evil:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_no_code_of_a_checkpoint_is_run(tmp_path):
+    torch.save({"config": Evil(tmp_path / "ran")}, tmp_path / "last.pt")
+    with pytest.raises(ConfigError, match="is no checkpoint"):
+        load_checkpoint(tmp_path / "last.pt")
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
     saved = Checkpoint(config=asdict(TrainConfig()), step=7, averaged={"w": torch.arange(3.0)}, best_iou=0.5)
     save_checkpoint(saved, tmp_path / "deep" / "last.pt")

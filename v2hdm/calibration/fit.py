@@ -38,6 +38,9 @@ _WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one s
 STATED_AS = 4.0  # observations that the stated errors count for: people know theirs to a factor of about 1.4
 UNKNOWNS = 6  # of a mounting
 _LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated
+_LEAST_SHARE = (
+    1e-12  # of its trace: so it does where one direction's variance, near the horizon, dwarfs the other's
+)
 _SUBSETS = 300  # subsets of four points that are tried; of ten points these are all 210
 _REFINED = 4  # starts that are refined
 # Rounds of expectation maximisation after which a refinement ends, and steps of each, converged or not.
@@ -96,8 +99,9 @@ class Seen:
         by_ground = self.by_pinhole @ homography_jacobian(pinhole_from_ground, self.points_vehicle)
         # a point behind the camera has no pixel to err by.
         by_ground = np.nan_to_num(by_ground, nan=0.0, posinf=0.0, neginf=0.0)
-        clicked = (self.noise.pixel_px**2 + _LEAST_VARIANCE_PX2) * np.eye(2)
-        return np.asarray(clicked + self.noise.survey_m**2 * by_ground @ np.swapaxes(by_ground, -1, -2))
+        surveyed = self.noise.survey_m**2 * by_ground @ np.swapaxes(by_ground, -1, -2)
+        least = _LEAST_VARIANCE_PX2 + _LEAST_SHARE * np.trace(surveyed, axis1=-2, axis2=-1)
+        return np.asarray(surveyed + (self.noise.pixel_px**2 + least)[..., None, None] * np.eye(2))
 
     def residual_px(self, cam_from_vehicle: FloatArray) -> FloatArray:
         """Predicted less recorded pixels (..., N, 2), to first order; far off behind the camera."""

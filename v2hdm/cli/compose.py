@@ -66,7 +66,9 @@ def work_on(
     parser.add_argument("--help", "-h", action="store_true")
     parser.add_argument("--config-dir", "-cd", type=Path, action="append", default=[])
     parser.add_argument("--cfg", "-c", choices=["job"])
-    parsed = parser.parse_intermixed_args(arguments)
+    parsed, unknown = parser.parse_known_intermixed_args(arguments)
+    if unknown:
+        raise ConfigError(f"there is no option {unknown[0]}; {command.name} --help lists them")
     if parsed.help:
         from v2hdm.cli.keys_help import help_text
 

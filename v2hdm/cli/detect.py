@@ -74,7 +74,7 @@ def _detect(parsed: argparse.Namespace) -> None:
 
     cv2.setNumThreads(1)
     stopwatch, live = Stopwatch(), parsed.live or parsed.source.isdecimal()
-    dropped, age_s = 0, deque[float](maxlen=KEPT)
+    dropped, age_s, drawn_as = 0, deque[float](maxlen=KEPT), set[str]()
     frames = detect_images(
         parsed.source,
         camera=parsed.camera,
@@ -103,7 +103,11 @@ def _detect(parsed: argparse.Namespace) -> None:
                     markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
                     drawn = draw_detections(frame.pixels, markings, lanes)
                     _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
-                    write_drawing(f"{frame.name}.jpg", packed.tobytes())
+                    name = frame.name  # images of several folders or endings may share it
+                    while name.casefold() in drawn_as:
+                        name += "_"
+                    drawn_as.add(name.casefold())
+                    write_drawing(f"{name}.jpg", packed.tobytes())
         except KeyboardInterrupt:
             if not live:
                 raise

@@ -128,7 +128,22 @@ _OLD = {"calibrate": "calibrate points", "extrinsic": "calibrate ground", "calib
 def main(arguments: Sequence[str] | None = None) -> int:
     """Be the process of a command line; returns the exit code."""
     answer_signals()
-    return run(sys.argv[1:] if arguments is None else arguments)
+    child = os.fork() if _is_limited() else 0
+    if child == 0:
+        return run(sys.argv[1:] if arguments is None else arguments)
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, lambda number, _: os.kill(child, number))
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    return code if code >= 0 else _fail(f"ended by signal {-code} under ulimit -v; {describe(MemoryError())}")
+
+
+def _is_limited() -> bool:
+    """Whether libraries may die of the limit of memory that this process has, without a word (SIGSEGV)."""
+    if sys.platform == "win32":
+        return False
+    import resource
+
+    return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
 
 
 def script() -> int:

@@ -51,7 +51,7 @@ class Frame:
     """One image (H, W, 3) uint8 BGR to look at.
 
     ``source`` is its file, or the video or camera it comes from, ``index`` its number there. ``stamp_s`` is
-    the time within a video, Unix time for a live camera, None for a file. ``name`` is unique. ``dropped``
+    the time within a video, Unix time for a live camera, None for a file. ``name`` names it. ``dropped``
     counts the live images before it that nobody has looked at, since newer ones came.
     """
 

@@ -29,7 +29,6 @@ _RANGES = dict.fromkeys(
         "max_range_m", "loss_scale",
         "association.ipm_sigma_rad", "association.refined_sigma_rad", "association.gate_sigmas",
         "association.max_gate_m",
-        "lanes.node_spacing_m", "lanes.half_width_m", "lanes.half_length_m",
         "known_sizes.sigma_m", "known_sizes.tolerance",
         "survey.sigma_m", "survey.reach_m",
     ),
@@ -43,6 +42,9 @@ _RANGES = dict.fromkeys(
         "lanes.min_images",
     ),
     NOT_NEGATIVE,
+) | dict.fromkeys(
+    # From half the width of a painted line, 0.1 m: less holds no line's paint.
+    ("lanes.node_spacing_m", "lanes.half_width_m", "lanes.half_length_m"), Within(0.05),
 ) | {"rounds": Within(1, 100), "acceptance.min_probability": Within(0, 1 - 1e-9, open=True)}  # fmt: skip
 
 

@@ -180,7 +180,9 @@ def assemble(
 
 
 def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArray:
-    unsure = readings.sigma_m > max_sigma_m
+    # Among positions that state how sure they are, one that does not is no fix.
+    states = np.isfinite(readings.sigma_m).any()
+    unsure = ~(readings.sigma_m <= max_sigma_m) if states else readings.sigma_m > max_sigma_m
     if unsure.all():
         stated = readings.sigma_m[np.isfinite(readings.sigma_m)]
         best = f"the best is {stated.min():.2g} m" if len(stated) else "none is a fix"
@@ -190,7 +192,7 @@ def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArra
         )
     if unsure.any():
         _log.warning(
-            "%s: left out %d of %d positions, stated to be less sure than %g m (no RTK fix; max_sigma_m)",
+            "%s: left out %d of %d positions, not stated to be as sure as %g m (no RTK fix; max_sigma_m)",
             where, int(unsure.sum()), len(unsure), max_sigma_m,
         )  # fmt: skip
     return np.asarray(~unsure)

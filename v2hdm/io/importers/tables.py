@@ -229,7 +229,9 @@ def _parse(name: str, cell: str, where: str) -> float:
             moment = datetime.fromisoformat(cell)
             return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
         if name in _SURENESS:
-            return float(cell or "nan")
+            if (value := float(cell or "nan")) >= 0 or np.isnan(value):
+                return value
+            raise DriveError(f"{where}: {cell} is negative, and no such number is; mend that line")
     except ValueError:
         kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number"
         raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None

@@ -246,7 +246,10 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
     def optional(key: str, take: Callable[..., Any], *how: Any) -> Any:
         # Properties of each point mean nothing without the points.
         known = properties.get(key) if key not in EXACT or len(points) else None
-        return None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
+        value = None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
+        if value is not None and "sigma" in key and np.min(value, initial=0.0) < 0:
+            raise MapFileError(f"{where}, {key}: a standard deviation is negative; mend it or leave it out")
+        return value
 
     left = [optional(name, take_number) for name in PAINT]
     return Feature(

@@ -155,7 +155,7 @@ def position_row(kind: str, fields: Any) -> Row:
     if kind == FIX:
         sigma_m = np.nan
         if fields.position_covariance_type:
-            sigma_m = _sigma((fields.position_covariance[0] + fields.position_covariance[4]) / 2)
+            sigma_m = _sigma(fields.position_covariance[0], fields.position_covariance[4])
         if fields.status.status <= _NO_FIX:
             sigma_m = np.inf
         return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
@@ -188,6 +188,8 @@ def readings_of(
     heading_s, turned = headings or (stamp_s, rows[:, 4:])
     by_time = in_order(heading_s, where, "message of the heading")
     heading_s, turned = heading_s[by_time], turned[by_time]
+    if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
+        raise DriveError(f"{where}: a message states a variance below 0; record it anew with 0, not known")
     # A dual antenna writes nan where it has none.
     known = np.isfinite(turned[:, :4]).all(axis=1)
     attitudes = None
@@ -203,7 +205,7 @@ def _pose(pose: Any, covariance: Any) -> Row:
     place = pose.position
     sigma_m, sigma_rad = np.nan, np.nan
     if covariance is not None:
-        sigma_m, sigma_rad = _sigma((covariance[0] + covariance[7]) / 2), _sigma(covariance[_YAW])
+        sigma_m, sigma_rad = _sigma(covariance[0], covariance[7]), _sigma(covariance[_YAW])
     return (place.x, place.y, place.z, sigma_m, *_quaternion(pose.orientation), sigma_rad)
 
 
@@ -211,6 +213,12 @@ def _quaternion(orientation: Any) -> Row:
     return (orientation.x, orientation.y, orientation.z, orientation.w)
 
 
-def _sigma(variance: float) -> float:
-    """Standard deviation, nan of a variance that stands for "not known"."""
-    return float(np.sqrt(variance)) if variance > 0 else np.nan
+def _sigma(*variances: float) -> float:
+    """Root of the mean of variances, nan where nan, 0 or sensor_msgs' -1 stand for "not known".
+
+    A negative variance comes back as it is.
+    """
+    least, mean = min(variances), float(np.mean(variances))
+    if least < 0:
+        return np.nan if least == -1 else least
+    return float(np.sqrt(mean)) if mean > 0 else np.nan

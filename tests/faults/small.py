@@ -1,0 +1,225 @@
+"""Bad inputs that are small: numbers that no sensor, survey, map or setting has, in tables of each format."""
+
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import yaml
+
+from tests.calibration.site import INFO, clicked, write_table
+from tests.drive.bags import Messages, StoragePlugin, messages_of, mountings, write_ros2
+from tests.drive.example import make_drive, make_map
+from tests.drive.test_bags import described
+from tests.faults.judge import Case
+from v2hdm.io.calibration.writing import write_camera_info
+from v2hdm.io.maps.geojson import write_geojson
+
+LONG = "9" * 200_000
+CHECKED = ("drive", "--no-ground", "--workers", "1", "--output", "out")
+NO_SIGMAS = ("-1", "-0.01", "-1e-9", "-inf")
+NO_NUMBERS = (*NO_SIGMAS, "x", "0x10", "1,5", "--1", "1e", LONG)
+
+
+def small() -> Iterator[Case]:
+    """All of them."""
+    for part in (_routes, _logs, _maps, _points, _options, _bags):
+        yield from part()
+
+
+def _checked(name: str, says: str, content: dict[str, object], files: dict[str, str]) -> Case:
+    def prepare(root: Path) -> None:
+        make_drive(root / "drive")
+        path = root / "drive" / "drive.yaml"
+        path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | content))
+        for file, text in files.items():
+            (root / "drive" / file).write_text(text)
+
+    return Case(name, "v2hdm check", CHECKED, prepare, says)
+
+
+ROUTE = {
+    "stamp_s": "100",
+    "x_m": "0",
+    "y_m": "0",
+    "yaw_deg": "0",
+    "sigma_m": ".02",
+    "heading_sigma_deg": ".1",
+}
+ROUTES = [
+    *(("sigma_m", cell, "sigma_m|cells under|no table") for cell in NO_NUMBERS),
+    *(("heading_sigma_deg", cell, "heading_sigma_deg|cells under|no table") for cell in NO_NUMBERS),
+    *(("x_m", cell, "x_m|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("stamp_s", cell, "stamp_s|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("yaw_deg", cell, "yaw_deg|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("sigma_m", cell, "no position is sure") for cell in ("inf", "1e300", "0.2")),
+]  # fmt: skip
+
+
+def _routes() -> Iterator[Case]:
+    for column, cell, says in ROUTES:
+        lines = [ROUTE | {"stamp_s": f"{100 + k / 10:.1f}", "x_m": str(k)} for k in range(20)]
+        wrong = range(20) if "sure" in says else [19]
+        rows = [line | ({column: cell} if k in wrong else {}) for k, line in enumerate(lines)]
+        text = "\n".join(",".join(row.values()) for row in (dict(zip(ROUTE, ROUTE, strict=True)), *rows))
+        content = {"poses": {"csv": "route.csv"}}
+        yield _checked(f"route: {column} {cell[:9]}", says, content, {"route.csv": text})
+
+
+GST = "GNGST,120000.00,1.0,,,,{},{},0.02"
+LOGS = {
+    "empty": "",
+    "no sentence": "words\n" * 9,
+    "sentences without checksums that are cut off": "$GNGGA,1200\n" * 9,
+    "wrong checksums": "$GNGGA,120000.00,5330.0,N,00957.0,E,4,12,0.8,4.0,M,40.5,M,1.0,0000*00\n" * 9,
+    "negative sigmas": "".join(f"${GST.format(one, one)}\n" for one in NO_SIGMAS),
+    "sigmas that are not known": "".join(f"${GST.format(one, one)}\n" for one in ("nan", "", "x")),
+    "a sentence of 200000 digits": f"${GST.format(LONG, LONG)}\n",
+    "bytes that do not show": "\x1b[2J\x07$\x1b\n" * 9,
+}
+
+
+def _logs() -> Iterator[Case]:
+    for name, text in LOGS.items():
+        poses = {"nmea": "log.nmea", "lever_arm_m": [0, 0, 0], "date": "2024-05-17"}
+        says = "no GGA sentence|sentences are damaged"
+        yield _checked(f"NMEA log: {name}", says, {"poses": poses}, {"log.nmea": text})
+
+
+def _maps() -> Iterator[Case]:
+    """Sigmas and shares of a map, of the first feature that may have them."""
+    one: tuple[object, ...] = (-1, -1e-9, "x", True, [], {}, [[1]], 10**400, float("nan"), float("-inf"))
+    each: tuple[object, ...] = ([-0.01] * 4, [0.01] * 3, ["x"] * 4, [float("nan")] * 4, 7, "x", {}, [[1]] * 4)
+    for key, values in {"relative_sigma_m": one, "heights_sigma_m": each}.items():
+        for value in values:
+            yield _map_with(f"{key} {json.dumps(value)[:12]}", "Polygon", {key: value}, key)
+    for value in (-1, "x", float("nan"), [1]):
+        paint = {"paint_left": 0.5, "paint_left_sigma": value}
+        yield _map_with(f"paint_left_sigma {value}", "Polygon", paint, "paint_left_sigma")
+    for value in ([-1, 1, 1], [1, 1], "x", [float("inf")] * 3):
+        yield _map_with(f"vertex_sigma_m {value}", "LineString", {"vertex_sigma_m": value}, "vertex_sigma_m")
+
+
+def _map_with(name: str, shape: str, properties: dict[str, object], says: str) -> Case:
+    def prepare(root: Path) -> None:
+        write_geojson(make_map(), root / "map.geojson")
+        content = json.loads((root / "map.geojson").read_text())
+        feature = next(one for one in content["features"] if one["geometry"]["type"] == shape)
+        feature["properties"].update(properties)
+        (root / "map.geojson").write_text(json.dumps(content))
+
+    line = ("map.geojson", "--format", "csv", "--output", "there")
+    return Case(f"map: {name}", "v2hdm export", line, prepare, says)
+
+
+def _points() -> Iterator[Case]:
+    """Many points, names that move a terminal's cursor, and errors that none has."""
+    rng = np.random.default_rng(0)
+    columns = rng.uniform(0, INFO.width - 1, 3000), rng.uniform(0, INFO.height - 1, 3000)
+    places = rng.uniform(2, 30, 3000), rng.uniform(-10, 10, 3000)
+    rows = "".join(f"{u:.2f},{v:.2f},{x:.3f},{y:.3f}\n" for u, v, x, y in zip(*columns, *places, strict=True))
+    yield _calibrated("3000 random points", f"u,v,x,y\n{rows}", "fit no mounting|fix no camera")
+    for name in ("\x1b]0;x\x07", "\x9b2J", "\u202eP", "\u2028P", "\x08\x08", "\x7f", "P" * 100_000):
+        text = f"name,u,v,x,y\n{name},-9,2,3,4\n" + "a,1,1,9,1\n" * 5
+        yield _calibrated(f"the name {name[:9]!r}", text, "outside|lies|cells under")
+    for option in ("--pixel-sigma", "--survey-sigma"):
+        for value in ("-1", "nan", "inf", "-inf", "1e999"):
+            yield _calibrated(f"{option} {value}", None, f"{option} ", f"{option}={value}")
+
+
+def _calibrated(name: str, text: str | None, says: str, *options: str) -> Case:
+    def prepare(root: Path) -> None:
+        write_camera_info(INFO, root / "camera_info.yaml")
+        write_table(root, *clicked(seed=1))
+        if text is not None:
+            (root / "points.csv").write_text(text)
+
+    line = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out", *options)
+    return Case(f"calibrate: {name}", "v2hdm calibrate points", line, prepare, says)
+
+
+LANES = ("lanes.node_spacing_m", "lanes.half_width_m", "lanes.half_length_m")
+SIGMAS = (
+    "known_sizes.sigma_m", "survey.sigma_m", "survey.reach_m", "association.ipm_sigma_rad",
+    "association.refined_sigma_rad", "association.gate_sigmas", "loss_scale",
+)  # fmt: skip
+OPTIONS = [
+    *(f"mapping.{key}={value}" for key in LANES for value in ("1e-9", "0.01", "0", "-1", "nan")),
+    *(f"mapping.{key}={value}" for key in SIGMAS for value in ("0", "-1", "nan", "inf")),
+    *(
+        f"mapping.survey.points=[{{id:a,position_map:[1,2],sigma_m:[{sigma},0.01]}}]"
+        for sigma in ("0", "-1", "nan")
+    ),
+]
+
+
+def _options() -> Iterator[Case]:
+    for line in OPTIONS:
+        words, says = ("drive.path=drive", "workers=1", line), line.split("=")[0].rpartition(".")[2]
+        yield Case(f"map {line}", "v2hdm map", words, lambda root: make_drive(root / "drive") and None, says)
+
+
+@lru_cache
+def _messages() -> Messages:
+    with TemporaryDirectory() as folder:
+        make_drive(Path(folder) / "drive")
+        return messages_of(Path(folder) / "drive", mounted=mountings())
+
+
+def _bag(name: str, says: str, change: Callable[[object], object], topic: str) -> Case:
+    """A bag whose last message of a topic is changed."""
+
+    def prepare(root: Path) -> None:
+        made = replace(_messages(), rows=list(_messages().rows))
+        number = max(n for n, row in enumerate(made.rows) if row[1] == topic)
+        made.rows[number] = (*made.rows[number][:2], change(made.rows[number][2]))
+        _described(root, made)
+
+    return Case(f"bag: {name}", "v2hdm check", CHECKED, prepare, says, leaves="^work/here/cache(/|$)")
+
+
+def _described(root: Path, made: Messages) -> Path:
+    make_drive(root / "drive")
+    bag = write_ros2(root / "bag", made, StoragePlugin.SQLITE3)
+    (root / "drive" / "drive.yaml").write_text(yaml.safe_dump(described(root / "drive", bag)))
+    return next(bag.glob("*.db3"))
+
+
+STAMPS = ("'noon'", "X'ff'")
+
+
+def _bags() -> Iterator[Case]:
+    info, other = "/sensing/front/camera_info", "states another lens than the first"
+    for name, change in {
+        "another focal length": lambda one: replace(one, k=one.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1]),
+        "a focal length that is not finite": lambda one: replace(one, k=one.k * np.nan),
+        "another size": lambda one: replace(one, width=2 * one.width),
+        "another distortion": lambda one: replace(one, d=one.d + 0.1),
+        "no distortion": lambda one: replace(one, d=one.d[:0]),
+    }.items():
+        yield _bag(f"{name} at the end", other, change, info)
+    for at in (0, 7, 35):
+        for value in (-0.5, -1e-9, -np.inf):
+
+            def turn(one: object, at: int = at, value: float = value) -> object:
+                covariance = one.pose.covariance.copy()  # type: ignore[attr-defined]
+                covariance[at] = value
+                return replace(one, pose=replace(one.pose, covariance=covariance))  # type: ignore
+
+            yield _bag(f"covariance {value} at {at}", "a variance below 0", turn, "/odom")
+    for value in STAMPS:
+
+        def prepare(root: Path, value: str = value) -> None:
+            with closing(sqlite3.connect(_described(root, _messages()))) as data:
+                data.execute(f"UPDATE messages SET timestamp = {value}")
+                data.commit()
+
+        says = "not readable as a bag"
+        yield Case(
+            f"bag: stamps {value}", "v2hdm check", CHECKED, prepare, says, leaves="^work/here/cache(/|$)"
+        )
