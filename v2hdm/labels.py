@@ -25,7 +25,7 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, has_distortion
-from v2hdm.geometry.planar import clip_convex, clip_half, rectangle_size, signed_area
+from v2hdm.geometry.planar import clip_convex, clip_half, densified, rectangle_size, signed_area
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.progress import Steps
@@ -138,9 +138,7 @@ class _Eye:
         if (depth_m < _NEAREST_M).any():
             part = clip_half(outline_map, depth_m - _NEAREST_M)
         if has_distortion(self.info):  # lenses bend sides
-            steps = np.arange(6)[:, None] / 6
-            pairs = zip(part, np.roll(part, -1, axis=0), strict=True)
-            part = np.concatenate([a + steps * (b - a) for a, b in pairs] or [part])
+            part = densified(part, 6)
         if not len(part):
             return part, False
         px = self.project(part)[0]

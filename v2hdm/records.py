@@ -8,7 +8,7 @@ pinhole image of the same intrinsic matrix.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path
@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+JointCovariance = Callable[[IntArray, IntArray], FloatArray]
+"""Joint covariance (2N, 2N), m^2, of the corners (N,) of markings (N,) of a map, stacked x0, y0, x1, ..."""
 
 DIAMOND = "diamond"
 LANE_DASH = "lane_dash"

@@ -143,9 +143,9 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
     )
     drive = replace(scene.drive, pose_noise=noise)
     result = run_methods(drive, scene.detections, ("front",), MappingOptions(pose_model="full"))["Opt"]
-    markings, corners = result.hd_map.markings, result.corners
+    markings = result.hd_map.markings
     chosen = np.arange(len(markings))
-    joint = corners.covariance(chosen, chosen % 4)
+    joint = result.joint_covariance(chosen, chosen % 4)
     assert np.linalg.eigvalsh(joint).min() > -1e-12
     for k, marking in enumerate(markings):
         own = marking.covariance_m2.reshape(4, 2, 4, 2)[k % 4, :, k % 4]
@@ -153,7 +153,7 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
     sigma_m = np.sqrt(np.diag(joint))
     alike = (joint / np.outer(sigma_m, sigma_m))[0::2, 0::2]
     assert alike.min() > 0.8
-    both = corners.covariance(np.array([3, 3]), np.array([0, 2]))
+    both = result.joint_covariance(np.array([3, 3]), np.array([0, 2]))
     np.testing.assert_allclose(both[:2, 2:], markings[3].covariance_m2.reshape(4, 2, 4, 2)[0, :, 2])  # type: ignore[union-attr]
 
 

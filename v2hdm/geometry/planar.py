@@ -70,6 +70,13 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
     return np.array(kept).reshape(-1, polygon.shape[1])
 
 
+def densified(polygon: FloatArray, pieces: int) -> FloatArray:
+    """A polygon (N, 2) with every side cut into ``pieces``, as lenses bend straight lines."""
+    part = np.arange(pieces)[:, None] / pieces
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    return (polygon[:, None] + part * sides[:, None]).reshape(-1, 2)
+
+
 def length_along(line: FloatArray) -> FloatArray:
     """How far along a polyline (N, D) each of its vertices (N,) lies."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])

@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,40 +83,28 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     return tuple(out)
 
 
-@dataclass(frozen=True)
-class JointCorners:
-    """How the errors of an optimised map's corners hang together."""
+def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) -> FloatArray:
+    """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
 
-    optimised: Optimised
-
-    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
-        """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
-
-        Within a marking it is what the map states. From one marking to another only the errors of the
-        adjustment are shared, drift above all: a corner that was not seen shares those of one that was.
-        """
-        optimised, bundle = self.optimised, self.optimised.bundle
-        index = bundle.corner_index[optimised.groups[marking]]
-        own = index[np.arange(len(corner)), corner]
-        number = np.where(own >= 0, own, index.max(axis=1))
-        out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
-        _state(out, optimised.markings, marking, corner)
-        # Put together from two sources, it may be negative along some direction, by a millimetre squared.
-        values, vectors = np.linalg.eigh(out)
-        return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    Within a marking it is what the map states. From one marking to another only the errors of the adjustment
+    are shared, drift above all: a corner that was not seen shares those of one that was.
+    """
+    bundle = optimised.bundle
+    index = bundle.corner_index[optimised.groups[marking]]
+    own = index[np.arange(len(corner)), corner]
+    number = np.where(own >= 0, own, index.max(axis=1))
+    out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
+    _state(out, optimised.markings, marking, corner)
+    # Put together from two sources, it may be negative along some direction, by a millimetre squared.
+    values, vectors = np.linalg.eigh(out)
+    return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-@dataclass(frozen=True)
-class StatedCorners:
-    """The errors of the corners of markings from several maps, as far as each marking states them."""
-
-    markings: Sequence[Marking]
-
-    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
-        """As :meth:`JointCorners.covariance`, but that nothing is shared from one marking to another."""
-        out = np.zeros((2 * len(marking), 2 * len(marking)))
-        _state(out, self.markings, marking, corner)
-        return out
+def stated_covariance(markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> FloatArray:
+    """As :func:`joint_covariance`, of markings from several maps: nothing is shared from one to another."""
+    out = np.zeros((2 * len(marking), 2 * len(marking)))
+    _state(out, markings, marking, corner)
+    return out
 
 
 def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> None:
@@ -337,7 +326,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
-        corners=JointCorners(optimised),
+        joint_covariance=partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
     )
@@ -363,12 +352,17 @@ def _brought_up_to_date(
     over_m = drive.pose_noise.position_drift_over_m
     hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
     hd_map = replace(hd_map, ground=made.hd_map.ground)
-    corners, residuals = StatedCorners(hd_map.markings), made.residuals
+    residuals = made.residuals
     if residuals is not None:
         residuals = residuals.renamed(*names)
     suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
     return replace(
-        made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals, suspicions=suspicions
+        made,
+        hd_map=hd_map,
+        changes=changes,
+        joint_covariance=partial(stated_covariance, hd_map.markings),
+        residuals=residuals,
+        suspicions=suspicions,
     )
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from v2hdm.adjust import ScoreTest
 from v2hdm.io.maps.evidence import Residuals
-from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray
+from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, JointCovariance
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.markings import Suspicion
 
@@ -119,13 +118,6 @@ class ClockOffset:
     sigma_s: float
 
 
-class Corners(Protocol):
-    """How the errors of a map's corners hang together."""
-
-    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
-        """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ..."""
-
-
 @dataclass(frozen=True)
 class MethodResult:
     """The outcome of one method on one set of cameras.
@@ -139,7 +131,7 @@ class MethodResult:
         evidence: for the checks after the solve.
         poses: as the solve has adjusted them.
         clocks: by visit the offsets of the cameras' clocks, corrections before the solve included.
-        corners: how the errors of the map's corners hang together, None where unknown.
+        joint_covariance: of the map's corners, None where unknown.
         residuals: of the accepted corner observations.
         suspicions: of the most suspicious markings, the worst first.
         changes: of an earlier map that was brought up to date.
@@ -157,7 +149,7 @@ class MethodResult:
     evidence: SolveEvidence | None = None
     poses: AdjustedPoses | None = None
     clocks: Sequence[Mapping[str, ClockOffset]] = ({},)
-    corners: Corners | None = None
+    joint_covariance: JointCovariance | None = None
     residuals: Residuals | None = None
     suspicions: Sequence[Suspicion] = ()
     changes: Changes | None = None

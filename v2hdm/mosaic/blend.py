@@ -37,6 +37,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.planar import densified
 from v2hdm.geometry.rigid import inverse
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.progress import Steps
@@ -137,7 +138,7 @@ def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
     The camera sits at ``cam_from_vehicle`` (4, 4); the mask of its own vehicle is left out where it is known.
     """
     info = camera.info
-    pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle, _densely(camera.roi_vehicle))
+    pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle, densified(camera.roi_vehicle, 16))
     inside = np.zeros((info.height + 2, info.width + 2), dtype=np.uint8)
     roi_px = np.round(distort_points(info, pinhole_px)).astype(np.int32)
     cv2.fillPoly(inside, [roi_px + 1], 1)
@@ -188,13 +189,6 @@ def adjusted_shots(
         px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
         shots.append(Shot(image.path, image.camera, px_from_map))
     return shots
-
-
-def _densely(polygon: FloatArray, pieces: int = 16) -> FloatArray:
-    """A polygon (N, 2) with every side cut into pieces, as lenses bend straight lines."""
-    part = np.arange(pieces)[:, None] / pieces
-    ahead = np.roll(polygon, -1, axis=0)
-    return np.concatenate([a + part * (b - a) for a, b in zip(polygon, ahead, strict=True)])
 
 
 TILES_PX = (128, 64, 32, 16)

@@ -123,7 +123,7 @@ class _Work:
         best = methods[BEST]
         checked = compare_survey(survey, drive, best) if name == self.last else None
         # The factors of the adjustment are large; whoever needs more of them asks while they are here.
-        methods[BEST] = replace(best, corners=None)
+        methods[BEST] = replace(best, joint_covariance=None)
         took_s = time.perf_counter() - begin_s
         _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
         for exclusion in best.excluded:

@@ -79,9 +79,9 @@ def compare_survey(survey: Survey, drive: Drive, best: MethodResult) -> CheckTab
     """The check points against the finished map of ``best``; None where there are none."""
     if not survey.check:
         return None
-    assert best.corners is not None
+    assert best.joint_covariance is not None
     hd_map, reach_m = with_heights(best.hd_map, drive.road), survey.mapping.survey.reach_m
-    return compare(hd_map, survey.check, reach_m, best.corners.covariance, drive.route_map)
+    return compare(hd_map, survey.check, reach_m, best.joint_covariance, drive.route_map)
 
 
 def check_survey(survey: Survey, best: MethodResult, compared: CheckTable | None) -> list[Finding]:

@@ -11,7 +11,7 @@ as they say. T over these is the normalised estimation error squared (NEES), 1 o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,8 @@ from scipy.stats import chi2
 from v2hdm.io.drive.survey import SurveyedPoint
 from v2hdm.io.maps.features import features_of
 from v2hdm.io.maps.surveyed import match
-from v2hdm.records import FloatArray, HdMap, IntArray
+from v2hdm.records import FloatArray, HdMap, JointCovariance
 from v2hdm.store.files import replace_csv
-
-JointCovariance = Callable[[IntArray, IntArray], FloatArray]
-"""Joint covariance (2N, 2N), m^2, of the corners (N,) of markings (N,) of a map, stacked x0, y0, x1, ..."""
 
 INSIDE = 0.95  # probability of the ellipse that a point is reported to lie in or not
 
