@@ -93,9 +93,10 @@ _UNDER_SYMBOL = (0.02, 0.5)
 Every second part of other paint is of a letter or a drawing that no class has, and counts as a marking here.
 """
 
-_ODDS, _ODDS_COUNT, _ODDS_FREEDOM = (6.0, 1.2), (1.0, 4.0), 4.0
-"""The detector's mean log odds of a marking: mean and scale before the drive says, how many markings these
-are worth, and degrees of freedom of Student's t distribution, since worn ones are among them."""
+_ODDS, _ODDS_FREEDOM = (6.0, 1.2), 4.0
+"""The detector's mean log odds of a marking, as one marking before the drive says: mean, and least scale of
+Student's t distribution of such freedom, since worn ones are among them (335 diamonds of a rendered port: 7.9
+and 1.0)."""
 
 _OTHER_ODDS = (1.5, 1.5)
 """Mean and sigma of the same of anything else (fourteen candidates of a rendered port)."""
@@ -202,10 +203,10 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
 
 def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
     """Log likelihood (N,) of a marking's mean log ``odds`` (N,), by those of markings (``weight``)."""
-    (mean, scale), (strength, freedom), total = _ODDS, _ODDS_COUNT, weight.sum()
-    mean = (strength * mean + weight @ odds) / (strength + total)
-    spread = weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM)
-    scale = np.sqrt((freedom * scale**2 + spread) / (freedom + total))
+    (usual, scale), total = _ODDS, 1 + weight.sum()
+    mean = (usual + weight @ odds) / total
+    spread = (scale**2 + weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM)) / total
+    scale = max(scale, float(np.sqrt(spread)))
     return np.asarray(t.logpdf(odds, _ODDS_FREEDOM, mean, scale))
 
 
