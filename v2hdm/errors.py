@@ -60,4 +60,5 @@ def describe(error: BaseException) -> str | None:
 
 def one_line(message: str) -> str:
     """A message whose words come from files of strangers: none ends the line or moves the cursor."""
-    return "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+    line = " ".join(message.split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)

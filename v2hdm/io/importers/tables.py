@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, one_line
 from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import FloatArray, Trajectory
@@ -209,8 +209,10 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
 
     def split(line: str) -> list[str]:
         if separator is None:
-            return line.split()
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+            cells = line.split()
+        else:
+            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        return [one_line(cell) for cell in cells]
 
     try:
         header = split(title)
