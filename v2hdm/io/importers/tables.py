@@ -232,13 +232,18 @@ def _parse(name: str, cell: str, where: str) -> float:
             moment = datetime.fromisoformat(cell)
             return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
         if name in _SURENESS:
-            if (value := float(cell or "nan")) >= 0 or np.isnan(value):
-                return value
-            raise DriveError(f"{where}: {cell} is negative, and no such number is; mend that line")
+            return parse_sigma(cell)
     except ValueError:
-        kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number"
+        kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number, 0 or more"
         raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None
     return parse_number(cell, where)
+
+
+def parse_sigma(cell: str) -> float:
+    """A standard deviation, nan where there is none; raises ValueError where it is no number from 0 up."""
+    if (sigma := float(cell or "nan")) < 0:
+        raise ValueError
+    return sigma
 
 
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
