@@ -95,6 +95,13 @@ def test_help_that_nobody_reads_to_its_end_is_no_error(arguments):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_a_warning_is_one_line_whatever_name_of_a_file_is_in_it(tmp_path):
+    program = "main(['--version']); logging.warning('%s: cut off', 'a\\x1b[2J\\nerror: b.avi')"
+    command = [sys.executable, "-c", f"import logging; from v2hdm.cli.main import main; {program}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stderr == "WARNING:root:a?[2J error: b.avi: cut off\n"
+
+
 @pytest.mark.parametrize(
     ("dies", "says"),
     [

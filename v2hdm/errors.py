@@ -41,8 +41,8 @@ class AdjustError(V2hdmError):
 EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
 
+# From what torch, onnxruntime, OpenCV and the loader of libraries say of it, none by a MemoryError.
 _NO_MEMORY = ("bad_alloc", "llocate memory", "ailed to allocate", "map segment", "nsufficient memory")
-"""From what torch, onnxruntime, OpenCV and the loader of libraries say of it, none by a MemoryError."""
 
 
 def describe(error: BaseException) -> str | None:
@@ -60,4 +60,5 @@ def describe(error: BaseException) -> str | None:
 
 def one_line(message: str) -> str:
     """A message whose words come from files of strangers: none ends the line or moves the cursor."""
-    return "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+    line = " ".join(message.split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)

@@ -43,9 +43,10 @@ def test_local_points_keep_their_metres_names_roles_and_sigmas(tmp_path):
         "\ufeffPoint;X;Y;Z;sigma_m;sigma_north_m;Role;Description;Executor\n"
         "A1;3.21;4.05;0.30;;;;corner of the stop line, north;Kim\n"
         "# re-measured\n"
-        "A2;61.7;12.33;;0.005;0.02;CHECK;;Kim\n"
+        "A2;61.7;12.33;;0.005;0.02;CHECK;\x1b[2J;Kim\n"
     )
     first, second = points(tmp_path, text)
+    assert second.description == "?[2J"
     assert (first.id, first.is_check, first.description) == ("A1", False, "corner of the stop line, north")
     assert (second.id, second.is_check, second.height_m) == ("A2", True, None)
     np.testing.assert_array_equal(first.position_map, [3.21, 4.05])

@@ -28,7 +28,7 @@ NO_NUMBERS = (*NO_SIGMAS, "x", "0x10", "1,5", "--1", "1e", LONG)
 
 def small() -> Iterator[Case]:
     """All of them."""
-    for part in (_routes, _logs, _maps, _points, _options, _bags):
+    for part in (_routes, _logs, _urls, _maps, _points, _options, _bags):
         yield from part()
 
 
@@ -89,6 +89,25 @@ def _logs() -> Iterator[Case]:
         poses = {"nmea": "log.nmea", "lever_arm_m": [0, 0, 0], "date": "2024-05-17"}
         says = "no GGA sentence|sentences are damaged"
         yield _checked(f"NMEA log: {name}", says, {"poses": poses}, {"log.nmea": text})
+
+
+URLS = ("s3://bucket/x", "memory://bucket/x", "http://127.0.0.1:9/x", "file:///etc/hosts")
+
+
+def _urls() -> Iterator[Case]:
+    """Places that a drive names: paths, never URLs."""
+    for url in URLS:
+        front = {
+            "roi_vehicle": [[3, -3], [9, -3], [9, 3], [3, 3]],
+            "mounting": {"height_m": 2, "pitch_deg": 0},
+        }
+        own = {"images": "front/images.txt", "camera_info": "front/camera_info.yaml"}
+        for key, value in {"images": url, "camera_info": url, "video": url}.items():
+            named = {"images": {"video": value, "start_s": 0}} if key == "video" else {key: value}
+            content = {"cameras": {"front": front | own | named}}
+            yield _checked(f"{key} at {url}", "no such|not readable|cannot be read|missing", content, {})
+        for key in ("poses", "truth"):
+            yield _checked(f"{key} at {url}", "no such|cannot be read|not a", {key: url}, {})
 
 
 def _maps() -> Iterator[Case]:

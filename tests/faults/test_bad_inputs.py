@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.faults.cases import JSON_TEXTS, YAML_TEXTS, all_cases, damaged_inside
-from tests.faults.judge import HYDRA_DOORS, judge
+from tests.faults.judge import HYDRA_DOORS, Case, judge
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import DriveError, V2hdmError
@@ -32,6 +32,18 @@ def test_the_table_is_large_and_names_each_case_once():
 def test_a_bad_input_ends_well(case, tmp_path):
     outcome = judge(case, tmp_path)
     assert not outcome.faults(case), outcome.error
+
+
+def test_the_judge_sees_what_a_command_may_not_do(tmp_path):
+    def run(case):
+        Path("precious.txt").unlink()
+        Path("new").touch()
+        return 1, "Traceback: <class 'x'>", ""
+
+    case = Case("a", "v2hdm check", (), lambda root: None, "a cause")
+    faults = " ".join(judge(case, tmp_path, run).faults(case))
+    for one in ("code 1", "traceback", "0 lines", "does not say", "changed or removed", "left"):
+        assert one in faults
 
 
 CORPUS = Path(__file__).with_name("corpus.tar.xz")

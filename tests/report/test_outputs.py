@@ -219,6 +219,18 @@ def test_a_result_of_another_command_or_another_drive_is_not_replaced(tmp_path, 
     assert (tmp_path / "run" / "map").read_text() == "of hours"
 
 
+@pytest.mark.parametrize("name", ["a", "linked", "twin"])
+def test_a_file_that_is_an_input_is_not_replaced_under_any_name(name, tmp_path):
+    (tmp_path / "a").write_text("read")
+    (tmp_path / "linked").symlink_to("a")
+    os.link(tmp_path / "a", tmp_path / "twin")
+    with protected_inputs():
+        note_input(tmp_path / "a")
+        with pytest.raises(ConfigError, match="is one of the inputs"):
+            replace_text(tmp_path / name, "new")
+    assert (tmp_path / "a").read_text() == "read"
+
+
 def test_a_result_that_is_an_input_is_not_replaced(tmp_path):
     write(tmp_path / "run", map="earlier")
 

@@ -255,7 +255,11 @@ def test_what_was_not_used_for_longest_goes_first(cache):
 
 
 def test_what_is_not_ours_stays(cache):
+    own = cache / ".thesis.part"
+    own.mkdir()
+    os.utime(own, (1000, 1000))
     prune(cache, 0)
+    assert own.is_dir()
     assert not left(cache)
     assert (cache / "stages" / "detect" / "notes.txt").read_text() == "mine"
     assert (cache / "drive" / "image.jpg").is_file()

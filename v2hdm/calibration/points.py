@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.errors import DriveError, one_line
+from v2hdm.errors import DriveError
 from v2hdm.io.importers.tables import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
@@ -44,7 +44,7 @@ def read_points(path: Path) -> SurveyedPoints:
     names, labels, rows = [], [], []
     for number, cells in lines:
         row = dict(zip(columns, cells, strict=True))
-        name = one_line(row.get(_NAME, ""))
+        name = row.get(_NAME, "")
         names.append(f"point {name} (line {number})" if name else f"the point of line {number}")
         labels.append(name or f"line {number}")
         rows.append([parse_number(row[column], f"{path}: line {number}: {column}") for column in COLUMNS])

@@ -125,9 +125,17 @@ _OLD = {"calibrate": "calibrate points", "extrinsic": "calibrate ground", "calib
 """Names of console scripts, ``v2hdm-NAME``, of commands that are called otherwise now."""
 
 
+class _Line(logging.LogRecord):
+    """A message of one line, whatever names of a stranger's files are in it."""
+
+    def getMessage(self) -> str:  # noqa: N802
+        return one_line(super().getMessage())
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Be the process of a command line; returns the exit code."""
     answer_signals()
+    logging.setLogRecordFactory(_Line)
     child = os.fork() if _is_limited() else 0
     if child == 0:
         return run(sys.argv[1:] if arguments is None else arguments)

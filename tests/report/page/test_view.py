@@ -114,7 +114,7 @@ def test_other_pages_other_names_and_guesses_are_refused(served):
     assert ask(address, "POST", "/correct", sent)[0] == 404
     assert ask(address, "GET", "/")[0] == 404
     assert ask(address, "GET", "", Host="elsewhere.example")[0] == 404
-    assert ask(address, "POST", place, "x" * 200_000)[0] == 400
+    assert ask(address, "POST", place, "x" * 200_000) == (400, "a correction is no larger than 100 kB")
     assert not path.exists()
     status, said = ask(
         address, "POST", place, json.dumps({"key": "m1", "correction": entry | {"says": "no"}})
@@ -122,6 +122,12 @@ def test_other_pages_other_names_and_guesses_are_refused(served):
     assert (status, "expected one of accepted, rejected, corrected" in said) == (400, True)
     assert ask(address, "POST", place, sent, Origin=f"http://{parts.netloc}") == (200, "kept")
     assert [one.says for one in read_corrections(path)] == ["rejected"]
+
+
+def test_nobody_on_another_machine_can_ask(tmp_path):
+    server, _, _ = server_of(tmp_path / "result", make_result(tmp_path), file_beside(tmp_path / "result"))
+    server.server_close()
+    assert server.server_address[0] == "127.0.0.1"
 
 
 def test_a_file_that_is_not_ours_is_not_replaced(tmp_path):

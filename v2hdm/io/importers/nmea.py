@@ -19,7 +19,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.importers.tables import SIGMA_OF_QUALITY_M, Attitudes, Readings
+from v2hdm.io.importers.tables import SIGMA_OF_QUALITY_M, Attitudes, Readings, parse_sigma
 from v2hdm.io.safe.texts import read_bytes, shown
 from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray
@@ -96,14 +96,16 @@ class _Log:
             self._dated(date(int(fields[4]), int(fields[3]), int(fields[2])))
         elif kind == "GST":
             stamp = self._time(fields[1])
-            self._sigma_m[stamp] = float(np.hypot(_sigma(fields[6]), _sigma(fields[7])) / np.sqrt(2))
+            self._sigma_m[stamp] = float(
+                np.hypot(parse_sigma(fields[6]), parse_sigma(fields[7])) / np.sqrt(2)
+            )
         # The modes of THS: autonomous, estimated, manual, simulated, and V for invalid.
         elif kind == "HDT" or (kind == "THS" and fields[2] != "V"):
             if fields[1] and self._time_s is not None:
                 self._attitudes[self._time_s] = (float(fields[1]), 0.0, 0.0, np.nan)
         elif kind == "PASHR" and fields[2] and fields[3] == "T":
             # Roll to starboard is left side up, as ours; pitch counts bow up, ours nose down.
-            sigma_deg = _sigma(fields[9]) if fields[9] else np.nan
+            sigma_deg = parse_sigma(fields[9])
             values = (float(fields[2]), float(fields[4] or 0), -float(fields[5] or 0), sigma_deg)
             self._attitudes[self._time(fields[1])] = values
 
@@ -153,13 +155,6 @@ def _table(rows: dict[float, tuple[float, ...]], begin_s: float, where: str) -> 
     stamp_s = np.array(list(rows))
     order = in_order(stamp_s, where, "sentence")
     return begin_s + stamp_s[order], np.array(list(rows.values()))[order]
-
-
-def _sigma(text: str) -> float:
-    """A standard deviation; raises ValueError where it is none."""
-    if not (value := float(text)) >= 0:
-        raise ValueError
-    return value
 
 
 def _fields(sentence: str) -> list[str]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, one_line
 from v2hdm.geometry.mounting import LEVEL
 from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
@@ -208,8 +208,10 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
 
     def split(line: str) -> list[str]:
         if separator is None:
-            return line.split()
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+            cells = line.split()
+        else:
+            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        return [one_line(cell) for cell in cells]
 
     try:
         header = split(title)
@@ -229,13 +231,18 @@ def _parse(name: str, cell: str, where: str) -> float:
             moment = datetime.fromisoformat(cell)
             return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
         if name in _SURENESS:
-            if (value := float(cell or "nan")) >= 0 or np.isnan(value):
-                return value
-            raise DriveError(f"{where}: {cell} is negative, and no such number is; mend that line")
+            return parse_sigma(cell)
     except ValueError:
-        kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number"
+        kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number, 0 or more"
         raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None
     return parse_number(cell, where)
+
+
+def parse_sigma(cell: str) -> float:
+    """A standard deviation, nan where there is none; raises ValueError where it is no number from 0 up."""
+    if (sigma := float(cell or "nan")) < 0:
+        raise ValueError
+    return sigma
 
 
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:

@@ -214,11 +214,7 @@ def _quaternion(orientation: Any) -> Row:
 
 
 def _sigma(*variances: float) -> float:
-    """Root of the mean of variances, nan where nan, 0 or sensor_msgs' -1 stand for "not known".
-
-    A negative variance comes back as it is.
-    """
-    least, mean = min(variances), float(np.mean(variances))
-    if least < 0:
-        return np.nan if least == -1 else least
-    return float(np.sqrt(mean)) if mean > 0 else np.nan
+    """Root of the mean of variances, nan where one is nan, 0 or -1, "not known"; a negative one as it is."""
+    if (least := min(variances)) < 0 and least != -1:
+        return least
+    return float(np.sqrt(np.mean(variances))) if least >= 0 and max(variances) > 0 else np.nan
