@@ -114,7 +114,7 @@ def test_the_workflow_runs_what_a_change_must_pass():
 
 def test_an_audit_that_reaches_no_advisories_says_so():
     place = f"BIN={Path(sys.executable).parent}", "ADVISORIES=http://127.0.0.1:9/"
-    command = ["make", "--old-file", ".venv/.installed-dev", *place, "audit"]
+    command = ["make", "--no-print-directory", "--old-file", ".venv/.installed-dev", *place, "audit"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "audit skipped: no advisories at http://127.0.0.1:9/\n"
 

@@ -93,10 +93,10 @@ _UNDER_SYMBOL = (0.02, 0.5)
 Every second part of other paint is of a letter or a drawing that no class has, and counts as a marking here.
 """
 
-_ODDS, _ODDS_FREEDOM = (6.0, 1.2), 4.0
-"""The detector's mean log odds of a marking, as one marking before the drive says: mean, and least scale of
-Student's t distribution of such freedom, since worn ones are among them (335 diamonds of a rendered port: 7.9
-and 1.0)."""
+_ODDS, _ODDS_SIGMA, _ODDS_FREEDOM = (5.0, 2.5), 1.2, 4.0
+"""The detector's mean log odds of a marking: mean and sigma of a class's before the drive says (in a rendered
+port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members' about it (1.0 of the
+diamonds) and their degrees of freedom in Student's t distribution, since worn ones are among them."""
 
 _OTHER_ODDS = (1.5, 1.5)
 """Mean and sigma of the same of anything else (fourteen candidates of a rendered port)."""
@@ -203,10 +203,11 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
 
 def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
     """Log likelihood (N,) of a marking's mean log ``odds`` (N,), by those of markings (``weight``)."""
-    (usual, scale), total = _ODDS, 1 + weight.sum()
-    mean = (usual + weight @ odds) / total
-    spread = (scale**2 + weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM)) / total
-    scale = max(scale, float(np.sqrt(spread)))
+    (usual, sigma), least, total = _ODDS, _ODDS_SIGMA**2, weight.sum()
+    information = sigma**-2 + total / least
+    mean = (usual / sigma**2 + weight @ odds / least) / information
+    spread = weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM) / max(total, 1.0)
+    scale = np.sqrt(max(least, float(spread)) + 1 / information)
     return np.asarray(t.logpdf(odds, _ODDS_FREEDOM, mean, scale))
 
 
