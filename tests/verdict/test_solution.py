@@ -71,6 +71,12 @@ def test_noise_along_the_way_alone_is_of_stamps_that_jitter(drive, ratio, named)
     assert "image stamps" not in raised(result(quiet), drive)
 
 
+@pytest.mark.parametrize(("noise", "status"), [(2.9, Status.WARN), (4.0, Status.FAIL)])
+def test_stamps_that_jitter_within_the_noise_that_is_allowed_for_are_a_warning(drive, noise, status):
+    noisy = replace(FINE, pose_noise={"position_m": noise}, jitter_s=0.02, along_over_across=5.0)
+    assert raised(result(noisy), drive)["image stamps"].status is status
+
+
 def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
     dropped = replace(LEVER, value=-1.2, p_value=1e-200)
     found = raised(result(replace(FINE, corrected=(dropped,))), drive)

@@ -38,9 +38,7 @@ _WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one s
 STATED_AS = 4.0  # observations that the stated errors count for: people know theirs to a factor of about 1.4
 UNKNOWNS = 6  # of a mounting
 _LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated
-_LEAST_SHARE = (
-    1e-12  # of its trace: so it does where one direction's variance, near the horizon, dwarfs the other's
-)
+_LEAST_SHARE = 1e-12  # and, as a share of its trace, near the horizon, where one variance dwarfs the other
 _SUBSETS = 300  # subsets of four points that are tried; of ten points these are all 210
 _REFINED = 4  # starts that are refined
 # Rounds of expectation maximisation after which a refinement ends, and steps of each, converged or not.

@@ -175,8 +175,8 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     raised = {finding.check for finding in findings}
     still = [one for one in evidence.score_tests if is_contradicted(one)]
     still = still or [one for one in evidence.score_tests if _is_left(one, evidence.corrected)][:1]
-    foreign = _foreign(evidence)
-    causes = {foreign: evidence.foreign[2], _stamps(evidence): _jitter_odds(evidence)}
+    foreign, stamps = _foreign(evidence), _stamps(evidence)
+    causes = {foreign: evidence.foreign[2], stamps: _jitter_odds(evidence)}
     if still:
         causes[_contradicted(still) if is_physical(still[0]) else _unknown(still[0])] = log_odds(still[0])
     # Each would explain part of the same contradictions: the likeliest is named, and what nearly is.
@@ -185,6 +185,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
     named = named or [_likely(one) for one in evidence.score_tests if is_likely(one)][:1]
     findings += named if foreign in causes else [*named, foreign]
+    findings += [stamps] if stamps.status is Status.WARN else []
     raised |= {one.check for one in named}
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.score_tests:
