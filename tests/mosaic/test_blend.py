@@ -10,6 +10,7 @@ from tests.mosaic import scene
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.mosaic import blend as module
 from v2hdm.mosaic.blend import (
     FEATHER,
@@ -50,6 +51,33 @@ def test_a_mosaic_shows_the_ground_where_it_lies(drive, right):
     off = np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen]
     assert np.median(off) < 1.0
     assert off.max() < 6.0
+
+
+def test_ground_that_rises_is_shown_where_it_lies(tmp_path):
+    """A grade of 5 % from 5 m on, seen as on the plane: what its image shows is back in its place."""
+    rise, pose = 0.05, scene.true_poses()[0]
+    centre = camera_centre(scene.cam_from_vehicle() @ inverse(pose))
+    height = centre[2] - rise * (centre[0] - 5.0)
+
+    def on_ground(plane_map):
+        share = height / (centre[2] + rise * (plane_map[..., :1] - centre[0]))
+        return centre[:2] + share * (plane_map - centre[:2])
+
+    def on_plane(points_map):
+        above = rise * (points_map[:, :1] - 5.0)
+        return points_map + above / (centre[2] - above) * (points_map - centre[:2])
+
+    cv2.imwrite(str(tmp_path / "rises.png"), scene.picture(lambda at: scene.waves(on_ground(at)), pose))
+    drive = scene.drive_of(tmp_path, scene.waves)
+    flat = recorded_shots(drive)[0]
+    canvas, off = Canvas(np.array([6.5, 1.5]), 0.02, 150, 200), []
+    for lift in (on_plane, None):
+        shot = replace(flat, path=tmp_path / "rises.png", on_plane=lift)
+        rgba = whole(canvas, [shot], lenses(drive))
+        seen = rgba[..., 3] == 255
+        assert seen.mean() > 0.3
+        off.append(np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen].max())
+    assert off[0] < 6.0 < 20.0 < off[1]
 
 
 def test_the_result_does_not_depend_on_the_size_of_sheets(drive, monkeypatch):

@@ -13,10 +13,10 @@ evaluates them at Chebyshev nodes, the polynomial through these gives them at ev
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -26,6 +26,7 @@ from kornia.geometry.linalg import transform_points
 from kornia.geometry.transform import remap
 from torch import Tensor
 
+from v2hdm.association.surface import Surface
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry import tensors
@@ -119,12 +120,14 @@ class Lens:
 class Shot:
     """One image: its file, its camera, and the homography (3, 3) of the ground plane of the map.
 
-    The homography's third coordinate is positive in front of the camera.
+    The homography's third coordinate is positive in front of the camera. ``on_plane`` gives the points (K, 2)
+    of that plane that are seen where the ground's are, None where it is the plane.
     """
 
     path: Path
     camera: str
     pinhole_px_from_map: FloatArray
+    on_plane: Callable[[FloatArray], FloatArray] | None = None
 
     def outline_map(self, lens: Lens) -> FloatArray:
         """The ground (N, 2), m, that is trusted: a convex polygon."""
@@ -171,11 +174,13 @@ def adjusted_shots(
     calibrations: Mapping[str, Calibration],
     clock_s: Mapping[str, float],
     adjusted: Trajectory,
+    surface_at: Callable[[FloatArray], Surface | None] = lambda poses: None,
 ) -> list[Shot]:
     """The images of calibrated cameras under adjusted extrinsics and poses.
 
     ``clock_s`` is by camera how much later than stamped its images were taken. ``adjusted`` is in the frame
-    of the recorded poses; where the drive's road was not flat, its own have been laid flat.
+    of the recorded poses; where the drive's road was not flat, its own have been laid flat. ``surface_at``
+    gives the ground under vehicles at poses (F, 4, 4).
     """
     images = [image for image in drive.images if image.camera in calibrations]
     taken_s = np.array([image.stamp_s + clock_s[image.camera] for image in images])
@@ -183,11 +188,15 @@ def adjusted_shots(
     if drive.recorded is not None and drive.trajectory is not None:
         recorded, flat = (interpolate(one, taken_s, np.inf)[0] for one in (drive.recorded, drive.trajectory))
         poses = flat @ np.linalg.inv(recorded) @ poses
-    shots = []
-    for image, pose in zip(images, poses, strict=True):
+    shots, surface = [], surface_at(poses)
+    for frame, (image, pose) in enumerate(zip(images, poses, strict=True)):
         own = calibrations[image.camera]
-        px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
-        shots.append(Shot(image.path, image.camera, px_from_map))
+        cam_from_map = own.cam_from_vehicle @ inverse(pose)
+        px_from_map = pinhole_px_from_ground(own.info.intrinsic, cam_from_map)
+        on_plane = None
+        if surface is not None:
+            on_plane = partial(surface.on_plane, cam_from_map=cam_from_map, frame=frame)
+        shots.append(Shot(image.path, image.camera, px_from_map, on_plane))
     return shots
 
 
@@ -247,7 +256,7 @@ def blend(
         sums = _Sums((rows, columns), views, tiling, device)
         map_from_sheet = canvas.window(row, column, rows, columns).map_from_canvas
         for index, tiles in views:
-            sums.add(next(sources), shots[index].pinhole_px_from_map @ map_from_sheet, tiles)
+            sums.add(next(sources), shots[index], map_from_sheet, tiles)
             done += 1
             if progress:
                 progress(done, len(order))
@@ -412,9 +421,9 @@ class _Sums:
         self._sums = torch.zeros((len(self._tiles), 4, side, side), device=device)
         self._rows = torch.from_numpy(tiling.pixels_from_nodes).float().to(device)
 
-    def add(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> None:
+    def add(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> None:
         """Add an image to the tiles (T, 2) of (column, row) that it shows."""
-        x, y, density = self._warp(source, pinhole_px_from_sheet, tiles)
+        x, y, density = self._warp(source, shot, map_from_sheet, tiles)
         image = source.values.expand(len(tiles), -1, -1, -1)
         values: Tensor = remap(image, x, y, align_corners=True, normalized_coordinates=True)
         weight = values[:, 3] * density
@@ -423,7 +432,7 @@ class _Sums:
         at = torch.tensor([self._at[int(c), int(r)] for c, r in tiles], device=self._device)
         self._sums.index_add_(0, at, values)
 
-    def _warp(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
+    def _warp(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
         """Where the pixels of tiles lie in an image, and how many of its pixels each covers.
 
         Returns:
@@ -431,6 +440,11 @@ class _Sums:
             density in px of the image a px of the sheet.
         """
         nodes = self._tiling.side_px * tiles[:, None] + self._tiling.nodes
+        pinhole_px_from_sheet = shot.pinhole_px_from_map @ map_from_sheet
+        if shot.on_plane is not None:
+            points_map = shot.on_plane(apply_homography(map_from_sheet, nodes.reshape(-1, 2)))
+            sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
+            nodes = apply_homography(sheet_from_map, points_map).reshape(nodes.shape)
         third = nodes @ pinhole_px_from_sheet[2, :2] + pinhole_px_from_sheet[2, 2]
         density = torch.from_numpy(np.linalg.det(pinhole_px_from_sheet) / third**3)
         px = _recorded_px(source.lens, pinhole_px_from_sheet, nodes)

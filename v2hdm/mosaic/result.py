@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +36,7 @@ from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.report import style
 from v2hdm.report.outputs import write_json
-from v2hdm.report.page.facts import read_cameras
+from v2hdm.report.page.facts import read_cameras, read_surface
 from v2hdm.store.files import whole_file
 
 REACH_M = 0.75  # half of the length of a profile, m: misplaced paint is found within it
@@ -381,7 +382,7 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
         for name, calibration in calibrations.items()
         if name in drive.cameras
     }
-    after = adjusted_shots(drive, calibrations, clock_s, adjusted)
+    after = adjusted_shots(drive, calibrations, clock_s, adjusted, partial(read_surface, folder))
     before = [shot for shot in recorded_shots(drive) if shot.camera in lenses]
     seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
     if not np.isfinite(seen).all():
