@@ -219,7 +219,7 @@ def _judge(
         before = over_surface(checked.findings, best)
         verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
-        judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
+        judgement = evaluate(result.drive, methods)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
     figures = {**judgement.metrics, **changes, "seconds": context.seconds}
     headlines = tuple(judgement.headlines)
