@@ -284,7 +284,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     if len(lost):
         _log.warning(
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
-            len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
+            len(lost), len(options.survey.points), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
     known = observability(bundle.problem, solution)
     surface = inputs.optimiser.surface
