@@ -634,7 +634,6 @@ SETTINGS = _plainly(
     "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
     "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
     "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
-    "mapping.survey.points_map=[[1.0]]": "points_map",
     "detector.model=nowhere.onnx": "nowhere.onnx",
     "export=[pdf]": "pdf",
     "maping.max_range_m=1": "did you mean mapping",

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
-from v2hdm.calibration.picture import save_picture
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
 from v2hdm.errors import ConfigError, DriveError
@@ -27,6 +26,7 @@ from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.outputs import write_json
+from v2hdm.report.photos import save_points
 from v2hdm.store.files import dump_yaml, replace_csv
 from v2hdm.verdict.verdict import Verdict
 
@@ -228,8 +228,8 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
         place = [*points.points_px[k].tolist(), *points.points_vehicle[k].tolist()]
         rows.append([name, *place, *shift, *known])
     replace_csv(folder / POINTS_FILE, [_COLUMNS, *rows])
-    labels = found.points.labels
-    save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
+    seen = zip(points.labels, points.points_px, off.off_px, found.fit.is_right.tolist(), strict=True)
+    save_points(folder / PICTURE_FILE, image, info, found.fit.cam_from_vehicle, found.roi_vehicle, list(seen))
 
 
 def summary_lines(found: PointCalibration) -> list[str]:

@@ -276,7 +276,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
     """False of a surveyed point held to a candidate that did not enter the map, such as a worn marking."""
     if one.fault is not Fault.CONTROL:
         return True
-    point_map = next(point.position_map for point in survey.control if point.id == one.about)
+    point_map = next(point.position_map for point in survey.points if point.id == one.about)
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
     if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
         return True
