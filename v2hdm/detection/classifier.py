@@ -155,7 +155,7 @@ def rectified_views(
     ordered = quads.long_first(lengthwise).corners[marking]
     quads, output = quads.take(marking), patches.output
     points = quads.px(_points(ordered, diamond, SIZE))
-    bgr = patches.light_at(marking, quads.px(_points(ordered, diamond, _FINER * SIZE)))
+    bgr = patches.light_at(quads.px(_points(ordered, diamond, _FINER * SIZE)))
     bgr = bgr.reshape(len(bgr), SIZE, _FINER, SIZE, _FINER, 3).mean(axis=(2, 4))
     logs = log_light(bgr)
     grey, blueness = (
@@ -294,7 +294,7 @@ def read_markings(
     start = np.stack([p.corners_pinhole_px for p in chosen if p.corners_pinhole_px is not None])
     start_px = camera.distort(start.reshape(-1, 2)).reshape(start.shape)
     own = np.array([(p.index, p.index + p.blob.parts) for p in chosen])
-    patches = Patches(image_bgr, camera, output, found.owner, start_px, own)
+    patches = Patches(image_bgr, camera, output, found.owner, own)
     cut = open_sides(start_px, camera)
     fit = fit_quadrilaterals(patches, camera, start_px, cut, blur_px or TYPICAL_BLUR_PX)
     quads, ground = ImageQuads.of(camera, fit.corners_px), Quad(camera.unproject(fit.corners_px))
@@ -338,7 +338,7 @@ def hidden_ends(patches: Patches, quads: ImageQuads, ground: Quad) -> BoolArray:
     across = np.stack([-_STRIP_PX[:, None] * inward, depth], axis=1)
     points = along[:, :, None, :, None] + across[:, None, :, None]
     points = own.px(points.reshape(len(end), -1, len(_STRIP_PX), 2))
-    bgr = patches.light_at(marking, points)
+    bgr = patches.light_at(points)
     logs = log_light(bgr)
     light = np.stack([log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2]], axis=-1)
     light = light.reshape(len(end), 3, 2, -1, 2)
