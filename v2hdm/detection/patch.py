@@ -101,7 +101,8 @@ class Patches:
 
     def outside(self, points_px: FloatArray) -> BoolArray:
         """Which points (..., 2) are outside the image."""
-        return np.asarray(((points_px < 0) | (points_px > self._last_px)).any(axis=-1))
+        u, v = np.moveaxis(points_px, -1, 0)
+        return np.asarray((u < 0) | (u > self._last_px[0]) | (v < 0) | (v > self._last_px[1]))
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,7 @@ class ImageQuads(Quad):
         """Recorded px (M, ..., 2) of points (M, ..., 2) laid out about each one's corners."""
         if self.frames is None or not self.bowed.any():
             return points
-        points = points.copy()
+        points = points.copy(order="K")
         flat = points[self.bowed].reshape(int(self.bowed.sum()), -1, 2)
         points[self.bowed] = self.frames.to_px(flat).reshape(-1, *points.shape[1:])
         return points
