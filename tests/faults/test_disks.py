@@ -2,7 +2,6 @@
 
 import errno
 import os
-import re
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.situations import Expected, Situation, calibrating
 from tests.drive.example import make_map
 from tests.faults.cases import picture
-from tests.faults.judge import Case, judge, judge_again
+from tests.faults.judge import DATE, Case, judge, judge_again
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.mosaic.blend import Canvas, Sheet
@@ -85,7 +84,7 @@ def test_a_geopackage_on_a_failing_disk_is_whole_or_not_there(tmp_path):
         return 0
 
     def left():
-        return [re.sub(rb"\d{4}-\d\d-\d\dT[\d:.]+Z", b"", path.read_bytes()) for path in tmp_path.iterdir()]
+        return [DATE.sub(b"", path.read_bytes()) for path in tmp_path.iterdir()]
 
     good = watch(write, tmp_path, None, 30)
     whole = left()
