@@ -683,8 +683,7 @@ def measures(options: object, below: str = "") -> Iterator[str]:
             yield below + one.name
 
 
-SIMULATED_PARTS = ("calibration", "disturbance", "route")
-SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "roi_near_m", "roi_far_m")
+SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "roi_near_m", "roi_far_m", "moving_offset_m")
 
 
 def numbers() -> Iterator[Case]:
@@ -694,8 +693,6 @@ def numbers() -> Iterator[Case]:
         (PortConfig(), "simulate.", ("+run=port2",)),
     ):
         for key in measures(options, below):
-            if key.startswith("simulate.") and key.split(".")[1] not in SIMULATED_PARTS:
-                continue
             last = key.rpartition(".")[2]
             for value in ("nan",) if last in SIGNED else ("nan", "-1e-3"):
                 words = (*run, "workers=1", f"{key}={value}")
