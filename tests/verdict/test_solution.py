@@ -15,7 +15,8 @@ from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, HdMap
 from v2hdm.site.candidates import Exclusion
-from v2hdm.verdict import Status
+from v2hdm.verdict import Status, Verdict
+from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_inputs, check_solution
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
@@ -163,10 +164,15 @@ def test_a_small_contradiction_is_none_however_sure_it_is():
 
 
 def test_a_straight_drive_says_what_it_cannot_tell():
-    unsure = (replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf")))
-    untold = [f for f in check_inputs(replace(FINE, score_tests=unsure)) if f.is_unobservable]
+    unsure = replace(FINE, score_tests=(replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf"))))
+    untold = [f for f in check_inputs(unsure) if f.is_unobservable]
     assert {f.check for f in untold} == {"clock", "survey"}
     assert all("drive a turn" in f.says for f in untold)
+    sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
+    for evidence, is_told in ((unsure, True), (FINE, False)):
+        headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline
+        assert headline.startswith("PASS")
+        assert ("if the clocks and the surveyed centres are right" in headline) is is_told
 
 
 @pytest.mark.parametrize(

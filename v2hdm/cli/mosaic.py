@@ -35,11 +35,5 @@ def run(arguments: Sequence[str]) -> None:
     drive = single_drive_of(parsed.result, parsed.drive, "a mosaic is")
     with added_to(parsed.result, "RESULT") as folder:
         steps = steps_of("put images on the ground")
-        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)["sharpness"]
-    if found["edges"]:
-        print(
-            f"paint edges {100 * found['edge_width_before_m']:.1f} cm wide before, "
-            f"{100 * found['edge_width_after_m']:.1f} cm after the optimisation: "
-            f"{found['after_over_before']:.1f} times as sharp (median of {found['edges']} sides)"
-        )
+        write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)
     print(f"mosaic in {parsed.result}")

@@ -329,6 +329,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         joint_covariance=partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
+        surface=surface,
     )
 
 

@@ -192,7 +192,9 @@ def _with_wear(
     ids = (k if one.id is None else one.id for k, one in enumerate(best.hd_map.markings, start=1))
     number = {one: k for k, one in enumerate(ids)}
     shown = {(index[image], number[marking]) for image, marking in whole if marking in number}
-    worn = with_wear(best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads)
+    worn = with_wear(
+        best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads, best.surface
+    )
     methods = {**last.methods, BEST: replace(best, hd_map=worn)}
     return {**sets, name: replace(last, methods=methods)}
 

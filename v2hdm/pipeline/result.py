@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2hdm import __version__
+from v2hdm.association.surface import FILE as GROUND
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError, MappingError
-from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
+from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import inverse
 from v2hdm.geometry.trajectory import interpolate
@@ -244,6 +246,8 @@ def _write_map(
             except MapFileError as error:
                 _log.info("no %s calibration is written: %s", form, error)
     write_trajectories(result.trajectory, drive, folder)
+    if best.surface is not None:
+        write_json(folder / GROUND, best.surface.stored())
     if best.residuals is not None:
         write_residuals(best.residuals, folder / RESIDUALS)
     if best.changes is not None:
@@ -295,9 +299,18 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
     initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
     cam_from_map = best.calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(adjusted)
     ipm = facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
-    views = {
-        initial: np.linalg.inv(ipm) @ flat_motion(inverse(image.map_from_vehicle)),
-        BEST: pinhole_px_from_ground(camera.info.intrinsic, cam_from_map),
+    before = np.linalg.inv(ipm) @ flat_motion(inverse(image.map_from_vehicle))
+    after = pinhole_px_from_ground(camera.info.intrinsic, cam_from_map)
+    ground = None if best.surface is None else best.surface.seen_from(adjusted[None])
+
+    def optimised(points_map: FloatArray) -> FloatArray:
+        if ground is not None:
+            points_map = ground.on_plane(points_map, cam_from_map, 0)
+        return apply_in_front(after, points_map)
+
+    views: dict[str, Callable[[FloatArray], FloatArray]] = {
+        initial: partial(apply_in_front, before),
+        BEST: optimised,
     }
     position_map = adjusted[:2, 3]
     save_overlay(path, read_image(image, camera), camera.info, best.hd_map, position_map, views)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.geometry.ipm import apply_in_front, project_ground
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.geometry.rigid import camera_centre
@@ -225,25 +225,24 @@ def save_overlay(
     info: CameraInfo,
     hd_map: HdMap,
     position_map: FloatArray,
-    views: Mapping[str, FloatArray],
+    views: Mapping[str, Callable[[FloatArray], FloatArray]],
 ) -> None:
     """Draw a map into an image, as recorded, as several calibrations and poses project it.
 
-    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` are by name the
-    homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third coordinate is positive in front of
-    the camera.
+    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` give by name the pinhole
+    px (N, 2) of ground points (N, 2), nan behind the camera.
     """
     canvas = image.copy()
     outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
     lines = [*(np.vstack([one, one[:1]]) for one in outlines), *(lane.points_map for lane in hd_map.lanes)]
     legend: list[tuple[Pen | None, str]] = []
-    for name, pinhole_px_from_map in views.items():
+    for name, view in views.items():
         pen = OVERLAY.get(name, _BEFORE)
         for line in lines:
             # Densified, for lenses bend it.
             dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
             near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-            pieces = _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
+            pieces = _visible_pieces(info, view(dense), near, 0.1)
             draw_lines(canvas, pieces, pen)
         said = "found by the run" if name in OVERLAY else "that the run began with"
         legend.append((pen, f"{name}: the map by the calibration and pose {said}"))

@@ -285,16 +285,29 @@ def _least_shown(one: Contradiction) -> str:
     return f"{CONTRADICTED_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
 
 
+def relied_on(evidence: SolveEvidence) -> list[str]:
+    """The inputs that would move the whole map if they erred in all cameras alike, unseen by this drive."""
+    loose = {"the clocks": _loosest_clock_s(evidence) > CLOCK_OBSERVABLE_S}
+    loose["the surveyed centres"] = bool(_loose_levers(evidence))
+    return [name for name, is_loose in loose.items() if is_loose]
+
+
+def _loosest_clock_s(evidence: SolveEvidence) -> float:
+    return max((one.sigma for one in _of_all(evidence, Fault.CLOCK, Fault.CLOCK)), default=0.0)
+
+
+def _loose_levers(evidence: SolveEvidence) -> list[Contradiction]:
+    levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
+    return [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
+
+
 def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
     """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
-    clocks = _of_all(evidence, Fault.CLOCK, Fault.CLOCK)
-    loosest_s = max((one.sigma for one in clocks), default=0.0)
+    loosest_s, loose = _loosest_clock_s(evidence), _loose_levers(evidence)
     if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
         yield passed("clock", "all cameras", says)
-    levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    loose = [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
     if loose and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
         worst_m = max(one.sigma for one in loose)
