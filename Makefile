@@ -53,10 +53,12 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(MAP_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV): some minutes"
 	$(INSTALL) -e '.[map]'
 	@touch $@
 
 # The development packages include those for mapping.
 $(DEV_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV): some minutes"
 	$(INSTALL) -e '.[dev]'
 	@touch $(MAP_INSTALLED) $@

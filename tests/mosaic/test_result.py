@@ -28,6 +28,7 @@ def result(tmp_path_factory):
 @pytest.fixture(scope="module")
 def told(result):
     assert run(["mosaic", str(result)]) == 0
+    assert '"mosaic":{"src":"' in (result / "report.html").read_text()
     return json.loads((result / "mosaic.json").read_text())
 
 

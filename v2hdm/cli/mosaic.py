@@ -26,6 +26,7 @@ def run(arguments: Sequence[str]) -> None:
     from v2hdm.io.drive.of_result import single_drive_of
     from v2hdm.mosaic.result import write_mosaic
     from v2hdm.pipeline.config import check_device
+    from v2hdm.report.page.document import write_page
     from v2hdm.store.results import added_to
 
     logging.basicConfig(format="%(message)s")
@@ -36,4 +37,5 @@ def run(arguments: Sequence[str]) -> None:
     with added_to(parsed.result, "RESULT") as folder:
         steps = steps_of("put images on the ground")
         write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)
-    print(f"mosaic in {parsed.result}")
+        write_page(folder, drive)
+    print(f"mosaic in {parsed.result}, and under the map of its report.html")

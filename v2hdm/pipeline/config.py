@@ -9,6 +9,7 @@ from typing import Any
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
+from v2hdm.extras import need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.io.maps.formats import check_formats
@@ -59,6 +60,13 @@ class MapConfig:
 
 
 @dataclass(kw_only=True)
+class ReportConfig:
+    """The report; ``background`` is a GeoTIFF or a folder of XYZ tiles under its map, None for none."""
+
+    background: str | None = None
+
+
+@dataclass(kw_only=True)
 class RunConfig:
     """Everything about one run.
 
@@ -66,6 +74,7 @@ class RunConfig:
         name: names the results, ``<output>/<name>/``; None takes the drive's own name.
         drive: the drive to map, or several that are mapped together.
         map: an earlier map that the drive brings up to date, if there is one.
+        report: what its page shows (docs/report.md).
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
@@ -91,6 +100,7 @@ class RunConfig:
     name: str | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
     simulate: PortConfig | None = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
@@ -184,6 +194,10 @@ def admit(config: RunConfig) -> str:
     if config.map.corrections is not None:
         read_corrections(Path(config.map.corrections))
     check_formats(config.export, "export")
+    if config.report.background is not None:
+        need("rasterio", "gis", "report.background", ConfigError)
+        if not Path(config.report.background).exists():
+            raise ConfigError(f"report.background: no file or folder {config.report.background}")
     if config.mosaic and len(config.drive.paths) > 1:
         raise ConfigError("mosaic=true shows the ground of one drive; map the drives one by one for it")
     has_base = config.map.base is not None

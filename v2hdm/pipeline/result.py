@@ -201,6 +201,7 @@ class Result:
         mosaic: bool,
         context: Context,
         crs: str | None = None,
+        background: str | None = None,
     ) -> None:
         """Write what :meth:`save` does into a folder that is still unfinished."""
         from v2hdm.mosaic.result import write_mosaic
@@ -220,7 +221,7 @@ class Result:
             grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
             write_qgis(self.map, folder / "map.qgs", grid=grid)
         with context.timed("report"):
-            write_page(folder, self.drive)
+            write_page(folder, self.drive, background and Path(background))
 
 
 def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | None) -> None:

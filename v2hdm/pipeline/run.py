@@ -258,7 +258,8 @@ def map_and_save(
                 context=context,
             )
             key = result_key(config, found.drives, found.contents, context.cache.key())
-            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs)
+            below = config.report.background
+            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs, below)
             for line in found.verdict.lines:
                 _log.info("%s", line)
         result = RunResult(place, found.metrics, found.headlines, found.verdict)
