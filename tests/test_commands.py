@@ -10,6 +10,7 @@ import sys
 import tomllib
 from contextlib import suppress
 from importlib import metadata
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -157,6 +158,9 @@ def test_openmp_waits_without_spinning_unless_the_user_says_so(given, expected, 
     assert run_command(tmp_path, "v2hdm.map", "+run=port2", **given).stderr.strip() == expected
 
 
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+
+
 def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(capsys):
     assert run([]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
@@ -211,6 +215,22 @@ def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_o
     done = run_command(tmp_path, "probe")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "drawn" / "a.jpg").is_file()
+
+
+OLD = {"extrinsic": "calibrate ground", "calibration": "calibrate compare", "calibrate": "calibrate points"}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_every_console_script_is_a_command_old_names_too(name, monkeypatch):
+    script = EntryPoint(name, SCRIPTS[name], "console_scripts").load()
+    asked: list[list[str]] = []
+    monkeypatch.setattr("v2hdm.cli.main.answer_signals", lambda: None)
+    monkeypatch.setattr("v2hdm.cli.main.run", lambda words: asked.append(list(words)) or 0)
+    monkeypatch.setattr(sys, "argv", [f"/usr/bin/{name}", "--version"])
+    assert script() == 0
+    (words,) = asked
+    old = name.removeprefix("v2hdm").removeprefix("-")
+    assert words == [*OLD.get(old, old).split(), "--version"]
 
 
 @pytest.mark.parametrize(

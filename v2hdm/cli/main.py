@@ -121,6 +121,9 @@ COMMANDS = {
 }
 """``v2hdm/cli/<name>.py`` has ``run(arguments)`` of each."""
 
+_OLD = {"calibrate": "calibrate points", "extrinsic": "calibrate ground", "calibration": "calibrate compare"}
+"""Names of console scripts, ``v2hdm-NAME``, of commands that are called otherwise now."""
+
 
 class _Line(logging.LogRecord):
     """A message of one line, whatever names of a stranger's files are in it."""
@@ -149,6 +152,12 @@ def _is_limited() -> bool:
     import resource
 
     return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+
+
+def script() -> int:
+    """Be an old console script, such as ``v2hdm-map``."""
+    name = Path(sys.argv[0]).stem.removeprefix("v2hdm-")
+    return main([*_OLD.get(name, name).split(), *sys.argv[1:]])
 
 
 def run(arguments: Sequence[str]) -> int:
