@@ -145,7 +145,9 @@ class NetworkOutput:
         """Values (K, M, N) of planes (K, h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
         middle = (stride - 1) / 2
         u, v = (
-            ((points_px[..., axis] - (first + middle)) / stride).astype(np.float32).reshape(len(points_px), -1)
+            ((points_px[..., axis] - (first + middle)) / stride)
+            .astype(np.float32)
+            .reshape(len(points_px), -1)
             for axis, first in enumerate((0, self.top))
         )
         found = np.empty((len(planes), *u.shape), dtype=np.float32)
