@@ -35,13 +35,8 @@ from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
-CONTRADICTED_SIGMAS = 4.0
-"""From so many sigmas an input is contradicted: in one of 400 right drives one of its forty tests exceeds
-it by chance."""
-
-
-_CHANGE_SIGMAS = 4.5
-"""The same where an input changes on the way: few stretches speak of it, and its p-values are too small."""
+CLEAR_SIGMAS = 4.0
+"""What is off by so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
 
 
 _PRIOR_ODDS = 1 / 800
@@ -250,9 +245,9 @@ def _foreign(
 
 def _is_bent(inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest]) -> bool:
     """Whether the ground surely falls or rises, if only by as little as outliers leave."""
-    if any(one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS for one in found):
+    if any(one.fault is Fault.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
         return True
-    return inputs.optimiser.ground_gain(settled) > CONTRADICTED_SIGMAS**2 / 2
+    return inputs.optimiser.ground_gain(settled) > CLEAR_SIGMAS**2 / 2
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
@@ -339,24 +334,34 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
 
 
 def is_contradicted(one: ScoreTest) -> bool:
-    """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
-    return matters(one) and one.sigmas > (_CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS)
+    """Whether an input is off by more than matters, and this drive observes it, likelier than not."""
+    return matters(one) and one.sigmas > even_sigmas(one)
 
 
 def is_doubtful(one: ScoreTest) -> bool:
     """Whether an input is off by more than matters, if not surely, then with more than 5 % probability."""
-    return matters(one) and bayes_factor(one) * _PRIOR_ODDS > _DOUBT / (1 - _DOUBT)
+    return matters(one) and one.sigmas > even_sigmas(one, _DOUBT / (1 - _DOUBT))
 
 
-def bayes_factor(one: ScoreTest) -> float:
-    """How much likelier its value is if the input is off than if it is right.
+def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
+    """The sigmas from which the ``odds`` are, 1 to 1 or others, that the input is off.
 
-    An error is Cauchy about the usual size, which hardly changes within the value's sigma; the p-value says
-    how far in the tail of no error the value lies.
+    An error is Cauchy about the usual size, which hardly changes within the value's sigma; the p-value, and
+    so the sigmas, say how far in the tail of no error the value lies.
     """
+    return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
+
+
+def doubt(one: ScoreTest) -> float:
+    """Log odds that an input is off, by its sigmas and its size."""
+    return one.sigmas**2 / 2 + _log_spread(one) + math.log(_PRIOR_ODDS)
+
+
+def _log_spread(one: ScoreTest) -> float:
+    """Log of the share of likely errors that lie within the sigma about the value of one."""
     usual = _SIZES[one.fault].usual
-    off = one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
-    return off * math.sqrt(2 * math.pi) * math.exp(min(one.sigmas**2 / 2, 700.0))
+    size = math.sqrt(2 * math.pi) * one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
+    return math.log(max(size, 1e-300))
 
 
 def matters(one: ScoreTest) -> bool:

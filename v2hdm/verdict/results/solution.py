@@ -18,10 +18,11 @@ from v2hdm.adjust import Fault
 from v2hdm.adjust.bench import STRETCHES
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.recovery import (
+    CLEAR_SIGMAS,
     CLOCK_OBSERVABLE_S,
-    CONTRADICTED_SIGMAS,
     OBSERVABLE_SIGMA,
-    bayes_factor,
+    doubt,
+    even_sigmas,
     is_contradicted,
     is_doubtful,
     is_physical,
@@ -54,7 +55,7 @@ _VARIANCE_LIMIT = 3.0
 # Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
 _POSE_NOISE_LIMIT = 3.0
 # Log odds from which a cause is named that no score test looks for.
-_ODDS_LIMIT = CONTRADICTED_SIGMAS**2 / 2
+_ODDS_LIMIT = CLEAR_SIGMAS**2 / 2
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
 _LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
@@ -184,7 +185,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
     least = max(causes.values(), default=0.0) - _RIVAL_LOG_ODDS
     named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
-    doubtful = sorted(filter(is_doubtful, evidence.score_tests), key=bayes_factor, reverse=True)
+    doubtful = sorted(filter(is_doubtful, evidence.score_tests), key=doubt, reverse=True)
     named = named or [_doubtful(one) for one in doubtful[:1]]
     findings += named if foreign in causes else [*named, foreign]
     findings += [stamps] if stamps.status is Status.WARN else []
@@ -236,7 +237,7 @@ def _unknown(one: Contradiction) -> Finding:
         "the markings contradict the inputs, and no wrong input of a plausible size explains them: compare "
         "images and poses, in time and in place"
     )
-    return Finding("cause unknown", Status.FAIL, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, "map")
+    return Finding("cause unknown", Status.FAIL, one.sigmas, even_sigmas(one), "sigmas", says, "map")
 
 
 def _contradicted(still: list[Contradiction]) -> Finding:
@@ -253,7 +254,7 @@ def _doubtful(one: Contradiction) -> Finding:
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
     check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
-    return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
+    return Finding(check, status, one.sigmas, even_sigmas(one), "sigmas", says, about)
 
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
@@ -284,7 +285,7 @@ def _sigma(one: Contradiction) -> float:
 def _least_shown(one: Contradiction) -> str:
     """The size from which on a drive shows an error, with its unit."""
     scale, unit = _SHOWN[one.fault.unit]
-    return f"{CONTRADICTED_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
+    return f"{CLEAR_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
 
 
 def relied_on(evidence: SolveEvidence) -> list[str]:
