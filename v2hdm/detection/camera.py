@@ -65,11 +65,14 @@ class RoadCamera:
         self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
         self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
         self.distorted = has_distortion(camera.info)
-        # The pinhole pixel of every few recorded ones, one cell beyond the image's far border.
+        # The pinhole pixel of every few recorded ones, one cell beyond the image's border, and its slopes.
         columns = np.arange(0.0, self.info.width + _LUT_STEP_PX, _LUT_STEP_PX)
         rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
         grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
-        self._pinhole_lut: FloatArray = undistort_points(self.info, grid_px.reshape(-1, 2))
+        node = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
+        right, down = np.diff(node, axis=1)[:-1], np.diff(node, axis=0)
+        slopes = right, down[:, :-1], np.diff(down, axis=1)
+        self._pinhole_lut: FloatArray = np.stack([node[:-1, :-1], *slopes]).transpose(3, 0, 1, 2).copy()
         self._ground_from_pinhole_px = facing_ipm(
             self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
         )
@@ -87,20 +90,18 @@ class RoadCamera:
 
     def undistort(self, points_px: FloatArray) -> FloatArray:
         """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-2 px of the lens model."""
-        points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
+        points = np.array(points_px, dtype=np.float64).reshape(-1, 2)
         if not self.distorted or not len(points):
-            return points.copy()
-        columns = (self.info.width - 1) // _LUT_STEP_PX + 2
-        rows = (self.info.height - 1) // _LUT_STEP_PX + 2
-        cell = points / _LUT_STEP_PX
-        first = np.minimum(np.maximum(np.floor(cell).astype(np.intp), 0), (columns - 2, rows - 2))
-        right, down = np.hsplit(cell - first, 2)
-        lut = self._pinhole_lut
-        at = first[:, 0] + columns * first[:, 1]
-        upper = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
-        at += columns
-        lower = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
-        return np.asarray(upper * (1 - down) + lower * down)
+            return points
+        rows, columns = self._pinhole_lut.shape[2:]
+        u, v = points.T / _LUT_STEP_PX
+        column, row = np.clip(u.astype(np.intp), 0, columns - 1), np.clip(v.astype(np.intp), 0, rows - 1)
+        right, down, at = u - column, v - row, columns * row + column
+        # Plane by plane numpy takes a sixth of the time.
+        for axis, table in enumerate(self._pinhole_lut.reshape(2, 4, -1)):
+            there, by_right, by_down, by_both = (plane.take(at) for plane in table)
+            points[:, axis] = there + by_right * right + (by_down + by_both * right) * down
+        return points
 
     def distort(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Pinhole pixels (N, 2) to recorded pixels."""

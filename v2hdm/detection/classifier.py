@@ -157,8 +157,11 @@ def rectified_views(
     points = quads.px(_points(ordered, diamond, SIZE))
     fine = patches.light_at(quads.px(_points(ordered, diamond, _FINER * SIZE)))
     fine = fine.reshape(-1, SIZE, _FINER, SIZE, _FINER, 3)
-    # A sum of slices takes a tenth of the time of a mean over two axes.
-    bgr = sum(fine[:, :, i, :, j] for i in range(_FINER) for j in range(_FINER)) / np.float32(_FINER**2)
+    # Added slice by slice: a mean over two axes takes ten times as long.
+    bgr = np.zeros_like(fine[:, :, 0, :, 0])
+    for i, j in np.ndindex(_FINER, _FINER):
+        bgr += fine[:, :, i, :, j]
+    bgr /= np.float32(_FINER**2)
     logs = log_light(bgr)
     grey, blueness = (
         plane - np.median(plane, axis=(1, 2), keepdims=True)
@@ -185,7 +188,7 @@ def rectified_views(
 
 
 def _points(corners: FloatArray, diamond: np.ndarray, size: int) -> np.ndarray:
-    """Where (M, size, size, 2) float32 the elements of pictures lie, the first corner near the first of them."""
+    """Where (M, size, size, 2) the elements of pictures lie, the first corner near the first of them."""
     first, second, third, fourth = corners.swapaxes(0, 1)
     # Heckbert, "Fundamentals of Texture Mapping and Image Warping" (1989), 2.2.3: from the unit square.
     surplus = first - second + third - fourth
@@ -203,7 +206,7 @@ def _points(corners: FloatArray, diamond: np.ndarray, size: int) -> np.ndarray:
 
 @cache
 def _grids(size: int) -> np.ndarray:
-    """The elements of a picture (2, 3, size * size), (a, b, 1) in sides of a marking: all but diamonds, these."""
+    """Elements (2, 3, size * size) of pictures, (a, b, 1) in sides of a marking, for others and diamonds."""
     step = (np.arange(size) + 0.5) / size
     grids = np.ones((2, 3, size, size), dtype=np.float32)
     for grid, beyond in zip(grids, ((_BEFORE, _BESIDE), (_AROUND, _AROUND)), strict=True):

@@ -83,6 +83,7 @@ aperture."""
 _SEARCH_STEPS, _STEPS = 4, 8
 _MAX_STEP = 2.0  # longest step of a side, in blurs
 _SETTLED_PX, _FOUND_PX = 0.05, 0.3  # steps of fit and of search that are shorter than this are the last, px
+_INSIGNIFICANT = 0.1  # and so are those by which chi-square was to fall by no more than this
 _BLUR, _K = 8, 9
 _LIGHT = 10
 _SLOPE = _LIGHT + KNOTS
@@ -112,7 +113,14 @@ it is from a parallelogram on the ground, in the deviation that is expected.
 
 _ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
 _DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
-_ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
+_ROUGHNESS = (_DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)) / _LIGHT_STEP**2
+_PRIOR = np.zeros((_UNKNOWNS, _UNKNOWNS))
+_PRIOR[_BLUR, _BLUR], _PRIOR[_K, _K] = 1 / _BLUR_SIGMA_PX**2, 1 / _CONTRAST_SIGMA**2
+_PRIOR[_SLOPE, _SLOPE], _PRIOR[_LIGHT:_SLOPE, _LIGHT:_SLOPE] = 1 / _LIGHT_STEP**2, _ROUGHNESS
+"""Information that the typical blur and contrast are of, and that light changes little."""
+
+_HELD = 1e9  # information of a blur that is held
+_SIDES = np.arange(8)
 
 _TILT_SHARE = 0.5  # a side that is off as a whole is askew by this share of that
 _WHOLE_SIDES = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron(
@@ -256,13 +264,15 @@ def _sound(quad: Quad, before: Quad) -> BoolArray:
 class _System:
     """Normal equations at the last linearisation: ``information`` (M, U, U), scatter, weights, last step.
 
-    ``scatter`` (M, 4) of log grey by side, ``inliers`` (M,) mean robust weight, ``by_side`` (M, 8) last step.
+    ``scatter`` (M, 4) of log grey by side, ``inliers`` (M,) mean robust weight, ``by_side`` (M, 8) last step,
+    ``decrement`` (M,) by how much chi-square was to fall by it (Newton's decrement).
     """
 
     information: FloatArray
     scatter: FloatArray
     inliers: FloatArray
     by_side: FloatArray
+    decrement: FloatArray
 
 
 def _put(whole: _System | _State, rows: np.ndarray, part: _System | _State) -> None:
@@ -310,13 +320,15 @@ class _State:
         return cls(*known, contrast, contrast.copy(), light, np.zeros(count))
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
-        """Gauss-Newton until each marking's step is small; the system is that of its last step.
+        """Gauss-Newton until each marking's step is small or says nothing; the system is of its last step.
 
         With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
         """
         scatter, settled_px = (_FINAL_SCATTER, _SETTLED_PX) if paint is None else (_WIDE_SCATTER, _FOUND_PX)
         count = len(self.blur_px)
-        system = _System(*(np.zeros((count, *shape)) for shape in ((_UNKNOWNS, _UNKNOWNS), (4,), (), (8,))))
+        system = _System(
+            *(np.zeros((count, *shape)) for shape in ((_UNKNOWNS, _UNKNOWNS), (4,), (), (8,), ()))
+        )
         running = np.arange(count)
         for number in range(steps):
             now = self._take(running)
@@ -324,7 +336,8 @@ class _State:
             _put(self, running, now)
             _put(system, running, part)
             self.quad.corners[running] = now.quad.corners
-            moving = np.flatnonzero(np.abs(part.by_side).max(axis=1) > settled_px)
+            moving = np.abs(part.by_side).max(axis=1) > settled_px
+            moving = np.flatnonzero(moving & (part.decrement > _INSIGNIFICANT))
             if not len(moving):
                 break
             if len(moving) < len(running):
@@ -373,7 +386,7 @@ class _State:
         self.contrast = self.contrast + np.clip(moved[:, _K], -0.5, 0.5)
         self.light = self.light + moved[:, _LIGHT:_SLOPE]
         self.slope = self.slope + moved[:, _SLOPE]
-        return _System(information, scatter, inliers, by_side)
+        return _System(information, scatter, inliers, by_side, (gradient * moved).sum(axis=1))
 
     def _first_light(self, lattice: Lattice, coverage: np.ndarray) -> None:
         """Light and contrast of least squares, the logarithm taken as linear in the coverage."""
@@ -382,7 +395,7 @@ class _State:
         matrix = (weighted @ basis.swapaxes(1, 2)).astype(np.float64)
         target = (weighted @ lattice.values[..., None])[..., 0].astype(np.float64)
         prior = np.zeros_like(matrix)
-        prior[:, :KNOTS, :KNOTS] = _ROUGHNESS / _LIGHT_STEP**2
+        prior[:, :KNOTS, :KNOTS] = _ROUGHNESS
         prior[:, KNOTS, KNOTS] = 1 / _CONTRAST_SIGMA**2
         found = np.linalg.solve(matrix + prior + 1e-6 * np.eye(KNOTS + 1), target[..., None])[..., 0]
         contrast = found[:, KNOTS]
@@ -401,21 +414,18 @@ class _State:
         start = (off * normal).sum(axis=-1)
         end = (following(off) * normal).sum(axis=-1)
         stiffness = 1 / self.outline_sigma_px**2
-        place = np.arange(8)
-        information[:, place, place] += stiffness
-        gradient[:, :8] += stiffness * np.concatenate([start, end], axis=1)
         by_side = self.closure @ self.quad.corner_from_side
-        open_ = self.open_gap()
+        information += _PRIOR
         information[:, :8, :8] += by_side.swapaxes(1, 2) @ by_side
-        gradient[:, :8] -= (by_side.swapaxes(1, 2) @ open_[..., None])[..., 0]
-        blur_stiffness = 1e9 if hold_blur else 1 / _BLUR_SIGMA_PX**2
-        information[:, _BLUR, _BLUR] += blur_stiffness
-        gradient[:, _BLUR] += 0.0 if hold_blur else blur_stiffness * (self.expected_blur_px - self.blur_px)
-        information[:, _K, _K] += 1 / _CONTRAST_SIGMA**2
+        information[:, _SIDES, _SIDES] += stiffness
+        gradient[:, :8] += stiffness * np.concatenate([start, end], axis=1)
+        gradient[:, :8] -= (self.open_gap()[:, None] @ by_side)[:, 0]
+        if hold_blur:
+            information[:, _BLUR, _BLUR] += _HELD
+        else:
+            gradient[:, _BLUR] += (self.expected_blur_px - self.blur_px) / _BLUR_SIGMA_PX**2
         gradient[:, _K] += (self.expected_contrast - self.contrast) / _CONTRAST_SIGMA**2
-        information[:, _LIGHT:_SLOPE, _LIGHT:_SLOPE] += _ROUGHNESS / _LIGHT_STEP**2
-        gradient[:, _LIGHT:_SLOPE] -= self.light @ _ROUGHNESS / _LIGHT_STEP**2
-        information[:, _SLOPE, _SLOPE] += 1 / _LIGHT_STEP**2
+        gradient[:, _LIGHT:_SLOPE] -= self.light @ _ROUGHNESS
         gradient[:, _SLOPE] -= self.slope / _LIGHT_STEP**2
 
 

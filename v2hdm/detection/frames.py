@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,14 +76,16 @@ def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
         yield Frame(str(path), name, index, None, read_bgr(path))
 
 
-def list_images(folder: Path) -> list[Path]:
-    """The image files that lie in a folder itself, by name."""
+def list_images(folder: Path, known: AbstractSet[str] = frozenset()) -> list[Path]:
+    """The image files that lie in a folder itself, by name, but for those of ``known`` names."""
     try:
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        # Names alone: of thousands of images paths would take longer than it takes to look at one.
+        names = {*os.listdir(folder)} - known  # noqa: PTH208
     except OSError as error:
         raise DriveError(
             f"{folder}: cannot read this folder ({error.strerror}); check its permissions"
         ) from error
+    return [folder / name for name in sorted(names) if name.lower().endswith(IMAGE_SUFFIXES)]
 
 
 def video_frames(path: Path) -> Iterator[Frame]:
@@ -168,7 +171,7 @@ def arriving_frames(folder: Path) -> Iterator[Frame]:
     """
     known, index = {path.name for path in list_images(folder)[:-1]}, 0
     while True:
-        came = {path: _written_s(path) for path in list_images(folder) if path.name not in known}
+        came = {path: _written_s(path) for path in list_images(folder, known)}
         if not came:
             time.sleep(_POLL_S)
             continue

@@ -127,9 +127,8 @@ class NetworkOutput:
         """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (K, M, ...)."""
         odds = self._sample(self.kinds, self.stride * self.kind_scale, points_px)
         odds -= odds.max(axis=0)
-        odds = cv2.exp(odds.reshape(len(odds), -1))
-        odds /= odds.sum(axis=0)
-        return odds.reshape(len(odds), *points_px.shape[:-1])
+        odds = np.asarray(cv2.exp(odds.reshape(len(odds), -1)))
+        return np.asarray(odds / odds.sum(axis=0)).reshape(len(odds), *points_px.shape[:-1])
 
     def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Probability (K, N) of each class at elements of ``paint``."""
@@ -143,13 +142,9 @@ class NetworkOutput:
 
     def _sample(self, planes: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
         """Values (K, M, N) of planes (K, h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
-        middle = (stride - 1) / 2
-        u, v = (
-            ((points_px[..., axis] - (first + middle)) / stride)
-            .astype(np.float32)
-            .reshape(len(points_px), -1)
-            for axis, first in enumerate((0, self.top))
-        )
+        middle, rows = (stride - 1) / 2, len(points_px)
+        u = ((points_px[..., 0] - middle) / stride).astype(np.float32).reshape(rows, -1)
+        v = ((points_px[..., 1] - self.top - middle) / stride).astype(np.float32).reshape(rows, -1)
         found = np.empty((len(planes), *u.shape), dtype=np.float32)
         for plane, values in zip(planes, found, strict=True):
             cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=values, borderMode=cv2.BORDER_REPLICATE)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
@@ -77,15 +79,15 @@ def _chains(runs: FloatArray) -> list[FloatArray]:
     linked = (below[:, 0] == above[:, 0] + 1) & (above[:, 1] < below[:, 2]) & (below[:, 1] < above[:, 2])
     if linked.all():
         return [runs]
-    # Some rows hold several runs.
-    cuts = np.split(runs, np.flatnonzero(np.diff(runs[:, 0])) + 1)
-    open_chains: list[list[FloatArray]] = []
-    closed: list[list[FloatArray]] = []
-    for runs in cuts:
-        following: list[list[FloatArray]] = []
+    # Some rows hold several runs; plain floats take a third of the time of arrays.
+    open_chains: list[list[list[float]]] = []
+    closed: list[list[list[float]]] = []
+    for _, cut in groupby(runs.tolist(), key=itemgetter(0)):
+        following: list[list[list[float]]] = []
         taken = set()
-        for run in runs:
-            meets = (chain[-1][1] < run[2] and run[1] < chain[-1][2] for chain in open_chains)
+        for run in cut:
+            _, begin, end = run
+            meets = (chain[-1][1] < end and begin < chain[-1][2] for chain in open_chains)
             match = next((c for c, met in enumerate(meets) if met and c not in taken), None)
             if match is None:
                 following.append([run])
