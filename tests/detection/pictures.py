@@ -68,7 +68,7 @@ def patches_of(
 ) -> Patches:
     """The pixels about markings (M, 4, 2), none of which is other markings' paint."""
     none = np.zeros((len(corners_px), 2), dtype=np.intp)
-    return Patches(image, camera, output, np.zeros(output.paint.shape, np.int16), corners_px, none)
+    return Patches(image, camera, output, np.zeros(output.paint.shape, np.int16), none)
 
 
 def view_of(

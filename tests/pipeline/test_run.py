@@ -120,7 +120,7 @@ def test_the_files_of_a_result_can_be_read_back(result):
             assert "# drive: short\n# date: " in text
     for one in FORMATS.values():
         assert (result / one.file.format(name="map")).stat().st_size > 1000
-    for picture in ("birdseye.png", "overlay_front.png", "overlay_rear.png", "mosaic_before_after.png"):
+    for picture in ("overlay_front.png", "overlay_rear.png", "mosaic_before_after.png"):
         image = cv2.imread(str(result / picture))
         assert image is not None, picture
         assert image.std() > 5.0

@@ -158,6 +158,14 @@ def test_a_rival_that_explains_as_much_is_named_as_well():
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
+@pytest.mark.parametrize(("sigmas", "is_told"), [(3.72, True), (2.5, False)])
+def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
+    focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.024, 0.0057, sigmas)
+    told = raised(result(replace(FINE, score_tests=(replace(focal, gain=0.2),))), drive)
+    assert [one.status for one in told.values()] == [Status.WARN] * is_told
+    assert not is_told or "2.4 % shorter" in told["focal length"].says
+
+
 def test_a_small_contradiction_is_none_however_sure_it_is():
     tiny = replace(CLOCK, value=0.0008, sigma=0.0001, p_value=1e-15)
     assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, score_tests=(tiny,))))

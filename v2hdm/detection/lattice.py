@@ -89,8 +89,9 @@ class Lattice:
         points = np.ones((len(pixels), 3, pixels.shape[1]), dtype=np.float32)
         points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
         outside = quad.outward.astype(np.float32) @ points
-        inside = np.asarray(outside.max(axis=1) < 0, dtype=np.float32)
-        of_side = np.asarray(outside.argmax(axis=1)[:, None] == np.arange(4)[:, None], dtype=np.float32)
+        nearest = outside.max(axis=1, keepdims=True)
+        inside = (nearest[:, 0] < 0).astype(np.float32)
+        of_side = (outside == nearest).astype(np.float32)
         hats, across = _light_basis(quad, points)
         clipped = limited.sum(axis=1, keepdims=True) / np.maximum(used.sum(axis=1, keepdims=True), 1)
         values = _clearest(light, used, inside)

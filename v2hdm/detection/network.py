@@ -118,18 +118,18 @@ class NetworkOutput:
         """Elements of ``paint`` per element of ``kinds``, in each direction."""
         return float(self.paint.shape[1] / self.kinds.shape[2])
 
-    def odds_at(self, points_px: FloatArray) -> FloatArray:
+    def odds_at(self, points_px: FloatArray) -> np.ndarray:
         """Log odds of paint, at most 6 either way, at recorded px (..., 2); outside, those of the border."""
-        found = self._sample(self.paint, self.stride, points_px)
-        return np.asarray(np.clip(found, -_MOST_ODDS, _MOST_ODDS), np.float64).reshape(points_px.shape[:-1])
+        (found,) = self._sample(self.paint[None], self.stride, points_px)
+        return np.asarray(np.clip(found, -_MOST_ODDS, _MOST_ODDS)).reshape(points_px.shape[:-1])
 
-    def shares_at(self, points_px: FloatArray) -> FloatArray:
-        """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (M, K, ...)."""
-        stride = self.stride * self.kind_scale
-        logits = np.stack([self._sample(plane, stride, points_px) for plane in self.kinds])
-        odds = np.exp(logits - logits.max(axis=0))
-        shares = (odds / odds.sum(axis=0)).reshape(len(odds), *points_px.shape[:-1])
-        return np.asarray(np.moveaxis(shares, 0, 1), dtype=np.float64)
+    def shares_at(self, points_px: FloatArray) -> np.ndarray:
+        """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (K, M, ...)."""
+        odds = self._sample(self.kinds, self.stride * self.kind_scale, points_px)
+        odds -= odds.max(axis=0)
+        odds = cv2.exp(odds.reshape(len(odds), -1))
+        odds /= odds.sum(axis=0)
+        return odds.reshape(len(odds), *points_px.shape[:-1])
 
     def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Probability (K, N) of each class at elements of ``paint``."""
@@ -141,12 +141,17 @@ class NetworkOutput:
         odds /= odds.sum(axis=0)
         return np.asarray(odds)
 
-    def _sample(self, plane: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
-        """Values (M, N) of a plane (h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
-        middle, rows = (stride - 1) / 2, len(points_px)
-        u = ((points_px[..., 0] - middle) / stride).astype(np.float32).reshape(rows, -1)
-        v = ((points_px[..., 1] - self.top - middle) / stride).astype(np.float32).reshape(rows, -1)
-        return np.asarray(cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    def _sample(self, planes: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
+        """Values (K, M, N) of planes (K, h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
+        middle = (stride - 1) / 2
+        u, v = (
+            ((points_px[..., axis] - (first + middle)) / stride).astype(np.float32).reshape(len(points_px), -1)
+            for axis, first in enumerate((0, self.top))
+        )
+        found = np.empty((len(planes), *u.shape), dtype=np.float32)
+        for plane, values in zip(planes, found, strict=True):
+            cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=values, borderMode=cv2.BORDER_REPLICATE)
+        return found
 
 
 class Network:

@@ -44,8 +44,11 @@ _CHANGE_SIGMAS = 4.5
 """The same where an input changes on the way: few stretches speak of it, and its p-values are too small."""
 
 
-_LIKELY = math.log(1e3 * 40)
-"""Log odds from which a fault is likelier than none: one drive in a thousand has one, of forty inputs."""
+_PRIOR_ODDS = 1 / 800
+"""That an input is wrong: one drive in twenty of a new vehicle, say, has a wrong one of forty."""
+
+_DOUBT = 0.05
+"""Probability of a wrong input that a PASS leaves, which speaks of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -273,7 +276,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
     """False of a surveyed point held to a candidate that did not enter the map, such as a worn marking."""
     if one.fault is not Fault.CONTROL:
         return True
-    point_map = next(point.position_map for point in survey.control if point.id == one.about)
+    point_map = next(point.position_map for point in survey.points if point.id == one.about)
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
     if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
         return True
@@ -340,9 +343,20 @@ def is_contradicted(one: ScoreTest) -> bool:
     return matters(one) and one.sigmas > (_CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS)
 
 
-def is_likely(one: ScoreTest) -> bool:
-    """Whether an input is likelier off than right by more than matters, if not surely."""
-    return matters(one) and log_odds(one) > _LIKELY
+def is_doubtful(one: ScoreTest) -> bool:
+    """Whether an input is off by more than matters, if not surely, then with more than 5 % probability."""
+    return matters(one) and bayes_factor(one) * _PRIOR_ODDS > _DOUBT / (1 - _DOUBT)
+
+
+def bayes_factor(one: ScoreTest) -> float:
+    """How much likelier its value is if the input is off than if it is right.
+
+    An error is Cauchy about the usual size, which hardly changes within the value's sigma; the p-value says
+    how far in the tail of no error the value lies.
+    """
+    usual = _SIZES[one.fault].usual
+    off = one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
+    return off * math.sqrt(2 * math.pi) * math.exp(min(one.sigmas**2 / 2, 700.0))
 
 
 def matters(one: ScoreTest) -> bool:

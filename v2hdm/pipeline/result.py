@@ -39,7 +39,6 @@ from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.keys import Contents, made_of_drives
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
-from v2hdm.report.figures import save_birdseye
 from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
@@ -209,7 +208,7 @@ class Result:
         from v2hdm.report.page.document import write_page
 
         if self.judgement is not None:
-            _write_map(folder, self, formats, self.judgement, crs)
+            _write_map(folder, self, formats, crs)
             for name, methods in self.methods.items() if all_maps else ():
                 for method, made in methods.items():
                     path = folder / "maps" / f"{name}_{method}.geojson"
@@ -225,9 +224,7 @@ class Result:
             write_page(folder, self.drive, None if background is None else Path(background))
 
 
-def _write_map(
-    folder: Path, result: Result, formats: Sequence[str], judgement: Judgement, crs: str | None
-) -> None:
+def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | None) -> None:
     drive, best, verdict = result.drive, result.best, result.verdict.as_json()
     geojson = [one for one in formats if one == "geojson"]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
@@ -261,17 +258,9 @@ def _write_map(
         for one in methods[BEST].excluded
     ]
     write_exclusions(excluded, folder / "excluded.geojson", drive.origin, drive.road)
-    maps = {name: one.hd_map for name, one in list(result.methods.values())[-1].items()}
-    save_birdseye(folder / "birdseye.png", maps, BEST, _route(drive), judgement.truth)
     for name in best.calibrations:
         image = _fullest_image(drive, name, result.detections)
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
-
-
-def _route(drive: Drive) -> FloatArray:
-    """Positions (N, 2) of the vehicle, with a nan between one visit and the next."""
-    ends = np.flatnonzero(np.diff([image.visit for image in drive.images])) + 1
-    return np.insert(drive.route_map, ends, np.nan, axis=0)
 
 
 _BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")

@@ -385,7 +385,7 @@ def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) ->
     places_px = _places_px(image, across, below[..., None])
     paint = output.odds_at(places_px).max(axis=2)
     weight = as_probability(paint) + _LEAST_WEIGHT
-    dashes = output.shares_at(places_px[:, :, len(_ON_M) // 2])[:, output.classes.index(LANE_DASH)]
+    dashes = output.shares_at(places_px[:, :, len(_ON_M) // 2])[output.classes.index(LANE_DASH)]
     return np.column_stack([paint.mean(axis=1), (dashes * weight).sum(axis=1) / weight.sum(axis=1)])
 
 

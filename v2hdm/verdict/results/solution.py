@@ -21,8 +21,9 @@ from v2hdm.mapping.recovery import (
     CLOCK_OBSERVABLE_S,
     CONTRADICTED_SIGMAS,
     OBSERVABLE_SIGMA,
+    bayes_factor,
     is_contradicted,
-    is_likely,
+    is_doubtful,
     is_physical,
     log_odds,
     matters,
@@ -183,7 +184,8 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
     least = max(causes.values(), default=0.0) - _RIVAL_LOG_ODDS
     named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
-    named = named or [_likely(one) for one in evidence.score_tests if is_likely(one)][:1]
+    doubtful = sorted(filter(is_doubtful, evidence.score_tests), key=bayes_factor, reverse=True)
+    named = named or [_doubtful(one) for one in doubtful[:1]]
     findings += named if foreign in causes else [*named, foreign]
     findings += [stamps] if stamps.status is Status.WARN else []
     raised |= {one.check for one in named}
@@ -244,7 +246,7 @@ def _contradicted(still: list[Contradiction]) -> Finding:
     return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
 
 
-def _likely(one: Contradiction) -> Finding:
+def _doubtful(one: Contradiction) -> Finding:
     says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {_CHECKS[one.fault][1]}"
     return _input(one, Status.WARN, says)
 
