@@ -16,12 +16,10 @@ from v2hdm.site.posterior import (
     OTHER_LENGTH,
     PART_OF_SYMBOL,
     PIECE,
-    WRONG_CORNER,
     WRONG_END,
-    _log_turns,
     posterior,
 )
-from v2hdm.site.shapes import lay, learn_shapes
+from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
 DASH = np.array([[1.5, 0.06], [-1.5, 0.06], [-1.5, -0.06], [1.5, -0.06]])
@@ -29,9 +27,9 @@ END = [1, 2]
 """Two corners of DASH at one end."""
 
 
-def painted(shapes, rng, turn=None):
-    """Markings (N, 4, 2) of these shapes, in a row, turned any way or by ``turn``, from any corner on."""
-    turn = rng.uniform(0, 2 * np.pi, len(shapes)) if turn is None else turn
+def painted(shapes, rng):
+    """Markings (N, 4, 2) of these shapes, in a row, turned any way, beginning with any corner."""
+    turn = rng.uniform(0, 2 * np.pi, len(shapes))
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
     placed = np.stack(shapes) @ rotation.transpose(0, 2, 1) + np.arange(len(shapes))[:, None, None] * [5.0, 0]
     return np.stack([np.roll(one, int(rng.integers(4)), axis=0) for one in placed])
@@ -338,21 +336,8 @@ def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diam
     candidates = solved(true, rng)
     candidates.corners_map[7] = piece_of(true[7])
     found = of_one_class(candidates)
-    # One that is turned by a right angle may have two corners elsewhere: here they lie in every direction.
-    assert found.probability[7, [WRONG_CORNER, PIECE]].sum() > 0.9
+    assert found.probability[7, PIECE] > 0.8
     assert normalised(found, true)[7] < 20
-
-
-@pytest.mark.parametrize("aligned", [True, False])
-def test_a_diamond_is_hardly_turned_by_a_right_angle_where_the_others_are_aligned(aligned):
-    rng = np.random.default_rng(31)
-    true = painted([DIAMOND] * 40, rng, turn=0.3 + 0.02 * rng.standard_normal(40) if aligned else None)
-    true[7] = (true[7] - true[7].mean(axis=0)) @ [[0.0, 1.0], [-1.0, 0.0]] + true[7].mean(axis=0)
-    ways = lay(DIAMOND, 0.01, solved(true, rng))
-    as_seen, otherwise = (np.exp(one) for one in _log_turns(ways, np.ones(40)))
-    np.testing.assert_allclose(as_seen + otherwise, 1.0)
-    others = np.delete(as_seen, 7)
-    assert bool(others.min() > 0.9) is bool(as_seen[7] < 0.05) is aligned
 
 
 def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first():

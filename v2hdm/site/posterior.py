@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.special import betaln, ive, logsumexp
+from scipy.special import betaln, logsumexp
 from scipy.stats import f, norm, t
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -47,7 +47,7 @@ _LENGTH_SIGMA_M = 0.3
 """Sigma, m, of the length of paint rolled by the metre, before the drive says: a tenth of a dash's."""
 
 _REPEATED_COUNT = 3.0
-"""Concentration of the Dirichlet processes of lengths and of directions: most paint repeats what was seen."""
+"""Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
 
 _SOUND_SPREAD, _WORN_SPREAD = (0.0, 0.4), (1.5, 0.7)
 """Mean and sigma of the logarithm of how uncertain an end is beside a typical one of its class: images of a
@@ -100,8 +100,6 @@ diamonds) and their degrees of freedom in Student's t distribution, since worn o
 
 _OTHER_ODDS = (1.5, 1.5)
 """Mean and sigma of the same of anything else (fourteen candidates of a rendered port)."""
-
-_ALIGNED_RAD = 0.05  # sigma of the direction of paint about that of others that are laid out alike
 
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
@@ -379,21 +377,19 @@ def _add_shape(
         The log likelihood (N,) that what is no marking has ends as ragged as these.
     """
     candidates, share = space.candidates, space.share
-    ways, scatter = lay(shape.corners, shape.sigma_m, candidates), shape.sigma_m**2 * np.eye(8)
-    turned = _log_turns(ways, weight)
+    laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
+    scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
+    space.add(OF_CLASS, part / 2, laid, scatter)
+    space.add(OF_CLASS, part / 2, otherwise, scatter)
+    ends = _inwards(laid.corners_map, shape.is_elongated)
+    for moved in _CORNERS_MOVED:
+        block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
+        space.add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
+    _add_pieces(space, part, laid, scatter, ends)
     none = np.zeros(len(candidates))
-    for laid, likely in zip(ways, turned, strict=True):
-        space.add(OF_CLASS, part, laid, scatter, beside=likely)
-        if not shape.is_elongated:
-            ends = _inwards(laid.corners_map, elongated=False)
-            _add_wrong_corners(space, part, laid, scatter, likely)
-            _add_pieces(space, part, laid, scatter, ends, likely)
-            _add_wrong_ends(space, part, laid, [(1.0, scatter)], ends, [[_NOTHING]] * 4, [none] * 4, likely)
     if not shape.is_elongated:
+        _add_wrong_ends(space, part, laid, [(1.0, scatter)], ends, [[_NOTHING]] * 4, [none] * 4)
         return none
-    laid = ways[0]
-    ends = _inwards(laid.corners_map, elongated=True)
-    _add_wrong_corners(space, part, laid, scatter, none)
     worn = [
         ragged + np.sum(end.reshape(-1, 4, 2).any(axis=2) * vague, axis=1) / 2
         for ragged, (end, _) in zip(
@@ -406,7 +402,7 @@ def _add_shape(
     space.add(OTHER_LENGTH, part, laid, longer, beside=again)
     other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
     angles = [[_NOTHING, _slanted(laid.corners_map, end)] for end, _ in ends]
-    _add_wrong_ends(space, part, laid, [(1 - other, scatter), (other, longer)], ends, angles, worn, none)
+    _add_wrong_ends(space, part, laid, [(1 - other, scatter), (other, longer)], ends, angles, worn)
     # Of what is no marking any end is as likely ragged as not.
     return np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
 
@@ -419,63 +415,27 @@ def _add_wrong_ends(
     ends: Sequence[tuple[FloatArray, FloatArray]],
     angles: Sequence[Sequence[FloatArray]],
     worn: Sequence[FloatArray],
-    likely: FloatArray,
 ) -> None:
-    """Add those of one end that is worn, or runs on, of each length and cut; as ``likely`` (N,)."""
+    """Add those of one end that is worn, or runs on: of each length, cut at each angle."""
     for (end, extent_m), cuts, ragged in zip(ends, angles, worn, strict=True):
         ways: tuple[tuple[FloatArray, FloatArray | float], ...] = (
             (_MISPLACED_M * end, ragged),
             (_WORN_SHARE * extent_m * end, ragged),
             (-_RUN_ON_M * end, 0.0),
         )
-        for (way, beside), cut, (common, size) in itertools.product(ways, cuts, lengths):
-            each = part * common / len(ends) / len(ways) / len(cuts)
-            space.add(WRONG_END, each, laid, size, _outer(way) + cut, way[..., None], likely + beside)
-
-
-def _add_wrong_corners(
-    space: _Space, part: float, laid: Laid, scatter: FloatArray, likely: FloatArray
-) -> None:
-    """Add those of corners that were taken from other edges, as ``likely`` (N,)."""
-    for moved in _CORNERS_MOVED:
-        block = np.asarray(_MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2)), np.float64)
-        space.add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, block, beside=likely)
+        for (way, beside), cut, (likely, size) in itertools.product(ways, cuts, lengths):
+            each = part * likely / len(ends) / len(ways) / len(cuts)
+            space.add(WRONG_END, each, laid, size, _outer(way) + cut, way[..., None], beside)
 
 
 def _add_pieces(
-    space: _Space,
-    part: float,
-    laid: Laid,
-    scatter: FloatArray,
-    ends: Sequence[tuple[FloatArray, FloatArray]],
-    likely: FloatArray,
+    space: _Space, part: float, laid: Laid, scatter: FloatArray, ends: Sequence[tuple[FloatArray, FloatArray]]
 ) -> None:
-    """Add those that lack one end and one side, as what a vehicle leaves in view; as ``likely`` (N,)."""
+    """Add those of a marking that lacks one end and one side, such as what another vehicle leaves in view."""
     for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
         both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
         slanted = _slanted(laid.corners_map, one + other_end, _CUT_SHARE)
-        misplaced = both @ np.swapaxes(both, 1, 2) + slanted
-        space.add(PIECE, part / 4, laid, scatter, misplaced, both, likely)
-
-
-def _log_turns(ways: Sequence[Laid], weight: FloatArray) -> list[FloatArray]:
-    """Log probabilities (N,) of each of the ways to lay a shape, by how the class's other markings lie.
-
-    Paint is aligned with what surrounds it: its directions are draws of a Dirichlet process, each with von
-    Mises' distribution about its like. ``weight`` (N,) says who is a marking.
-    """
-    concentration = (2 * _ALIGNED_RAD) ** -2
-    # A parallelogram looks the same from both ends, so that angles count twice.
-    angles = [2 * np.arctan2(one.rotation[:, 1, 0], one.rotation[:, 0, 0]) for one in ways]
-    order = np.arange(1, int(5 * np.sqrt(concentration)))
-    fading = 2 * ive(order, concentration) / ive(0, concentration)
-    waves = weight @ np.exp(-1j * angles[0][:, None] * order)
-    densities = []
-    for angle in angles:
-        own = weight * np.exp(concentration * (np.cos(angle - angles[0]) - 1)) / ive(0, concentration)
-        all_of_them = weight.sum() + (np.exp(1j * angle[:, None] * order) @ (fading * waves)).real
-        densities.append(_REPEATED_COUNT + np.maximum(all_of_them - own, 0.0))
-    return [np.log(one / sum(densities)) for one in densities]
+        space.add(PIECE, part / 4, laid, scatter, both @ np.swapaxes(both, 1, 2) + slanted, both)
 
 
 def _worn_evidence(
