@@ -221,7 +221,7 @@ class Result:
             grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
             write_qgis(self.map, folder / "map.qgs", grid=grid)
         with context.timed("report"):
-            write_page(folder, self.drive, background and Path(background))
+            write_page(folder, self.drive, None if background is None else Path(background))
 
 
 def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | None) -> None:

@@ -69,7 +69,7 @@ def _summary(facts: Facts) -> str:
         words.append(in_words(len(hd_map.symbols), "symbol"))
     sentence = f"{', '.join(words[:-1])} and {words[-1]}"
     if facts.route is not None:
-        sentence += f", mapped along {facts.route.way_m[-1]:.0f} m"
+        sentence += f", mapped along {facts.route.way_m[-1]:.0f}\u00a0m"
     if facts.cameras:
         sentence += f" with {in_words(len(facts.cameras), 'camera')} ({', '.join(facts.cameras)})"
     return f"{sentence}."
