@@ -8,7 +8,7 @@
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
-ARGS ?= +run=port2
+ARGS ?= +run=port2 mosaic=true
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
@@ -53,10 +53,12 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(MAP_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV): some minutes"
 	$(INSTALL) -e '.[map]'
 	@touch $@
 
 # The development packages include those for mapping.
 $(DEV_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV): some minutes"
 	$(INSTALL) -e '.[dev]'
 	@touch $(MAP_INSTALLED) $@

@@ -1,6 +1,7 @@
 """Every shipped run composes, every key is explained, a typo is one line."""
 
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import pytest
@@ -8,12 +9,13 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from export.config import ExportConfig
+from tests.faults.cases import SIGNED, measures
 from train.config import TrainConfig
 from v2hdm.cli import compose as config
 from v2hdm.cli.keys_help import help_text, keys_of
 from v2hdm.cli.main import run
 from v2hdm.errors import ConfigError
-from v2hdm.pipeline.config import RunConfig
+from v2hdm.pipeline.config import PortConfig, RunConfig, admit
 
 RUNS = sorted(path.stem for path in (config.conf_dir() / "run").glob("*.yaml"))
 
@@ -79,6 +81,15 @@ def test_a_users_own_runs_join_the_shipped_ones(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run(["map", "--config-dir", str(tmp_path / "conf"), "+run=mysite"]) == 2
     assert "nowhere_at_all" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", [key for key in measures(PortConfig()) if key.split(".")[-1] not in SIGNED])
+def test_a_measure_of_a_rendered_port_that_is_below_zero_is_refused(key):
+    config = RunConfig(simulate=PortConfig())
+    *parts, name = key.split(".")
+    setattr(reduce(getattr, parts, config.simulate), name, -1e-3)
+    with pytest.raises(ConfigError, match=key):
+        admit(config)
 
 
 def test_device_and_mode_reach_the_mapping():

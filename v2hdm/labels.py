@@ -21,6 +21,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from v2hdm.association.sightings import row_shares
+from v2hdm.association.surface import Surface
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
@@ -111,6 +112,7 @@ class _Eye:
 
     info: CameraInfo
     cam_from_map: FloatArray  # (2, 4, 4), when the first and the last row was read
+    ground: Surface | None  # under the vehicle at these two times
 
     @classmethod
     def of(cls, image: Image, own: CameraFacts, facts: Facts) -> _Eye:
@@ -120,11 +122,16 @@ class _Eye:
         read_out_s = own.read_out_s or 0.0
         taken_s = image.stamp_s + (own.clock_offset_s or 0.0) + np.array([-0.5, 0.5]) * read_out_s
         poses = interpolate(Trajectory(route.stamp_s, route.flat), taken_s, np.inf)[0]
-        return cls(info, own.calibration.cam_from_vehicle @ inverse(poses))
+        ground = None if facts.surface is None else facts.surface.seen_from(poses)
+        return cls(info, own.calibration.cam_from_vehicle @ inverse(poses), ground)
 
     def project(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Recorded px (N, 2) of ground points (N, 2), and their depths (N,), m."""
-        first, last = (project_ground(self.info.intrinsic, one, points_map) for one in self.cam_from_map)
+        laid = [points_map, points_map]
+        if self.ground is not None:
+            laid = [self.ground.on_plane(points_map, one, n) for n, one in enumerate(self.cam_from_map)]
+        views = zip(self.cam_from_map, laid, strict=True)
+        first, last = (project_ground(self.info.intrinsic, one, points) for one, points in views)
         px = distort_points(self.info, (first[0] + last[0]) / 2)
         if np.array_equal(*self.cam_from_map):
             return px, first[1]

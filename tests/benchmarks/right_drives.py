@@ -41,6 +41,7 @@ from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
+from v2hdm.mapping.recovery import doubt, log_odds, matters
 from v2hdm.pipeline.camera_sets import BEST, camera_sets
 from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
@@ -230,6 +231,9 @@ def _test(one: Any) -> dict[str, Any]:
         "p": float(chi2.sf(one.sigmas**2, 1)) if own is None else float(own),
         "value": one.value,
         "sigma": one.sigma,
+        "log_odds": log_odds(one),
+        "doubt": doubt(one),
+        "matters": matters(one),
     }
 
 

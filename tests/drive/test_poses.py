@@ -281,26 +281,6 @@ def test_positions_that_do_not_say_how_sure_they_are_are_left_out_among_those_th
     assert "left out 2 of 20 positions" in caplog.text
 
 
-@pytest.mark.parametrize("axes", ["vehicle", "camera"])
-def test_rows_of_kitti_have_their_times_beside_them(axes, tmp_path):
-    stamp_s, points, yaw = curve()
-    matrices = np.zeros((41, 3, 4))
-    matrices[:, :, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
-    matrices[:, :, 3] = points
-    if axes == "camera":
-        # A camera that looks ahead: its x is the vehicle's -y, its y -z, its z x.
-        swap = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-        matrices = np.concatenate([swap @ matrices[:, :, :3] @ swap.T, swap @ matrices[:, :, 3:]], axis=2)
-    np.savetxt(tmp_path / "poses.txt", matrices.reshape(41, 12), fmt="%.15g")
-    np.savetxt(tmp_path / "times.txt", stamp_s, fmt="%.9f")
-    check(read({"kitti": "poses.txt", "stamps": "times.txt", "axes": axes}, tmp_path))
-    if axes == "camera":
-        with pytest.raises(DriveError, match="z axis does not point up; say axes: camera"):
-            read({"kitti": "poses.txt", "stamps": "times.txt"}, tmp_path)
-    with pytest.raises(DriveError, match="have no times: add stamps"):
-        read({"kitti": "poses.txt"}, tmp_path)
-
-
 def with_topic(root, made, poses, **changes):
     """A drive of a folder's images at times within the curve, with the poses of a bag."""
     make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))

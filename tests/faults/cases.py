@@ -634,7 +634,6 @@ SETTINGS = _plainly(
     "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
     "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
     "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
-    "mapping.survey.points_map=[[1.0]]": "points_map",
     "detector.model=nowhere.onnx": "nowhere.onnx",
     "export=[pdf]": "pdf",
     "maping.max_range_m=1": "did you mean mapping",
@@ -684,8 +683,7 @@ def measures(options: object, below: str = "") -> Iterator[str]:
             yield below + one.name
 
 
-SIMULATED_PARTS = ("calibration", "disturbance", "route")
-SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "roi_near_m", "roi_far_m")
+SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "roi_near_m", "roi_far_m", "moving_offset_m")
 
 
 def numbers() -> Iterator[Case]:
@@ -695,8 +693,6 @@ def numbers() -> Iterator[Case]:
         (PortConfig(), "simulate.", ("+run=port2",)),
     ):
         for key in measures(options, below):
-            if key.startswith("simulate.") and key.split(".")[1] not in SIMULATED_PARTS:
-                continue
             last = key.rpartition(".")[2]
             for value in ("nan",) if last in SIGNED else ("nan", "-1e-3"):
                 words = (*run, "workers=1", f"{key}={value}")

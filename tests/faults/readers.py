@@ -13,7 +13,7 @@ from v2hdm.errors import V2hdmError
 from v2hdm.io.calibration.reading import read_calibration, read_camera_info
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.importers.nmea import read_nmea
-from v2hdm.io.importers.tables import read_kitti_rows, read_table
+from v2hdm.io.importers.tables import read_table
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_image_list, read_tum
@@ -48,11 +48,6 @@ def nmea(path: Path) -> None:
     )
 
 
-def rows(path: Path) -> None:
-    path.write_text("1 0 0 1 0 1 0 0 0 0 1 0\n1 0 0 2 0 1 0 0 0 0 1 0\n")
-    path.with_name("stamps").write_text("1.0\n2.0\n")
-
-
 def calibration(path: Path) -> None:
     write_calibration(Calibration(camera_info(), looking_forward(), np.eye(6) * 1e-4), path)
 
@@ -62,7 +57,6 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "image list": (image_list, read_image_list),
     "table": (table, lambda path: read_table(path, {}, path.parent, "here")),
     "nmea": (nmea, lambda path: read_nmea(path, {}, path.parent, "here")),
-    "kitti rows": (rows, lambda path: read_kitti_rows(path, {"stamps": "stamps"}, path.parent, "here")),
     "camera_info": (lambda path: write_camera_info(camera_info(), path), read_camera_info),
     "calibration": (calibration, read_calibration),
     "map": (lambda path: write_geojson(make_map(), path), read_geojson),

@@ -9,8 +9,11 @@ import pytest
 from tests.benchmarks.faults.failing_calls import Failure, watch, why_not
 from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.situations import Expected, Situation, calibrating
+from tests.drive.example import make_map
 from tests.faults.cases import picture
-from tests.faults.judge import Case, judge, judge_again
+from tests.faults.judge import DATE, Case, judge, judge_again
+from v2hdm.errors import MapFileError
+from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.mosaic.blend import Canvas, Sheet
 from v2hdm.mosaic.result import geotiff
 
@@ -67,6 +70,28 @@ def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path):
         assert ended.code in (0, 2)
         left = [path.read_bytes() for path in tmp_path.iterdir()]
         assert left == ([whole] if ended.code == 0 else [])
+
+
+def test_a_geopackage_on_a_failing_disk_is_whole_or_not_there(tmp_path):
+    pytest.importorskip("pyogrio", reason="no pyogrio: pip install 'v2hdm[gis]'")
+    hd_map = make_map()
+
+    def write():
+        try:
+            write_geopackage(hd_map, tmp_path / "a.gpkg")
+        except (OSError, MapFileError):
+            return 2
+        return 0
+
+    def left():
+        return [DATE.sub(b"", path.read_bytes()) for path in tmp_path.iterdir()]
+
+    good = watch(write, tmp_path, None, 30)
+    whole = left()
+    for at in range(0, len(good.calls), 13):
+        (tmp_path / "a.gpkg").unlink(missing_ok=True)
+        ended = watch(write, tmp_path, Failure(at, errno.EIO, False), 30)
+        assert left() == (whole if ended.code == 0 else [])
 
 
 def test_calls_below_a_folder_are_counted_and_no_others(tmp_path):

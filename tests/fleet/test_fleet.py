@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from v2hdm.cli.main import run as command
-from v2hdm.errors import ConfigError
-from v2hdm.fleet.plan import Row, exit_code, plan, plan_site
+from v2hdm.fleet.plan import Row, exit_code, plan
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.run import run, take_or_run
@@ -132,40 +131,10 @@ def test_shares_are_all_drives_together_and_never_two_of_one_folder(tmp_path, dr
     assert not plan(files, [], (1, 2)).refused
 
 
-@pytest.mark.parametrize("given", ["0/4", "5/4", "1/0", "2", "1/4 --site port"])
+@pytest.mark.parametrize("given", ["0/4", "5/4", "1/0", "2"])
 def test_a_share_that_cannot_be_is_one_line(given, capsys):
     assert command(["fleet", "a.yaml", "--share", *given.split()]) == 2
     assert re.fullmatch("error: .*--share.*\n", capsys.readouterr().err)
-
-
-def test_the_drives_of_run_files_become_one_site(tmp_path):
-    monday = written(tmp_path, "monday", "drives/monday")
-    week = written(tmp_path, "week", "[drives/tuesday, drives/friday]")
-    planned = plan_site([monday, week], ["output=maps", "mapping.rounds=3"], "port")
-    (job,) = planned.jobs
-    assert job.config.drive.path == ["drives/monday", "drives/tuesday", "drives/friday"]
-    assert (job.name, job.place, job.config.mapping.rounds) == ("port", str(Path("maps/port").resolve()), 3)
-    assert planned.sources == [f"{monday}, {week}"] == [job.source]
-    far = written(tmp_path, "far", "s3://bucket/drives/far")
-    (job,) = plan_site([monday, far], [], "port").jobs
-    assert job.config.drive.path == ["drives/monday", "s3://bucket/drives/far"]
-
-
-def test_files_that_make_no_site_are_one_row_that_says_why(tmp_path):
-    monday, tuesday = (written(tmp_path, name, name) for name in ("monday", "tuesday"))
-    tuesday.write_text(tuesday.read_text() + "mapping: {max_range_m: 9.0}\n")
-    (row,) = plan_site([monday, tuesday], [], "port").refused
-    assert (row.drive, row.status) == ("port", "ERROR")
-    assert "tuesday.yaml: mapping.max_range_m is 9.0, and 16.0 in" in row.says
-    assert plan_site([monday, tuesday], ["mapping.max_range_m=9.0"], "port").jobs
-    rendered = tmp_path / "rendered.yaml"
-    rendered.write_text("# @package _global_\nname: rendered\nsimulate: {}\n")
-    (row,) = plan_site([rendered, monday], [], "port").refused
-    assert "set drive.path" in row.says
-    (row,) = plan_site([monday, tmp_path / "absent.yaml"], [], "port").refused
-    assert "absent.yaml" in row.says
-    with pytest.raises(ConfigError, match="--site"):
-        plan_site([monday], [], "../port")
 
 
 def test_what_would_be_gone_with_a_worker_is_refused(tmp_path, drive):

@@ -156,6 +156,10 @@ def test_a_rough_floor_that_lies_elsewhere_contradicts_the_poses(tmp_path, grain
     assert estimate_ground(feet, "front", FEW).status is GroundStatus.NO_MATCH
 
 
+def test_ground_that_matches_but_is_too_little_to_solve_for_contradicts_nothing(straight):
+    assert estimate_ground(straight, "front", replace(FEW, pairs=1)).status is GroundStatus.NO_TEXTURE
+
+
 def test_dirt_on_a_lens_over_a_floor_without_texture_contradicts_nothing(tmp_path):
     dusk = make_drive(tmp_path, 0.0, TRUE, 0.0, 2.0)
     dirt = np.random.default_rng(3).integers(0, 40, (40, 60), dtype=np.uint8)

@@ -17,9 +17,12 @@ from tests.mapping.scene import make_scene as make_yard
 from v2hdm.adjust import SolveOptions, height_information, solve
 from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.surface import KNOTS_M, Paths, Recorded, Surface
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import HdMap, PoseNoise, Road
+from v2hdm.report.outputs import write_json
+from v2hdm.store.files import load_json
 
 FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
@@ -123,6 +126,36 @@ def test_a_pixel_of_any_surface_is_moved_to_where_the_plane_would_show_its_place
     assert np.quantile(np.abs(moved - plane).max(axis=1), 0.9) < 1e-5
     columns = surface.seen_columns(points, frame)
     np.testing.assert_allclose(columns @ surface.parameters, height, atol=1e-12)
+
+
+def test_a_surface_read_back_shows_from_any_pose_what_the_plane_would(tmp_path):
+    there, rng = arc(), np.random.default_rng(8)
+    # The way back on the same road: each place was passed in two directions.
+    back = there[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    paths = Paths.of(np.concatenate([there, back]), np.repeat([0, 1], len(there)))
+    level = Surface.level(paths)
+    surface = replace(level, parameters=rng.normal(0.0, 0.01, len(level.parameters)), datum_m=80.0)
+    write_json(tmp_path / "ground.json", surface.stored())
+    between = there.copy()  # poses that the surface was not made at
+    between[:, :2, 3] += 0.3 * there[:, :2, 0]
+    read = Surface.from_stored(load_json(tmp_path / "ground.json", MapFileError), between)
+    cam_from_map, frame, points = seen_from(between, rng, count=60)
+    seen = np.array([
+        read.on_plane(p[None], cam, f)[0] for p, cam, f in zip(points, cam_from_map, frame, strict=True)
+    ])  # fmt: skip
+    height = read.seen_height_m(points, frame)
+    assert np.std(height) > 0.05
+    raised, plane = projected(cam_from_map, points, height), projected(cam_from_map, seen, 0 * height)
+    np.testing.assert_allclose(plane, raised, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "damage", [{"knots": [0.0, 6.0, 9]}, {"points_map": "far"}, {"parameters": [np.nan]}, {"ahead": None}]
+)
+def test_a_damaged_ground_is_named(damage):
+    stored = Surface.level(way(arc())).stored() | damage
+    with pytest.raises(ValueError, match="not a ground"):
+        Surface.from_stored(stored, arc())
 
 
 def test_ground_that_is_a_plane_is_seen_as_one_however_it_leans():

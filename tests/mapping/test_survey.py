@@ -32,8 +32,21 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 INDEX = np.array([[7, 8, -1, 9]])
 
 
+def named(name, **changes):
+    return ControlOptions(**{"id": name, "position_map": [1.0, 2.0], "sigma_m": [0.01, 0.01], **changes})  # type: ignore[arg-type]
+
+
+def survey_of(*points, sigma_m=0.01):
+    """Control points at ``points`` (x, y), named after them."""
+    return SurveyOptions(
+        points=[
+            named(f"({x:.2f}, {y:.2f})", position_map=[x, y], sigma_m=[sigma_m, sigma_m]) for x, y in points
+        ]
+    )
+
+
 def found(points):
-    control = control_points(SurveyOptions(points_map=points, reach_m=0.25), SQUARE[None], INDEX, PoseSigma())
+    control = control_points(survey_of(*points), SQUARE[None], INDEX, PoseSigma())
     if control is None:
         return {}
     return {int(c): (x, y) for c, (x, y) in zip(control.corner, control.points_map.tolist(), strict=True)}
@@ -48,7 +61,7 @@ def test_a_surveyed_point_is_of_the_nearest_corner_within_reach():
 
 
 def test_surveyed_points_that_no_corner_is_nearest_to_are_told():
-    survey = SurveyOptions(points_map=[[0.1, 0.1], [5.0, 5.0], [0.0, 0.05], [1.0, 1.0]], reach_m=0.25)
+    survey = survey_of([0.1, 0.1], [5.0, 5.0], [0.0, 0.05], [1.0, 1.0])
     control = control_points(survey, SQUARE[None], INDEX, PoseSigma())
     assert without_corner(survey, control) == ["(0.10, 0.10)", "(5.00, 5.00)", "(1.00, 1.00)"]
     assert len(without_corner(survey, None)) == 4
@@ -57,7 +70,7 @@ def test_surveyed_points_that_no_corner_is_nearest_to_are_told():
 
 def test_a_surveyed_point_far_from_the_map_is_warned_of(caplog):
     scene = make_scene(SceneOptions(seed=31, length_m=30.0, wild_rate=0.0, false_rate=0.0))
-    options = MappingOptions(pose_model="full", survey=SurveyOptions(points_map=[[500.0, 3.0]]))
+    options = MappingOptions(pose_model="full", survey=survey_of([500.0, 3.0]))
     run_methods(scene.drive, scene.detections, ("front",), options)
     (warning,) = [r.getMessage() for r in caplog.records if "surveyed" in r.getMessage()]
     assert "1 of 1" in warning
@@ -97,28 +110,20 @@ def test_two_surveyed_corners_take_the_drift_of_the_receiver_out_of_the_map():
     assert mean_offset_m(alone, truth) > 0.06
     middle = alone[np.argsort(alone[:, 0])[[len(alone) // 3, 2 * len(alone) // 3]]]
     nearest = np.linalg.norm(middle[:, None] - truth[None], axis=-1).argmin(axis=1)
-    survey = SurveyOptions(points_map=truth[nearest].tolist(), sigma_m=0.005)
+    survey = survey_of(*truth[nearest].tolist(), sigma_m=0.005)
     assert mean_offset_m(adjusted(scene, survey), truth) < 0.02
     assert mean_offset_m(adjusted(scene, survey, one_by_one=True), truth) < 0.02
 
 
-def named(name, **changes):
-    return ControlOptions(**{"id": name, "position_map": [1.0, 2.0], "sigma_m": [0.01, 0.01], **changes})  # type: ignore[arg-type]
-
-
 def test_a_control_point_has_its_own_sigmas_and_is_left_out_by_name():
-    survey = SurveyOptions(
-        points_map=[[0.0, 0.02]],
-        points=[named("A", position_map=[1.0, 0.0], sigma_m=[0.002, 0.05])],
-        reach_m=0.25,
-    )
+    one = named("A", position_map=[1.0, 0.0], sigma_m=[0.002, 0.05])
+    survey = SurveyOptions(points=[named("B", position_map=[0.0, 0.02]), one])
     control = control_points(survey, SQUARE[None], INDEX, PoseSigma())
     assert dict(zip(control.corner.tolist(), control.sigma_m.tolist(), strict=True)) == {
         7: [0.01, 0.01],
         8: [0.002, 0.05],
     }
-    assert [one.id for one in survey.without("(0.00, 0.02)").control] == ["A"]
-    assert [one.id for one in survey.without("A").control] == ["(0.00, 0.02)"]
+    assert [point.id for point in survey.without("B").points] == ["A"]
 
 
 def test_points_find_their_corners_in_a_map_that_drifts_by_more_than_half_a_dash():
@@ -160,8 +165,7 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
 @pytest.mark.parametrize(
     ("survey", "mode", "message"),
     [
-        ({"points_map": [[1.0, 2.0, 3.0]]}, "batch", r"survey\.points_map\[0\]"),
-        ({"points_map": [[1.0, 2.0], [1.0, float("nan")]]}, "batch", r"survey\.points_map\[1\]"),
+        ({"points": [named("A", position_map=[1.0, float("nan")])]}, "batch", r"position_map\[1\]"),
         ({"points": [named("A", sigma_m=[0.01, 0.0])]}, "batch", r"points\[0\]\.sigma_m is \[0\.01, 0\.0\]"),
         ({"points": [named("A", position_map=[1.0])]}, "batch", r"points\[0\]\.position_map is \[1\.0\]"),
         ({"points": [named("A"), named("A")]}, "batch", "names the point A twice"),
@@ -331,7 +335,7 @@ def test_a_surveyed_point_that_lies_elsewhere_is_dropped_and_the_others_stay(sce
     known = mapped(scene, scene.drive).hd_map.markings
     points = [m.corners_map[0] for m in known[2:14:3]]
     points[1] = points[1] + (0.15, 0.0)
-    survey = SurveyOptions(points_map=[point.tolist() for point in points], sigma_m=0.005)
+    survey = survey_of(*points, sigma_m=0.005)
     result = mapped(scene, scene.drive, replace(OPTIONS, survey=survey))
     assert [one.about for one in result.evidence.corrected] == [f"({points[1][0]:.2f}, {points[1][1]:.2f})"]
 

@@ -115,6 +115,8 @@ def result_of(folder: Path, drive: Drive) -> Path:
     with result_folder(folder / "result") as out:
         write_drive(drive.root, drive, drive.recorded)
         write_tum(replace(drive.recorded, map_from_vehicle=true_poses()), out / "trajectory.tum")
+        sigmas = np.zeros((len(drive.recorded.stamp_s), 8))
+        np.savetxt(out / "trajectory_sigma.csv", sigmas, delimiter=",", header="one line to skip")
         write_calibration(
             Calibration(INFO, cam_from_vehicle()), out / "calibration_front.yaml", clock_s=(0.0, 0.001)
         )

@@ -7,23 +7,21 @@ import numpy as np
 import pytest
 
 from tests.mosaic import scene
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.mosaic import blend as module
 from v2hdm.mosaic.blend import (
     FEATHER,
-    WARP_ERROR_PX,
     Canvas,
     Shot,
-    Tiling,
     adjusted_shots,
     lens_of,
     recorded_shots,
     whole,
 )
-from v2hdm.mosaic.result import edge_widths_m, measure_edges, paint_sides
-from v2hdm.records import Calibration, HdMap, Marking
+from v2hdm.records import Calibration
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +48,33 @@ def test_a_mosaic_shows_the_ground_where_it_lies(drive, right):
     off = np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen]
     assert np.median(off) < 1.0
     assert off.max() < 6.0
+
+
+def test_ground_that_rises_is_shown_where_it_lies(tmp_path):
+    """A grade of 5 % from 5 m on, seen as on the plane: what its image shows is back in its place."""
+    rise, pose = 0.05, scene.true_poses()[0]
+    centre = camera_centre(scene.cam_from_vehicle() @ inverse(pose))
+    height = centre[2] - rise * (centre[0] - 5.0)
+
+    def on_ground(plane_map):
+        share = height / (centre[2] + rise * (plane_map[..., :1] - centre[0]))
+        return centre[:2] + share * (plane_map - centre[:2])
+
+    def on_plane(points_map):
+        above = rise * (points_map[:, :1] - 5.0)
+        return points_map + above / (centre[2] - above) * (points_map - centre[:2])
+
+    cv2.imwrite(str(tmp_path / "rises.png"), scene.picture(lambda at: scene.waves(on_ground(at)), pose))
+    drive = scene.drive_of(tmp_path, scene.waves)
+    flat = recorded_shots(drive)[0]
+    canvas, off = Canvas(np.array([6.5, 1.5]), 0.02, 150, 200), []
+    for lift in (on_plane, None):
+        shot = replace(flat, path=tmp_path / "rises.png", on_plane=lift)
+        rgba = whole(canvas, [shot], lenses(drive))
+        seen = rgba[..., 3] == 255
+        assert seen.mean() > 0.3
+        off.append(np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen].max())
+    assert off[0] < 6.0 < 20.0 < off[1]
 
 
 def test_the_result_does_not_depend_on_the_size_of_sheets(drive, monkeypatch):
@@ -105,17 +130,6 @@ def test_trust_rises_from_the_edge_of_the_roi_over_the_feather(drive):
     np.testing.assert_allclose(rise, 1 / feather_px, rtol=0.05)
 
 
-def test_tiles_are_as_large_as_the_warp_stays_exact_and_a_coarse_canvas_is_refused(drive):
-    shots, lens = recorded_shots(drive), lenses(drive)
-    fine, coarse = (Canvas(np.zeros(2), cell, 9, 9) for cell in (0.01, 0.04))
-    sides = [Tiling.of(canvas, shots, lens).side_px for canvas in (fine, coarse)]
-    assert sides[0] > sides[1]
-    for canvas, side in zip((fine, coarse), sides, strict=True):
-        assert Tiling(side).error_px(canvas.cell_m, shots[0], lens["front"]) <= WARP_ERROR_PX
-    with pytest.raises(ConfigError, match="too coarse"):
-        Tiling.of(Canvas(np.zeros(2), 1.0, 9, 9), shots, lens)
-
-
 def test_a_sloping_road_is_undone_and_clocks_are_kept(drive):
     """Poses written in the recorded frame come back to the flat one, at the time that the image was taken."""
     up = np.eye(4)
@@ -137,46 +151,3 @@ def test_an_image_of_another_size_is_named(drive, tmp_path):
     shot = Shot(path, "front", recorded_shots(drive)[0].pinhole_px_from_map)
     with pytest.raises(DriveError, match=r"small.png: the image is 30x20"):
         whole(Canvas(np.array([6.0, 1.0]), 0.02, 50, 50), [shot], lenses(drive))
-
-
-CANVAS = Canvas(np.array([0.0, 6.0]), 0.02, 300, 300)
-SQUARE = np.array([[2.0, 2.0], [4.0, 2.0], [4.0, 4.0], [2.0, 4.0]])
-SIDES = paint_sides(HdMap((Marking("diamond", SQUARE, 3),))).ends_map
-
-
-def painted(width_m, shift_m=0.0):
-    """A square whose edges rise over ``width_m``, out of place by ``shift_m`` in x and y."""
-    across = (np.arange(300) + 0.5) * 0.02 - 3 - shift_m
-    rise = np.clip((1 - np.abs(across)) / width_m + 0.5, 0, 1)
-    grey = 60 + 150 * np.minimum(rise[None, :], rise[::-1, None])
-    return np.dstack([grey, grey, grey, np.full_like(grey, 255)]).round().astype(np.uint8)
-
-
-def median_widths(*mosaics):
-    edges = [measure_edges(rgba, CANVAS, SIDES) for rgba in mosaics]
-    return [float(np.median(widths)) for widths in edge_widths_m(edges)]
-
-
-@pytest.mark.parametrize("width_m", [0.06, 0.1, 0.3])
-@pytest.mark.parametrize("shift_m", [0.0, 0.3])
-def test_a_ramp_is_as_wide_as_it_was_drawn_though_out_of_place(width_m, shift_m):
-    assert median_widths(painted(width_m, shift_m))[0] == pytest.approx(width_m, rel=0.05)
-
-
-def test_paint_that_appears_twice_has_edges_twice_as_wide():
-    once = painted(0.06)
-    twice = (once.astype(float) / 2 + painted(0.06, 0.4).astype(float) / 2).round().astype(np.uint8)
-    doubled, sharp = median_widths(twice, once)
-    assert doubled == pytest.approx(2 * sharp, rel=0.1)
-
-
-def test_edges_that_a_mosaic_does_not_show_whole_are_left_out_of_all():
-    half = painted(0.06)
-    half[:, :150, 3] = 0
-    before, after = edge_widths_m([measure_edges(one, CANVAS, SIDES) for one in (half, painted(0.06))])
-    assert len(before) == len(after) == 1
-
-
-def test_short_sides_are_no_edges():
-    assert not len(paint_sides(HdMap((Marking("diamond", 0.1 * SQUARE, 3),))).ends_map)
-    assert not len(paint_sides(HdMap(())).sightings)

@@ -28,13 +28,8 @@ def result(tmp_path_factory):
 @pytest.fixture(scope="module")
 def told(result):
     assert run(["mosaic", str(result)]) == 0
+    assert '"mosaic":{"src":"' in (result / "report.html").read_text()
     return json.loads((result / "mosaic.json").read_text())
-
-
-def test_paint_is_sharper_after_the_optimisation(told):
-    assert told["sharpness"]["edges"] >= 8
-    assert told["sharpness"]["edge_width_after_m"] < 0.08
-    assert told["sharpness"]["after_over_before"] > 1.7
 
 
 def test_the_geotiff_has_the_ground_where_it_lies(told, result):
@@ -121,7 +116,7 @@ def test_what_is_no_result_ends_in_one_line(spoil, says, result, tmp_path, capsy
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("resolution", ["0", "-1", "2", "1e-9", "nan", "inf"])
+@pytest.mark.parametrize("resolution", ["0", "-1", "1e-9", "nan", "inf"])
 def test_a_resolution_that_makes_no_mosaic_is_one_line(resolution, result, capsys):
     assert run(["mosaic", str(result), f"--resolution={resolution}"]) == 2
     assert "resolution of" in capsys.readouterr().err

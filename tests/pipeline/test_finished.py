@@ -126,16 +126,6 @@ def test_a_cache_at_a_store_is_refused(config, memory):
         take_or_make(replace(config, cache=f"{memory}/cache"), Work(), True, quiet)
 
 
-def test_a_folder_named_by_a_url_is_that_folder(config, tmp_path):
-    local = replace(config, output=f"file://{tmp_path}/out", cache=f"file://{tmp_path}/kept")
-    work = Work()
-    assert take_or_make(local, work, True, quiet)[0].place == str(tmp_path / "out" / "example")
-    assert take_or_make(local, work, True, quiet)[1]
-    drive = DriveConfig(path=f"file://{tmp_path}/drive")
-    assert take_or_make(replace(local, drive=drive), work, True, quiet)[1]
-    assert (work.done[0].cache, work.done[0].output) == (str(tmp_path / "kept"), str(tmp_path / "out"))
-
-
 def uploaded(folder, place):
     for path in folder.rglob("*"):
         if path.is_file():

@@ -13,6 +13,7 @@ import pytest
 from tests.faults.judge import full_disk
 from v2hdm.errors import ConfigError
 from v2hdm.report.outputs import write_json
+from v2hdm.store import results
 from v2hdm.store.files import replace_text
 from v2hdm.store.inputs import LIST, note_input, protected_inputs
 from v2hdm.store.results import added_to, files_of_result, growing_folder, listed_files, result_folder
@@ -43,6 +44,13 @@ def test_a_failed_first_run_leaves_no_folder_that_it_made(tmp_path):
     with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "outputs" / "run"):
         print(1 / 0)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_fails_before_the_first_file_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "_write_list", lambda *_: (_ for _ in ()).throw(OSError(5, "broken")))
+    with pytest.raises(ConfigError, match="broken"), result_folder(tmp_path / "out"):
+        pass
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == []
 
 
 def test_a_second_run_replaces_the_first_whole(tmp_path):

@@ -2,10 +2,13 @@
 
 import errno
 import fcntl
+import itertools
 import json
 import logging
 import os
 import pickle
+import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -31,7 +34,7 @@ from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
 from v2hdm.store.cache import CodecError, StageCache, decode, encode
-from v2hdm.store.folders import LIST, note_use
+from v2hdm.store.folders import LIST, is_whole, new_entry, note_use
 from v2hdm.store.lock import IN_USE, in_use, take_lock
 from v2hdm.store.pruning import DRIVES, items_of, prune
 from v2hdm.store.results import result_folder
@@ -350,6 +353,58 @@ def test_a_rendered_drive_goes_but_for_what_the_user_put_there(tmp_path):
     found.remove()
     assert [path.name for path in folder.rglob("*") if path.is_file()] == ["notes.txt"]
     (folder / "front" / "notes.txt").unlink()
+
+
+def damaged_entry(folder):
+    """An import that has lost a file, in which a user has put notes."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with new_entry(folder) as partial:
+        write_entry(partial)
+    (folder / "front" / "0.png").unlink()
+    for note in (folder / "notes.md", folder / "front" / "notes.md"):
+        note.write_text("mine")
+
+
+def write_entry(partial):
+    (partial / "front").mkdir()
+    for name in ("images.txt", "front/0.png", "front/1.png"):
+        (partial / name).write_text(name)
+
+
+def renew_and_die(folder, at):
+    """Make an entry anew in a fork, which is killed at so many lines; whether it was."""
+
+    def trace(frame, event, arg):
+        nonlocal at
+        if not frame.f_code.co_filename.endswith(("store/folders.py", "shutil.py")):
+            return None
+        at -= event == "line"
+        if at < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return trace
+
+    process = os.fork()
+    if not process:
+        sys.settrace(trace)
+        with new_entry(folder) as partial:
+            write_entry(partial)
+        os._exit(0)
+    return os.WIFSIGNALED(os.waitpid(process, 0)[1])
+
+
+def test_a_note_in_an_import_outlives_a_kill_at_any_line_while_it_is_made_anew(tmp_path):
+    folder = tmp_path / "bag-front"
+    for at in itertools.count(0, 3):
+        damaged_entry(folder)
+        killed = renew_and_die(folder, at)
+        with new_entry(folder) as partial:
+            write_entry(partial)
+        assert is_whole(folder)
+        assert [path.read_text() for path in folder.rglob("notes.md")] == ["mine", "mine"], at
+        assert list(tmp_path.glob(".*")) == []
+        if not killed:
+            assert at > 100
+            return
 
 
 def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path):

@@ -84,7 +84,7 @@ def test_what_fails_is_one_line(failure, says):
         ("s3://b/x?versionId=3", "no place at a store"),
         ("s3://b/\x1b[2J", "no place at a store"),
         ("s3://key:secret@b/x", r"^output= s3://\.\.\.: holds what is no name of a bucket"),
-        ("file://x/y", "named as in file:///data"),
+        ("file:///data/runs", "at no store"),
     ],
 )
 def test_what_is_no_place_is_refused(url, says):
@@ -101,11 +101,6 @@ def test_a_package_that_is_not_installed_is_named(monkeypatch):
         place_of("gs://b/x", "output=")
 
 
-def test_a_folder_may_be_named_by_a_url():
-    assert place_of("file:///data/my%20runs", "output=") == Path("/data/my runs")
-    assert place_of("outputs", "output=") == Path("outputs")
-
-
 def test_s3_does_what_the_store_in_memory_does(s3, tmp_path):
     place = RemoteFolder.at("s3://bucket/place", "output=")
     assert not place.listed()
@@ -118,7 +113,7 @@ def test_s3_does_what_the_store_in_memory_does(s3, tmp_path):
 
 def test_a_bucket_that_is_not_there_is_told(s3):
     nowhere = RemoteFolder.at("s3://nowhere/results", "output=")
-    for work in (nowhere.check, lambda: nowhere.write("a", b"x"), lambda: nowhere.create("a", b"x")):
+    for work in (nowhere.listed, lambda: nowhere.write("a", b"x"), lambda: nowhere.create("a", b"x")):
         with pytest.raises(ConfigError, match="no such bucket"):
             work()
 

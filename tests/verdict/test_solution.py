@@ -15,7 +15,8 @@ from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, HdMap
 from v2hdm.site.candidates import Exclusion
-from v2hdm.verdict import Status
+from v2hdm.verdict import Status, Verdict
+from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_inputs, check_solution
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
@@ -157,16 +158,29 @@ def test_a_rival_that_explains_as_much_is_named_as_well():
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
+@pytest.mark.parametrize(("sigmas", "is_told"), [(3.72, True), (2.5, False)])
+def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
+    focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.024, 0.0057, sigmas)
+    told = raised(result(replace(FINE, score_tests=(replace(focal, gain=0.2),))), drive)
+    assert [one.status for one in told.values()] == [Status.WARN] * is_told
+    assert not is_told or "2.4 % shorter" in told["focal length"].says
+
+
 def test_a_small_contradiction_is_none_however_sure_it_is():
     tiny = replace(CLOCK, value=0.0008, sigma=0.0001, p_value=1e-15)
     assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, score_tests=(tiny,))))
 
 
 def test_a_straight_drive_says_what_it_cannot_tell():
-    unsure = (replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf")))
-    untold = [f for f in check_inputs(replace(FINE, score_tests=unsure)) if f.is_unobservable]
+    unsure = replace(FINE, score_tests=(replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf"))))
+    untold = [f for f in check_inputs(unsure) if f.is_unobservable]
     assert {f.check for f in untold} == {"clock", "survey"}
     assert all("drive a turn" in f.says for f in untold)
+    sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
+    for evidence, is_told in ((unsure, True), (FINE, False)):
+        headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline
+        assert headline.startswith("PASS")
+        assert ("if the clocks and the surveyed centres are right" in headline) is is_told
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOptions
@@ -19,8 +21,9 @@ def check_problem(problem: Problem) -> None:
 
     Except observations that are there twice: :func:`v2hdm.adjust.layout.make_arrays` finds them as it sorts.
     """
-    _check_shapes(problem)
-    _check_finite(problem)
+    _check_arrays(problem)
+    wrong = (problem.intrinsic[:, :2] <= 0).any(1)
+    _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")
     _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
     _check_rigid("map_from_vehicle", problem.map_from_vehicle)
     _check_observations(problem)
@@ -109,60 +112,41 @@ def check_options(options: SolveOptions) -> None:
         raise AdjustError(f"loss_scale is {options.loss_scale}: give a number of standard deviations above 0")
 
 
-def _check_shapes(problem: Problem) -> None:
-    cameras, frames = len(problem.intrinsic), len(problem.map_from_vehicle)
+_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+    "camera": {
+        "intrinsic": (4,), "cam_from_vehicle": (4, 4), "centre_vehicle": (3,), "centre_sigma_m": (3,),
+        "read_out_s": (),
+    },
+    "frame": {"map_from_vehicle": (4, 4), "twist_vehicle": (6,)},
+    "corner": {"corners_start": (2,)},
+    "observation": {
+        "camera": (), "frame": (), "corner": (), "pinhole_px": (2,), "covariance_px": (2, 2), "row_share": (),
+    },
+}  # fmt: skip
+"""The shapes of a problem's arrays, of one for each thing."""
+
+
+def _check_arrays(problem: Problem) -> None:
+    """Every array is one, has its shape and, but for sigmas of centres, finite numbers."""
     seen = problem.observations
-    count = len(seen.camera)
-    expected: list[tuple[str, FloatArray | IntArray | None, tuple[int, ...]]] = [
-        ("intrinsic", problem.intrinsic, (cameras, 4)),
-        ("cam_from_vehicle", problem.cam_from_vehicle, (cameras, 4, 4)),
-        ("map_from_vehicle", problem.map_from_vehicle, (frames, 4, 4)),
-        ("centre_vehicle", problem.centre_vehicle, (cameras, 3)),
-        ("centre_sigma_m", problem.centre_sigma_m, (cameras, 3)),
-        ("corners_start", problem.corners_start, (problem.corner_count, 2)),
-        ("twist_vehicle", problem.twist_vehicle, (frames, 6)),
-        ("read_out_s", problem.read_out_s, (cameras,)),
-        ("observations.row_share", seen.row_share, (count,)),
-        ("observations.camera", seen.camera, (count,)),
-        ("observations.frame", seen.frame, (count,)),
-        ("observations.corner", seen.corner, (count,)),
-        ("observations.pinhole_px", seen.pinhole_px, (count, 2)),
-        ("observations.covariance_px", seen.covariance_px, (count, 2, 2)),
-    ]
-    for name, values, shape in expected:
-        if values is None:
-            continue
-        if not isinstance(values, np.ndarray):
-            raise AdjustError(f"{name} is a {type(values).__name__}: give a numpy array")
-        if values.shape != shape:
-            raise AdjustError(f"{name} has shape {np.shape(values)}, expected {shape}")
-    if count == 0:
+    if len(seen.camera) == 0:
         raise AdjustError("there is no observation to adjust: detect and associate markings first")
-    for name in ("camera", "frame", "corner"):
-        kind = getattr(seen, name).dtype
-        if not np.issubdtype(kind, np.integer):
-            raise AdjustError(f"observations.{name} holds {kind}: give whole numbers")
-
-
-def _check_finite(problem: Problem) -> None:
-    for name, values in (
-        ("intrinsic of camera", problem.intrinsic),
-        ("cam_from_vehicle of camera", problem.cam_from_vehicle),
-        ("map_from_vehicle of frame", problem.map_from_vehicle),
-        ("centre_vehicle of camera", problem.centre_vehicle),
-        ("corners_start of corner", problem.corners_start),
-        ("twist_vehicle of frame", problem.twist_vehicle),
-        ("read_out_s of camera", problem.read_out_s),
-        ("row_share of observation", problem.observations.row_share),
-    ):
-        if values is not None:
-            wrong = ~np.isfinite(values).reshape(len(values), -1).all(1)
-            _refuse(wrong, f"{name} {{}} {_NOT_FINITE}")
-    wrong = (problem.intrinsic[:, :2] <= 0).any(1)
-    _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")
-
-
-_NOT_FINITE = "is not finite: remove it or correct its source"
+    sizes = _sizes(problem) | {"observation": len(seen.camera)}
+    for of, arrays in _ARRAYS.items():
+        owner, prefix = (seen, "observations.") if of == "observation" else (problem, "")
+        for name, each in arrays.items():
+            values, shape = getattr(owner, name), (sizes[of], *each)
+            if values is None:
+                continue
+            if not isinstance(values, np.ndarray):
+                raise AdjustError(f"{prefix}{name} is a {type(values).__name__}: give a numpy array")
+            if values.shape != shape:
+                raise AdjustError(f"{prefix}{name} has shape {values.shape}, expected {shape}")
+            if name in _sizes(problem) and not np.issubdtype(values.dtype, np.integer):
+                raise AdjustError(f"{prefix}{name} holds {values.dtype}: give whole numbers")
+            if name != "centre_sigma_m":
+                finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+                _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or correct its source")
 
 
 def _check_rigid(name: str, transforms: FloatArray) -> None:
@@ -175,51 +159,29 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
 
 def _check_observations(problem: Problem) -> None:
     seen, sizes = problem.observations, _sizes(problem)
-    sound = np.ones(len(seen.corner), dtype=bool)
     for name, size in sizes.items():
         index = getattr(seen, name)
-        sound &= (index >= 0) & (index < size)
-    intrinsic = problem.intrinsic[np.where(sound, seen.camera, 0)]
-    with np.errstate(invalid="ignore", over="ignore"):
+        said = f"observation {{}} names {name} {{}}, but there are only {size}"
+        _refuse((index < 0) | (index >= size), said, index)
+    lens = problem.intrinsic[seen.camera]
+    aside = np.abs((seen.pinhole_px - lens[:, 2:]) / lens[:, :2]).max(1)
+    said = "pinhole_px of observation {} lies {:.3g} focal lengths from the principal point, where no camera "
+    _refuse(aside > _MAX_SLOPE, said + "looks: leave it out", aside)
+    with np.errstate(over="ignore"):
         (xx, xy), (yx, yy) = seen.covariance_px.astype(np.float64).transpose(1, 2, 0)
-        sound &= (xx > 0) & (xx * yy > yx**2) & (xx * yy < np.inf)
-        sound &= (xy - yx) ** 2 <= _SYMMETRIC_TO**2 * xx * yy
-        sound &= (np.abs((seen.pinhole_px - intrinsic[:, 2:]) / intrinsic[:, :2]) <= _MAX_SLOPE).all(1)
-    if not sound.all():
-        raise AdjustError(_fault(problem, int(sound.argmin())))
+        definite = (xx > 0) & (xx * yy > yx**2) & (xx * yy < np.inf)
+        _refuse(~definite, "covariance_px of observation {} is not positive definite")
+        uneven = (xy - yx) ** 2 > _SYMMETRIC_TO**2 * xx * yy
+        _refuse(uneven, "covariance_px of observation {} is not symmetric")
     for name in ("corner", "camera"):
         times = np.bincount(getattr(seen, name), minlength=sizes[name])
-        if not times.all():
-            raise AdjustError(f"{name} {times.argmin()} has no observation: leave it out of the problem")
+        _refuse(times == 0, f"{name} {{}} has no observation: leave it out of the problem")
 
 
 def _sizes(problem: Problem) -> dict[str, int]:
     """How many there are of each thing that an observation names."""
     frames = len(problem.map_from_vehicle)
     return {"camera": len(problem.intrinsic), "frame": frames, "corner": problem.corner_count}
-
-
-def _fault(problem: Problem, k: int) -> str:
-    """The message for observation k, which is unsound."""
-    seen = problem.observations
-    for name, size in _sizes(problem).items():
-        index = getattr(seen, name)[k]
-        if not 0 <= index < size:
-            return f"observation {k} names {name} {index}, but there are only {size}"
-    for name in ("pinhole_px", "covariance_px"):
-        if not np.isfinite(getattr(seen, name)[k]).all():
-            return f"{name} of observation {k} {_NOT_FINITE}"
-    (xx, xy), (yx, yy) = seen.covariance_px[k].astype(np.float64)
-    intrinsic = problem.intrinsic[seen.camera[k]]
-    aside = np.abs((seen.pinhole_px[k] - intrinsic[2:]) / intrinsic[:2]).max()
-    if aside > _MAX_SLOPE:
-        return (
-            f"pinhole_px of observation {k} lies {aside:.3g} focal lengths "
-            "from the principal point, where no camera looks: leave it out"
-        )
-    if xx > 0 and xx * yy > yx**2 and abs(xy - yx) > _SYMMETRIC_TO * np.sqrt(xx * yy):
-        return f"covariance_px of observation {k} is not symmetric"
-    return f"covariance_px of observation {k} is not positive definite"
 
 
 def _check_priors(problem: Problem) -> None:

@@ -64,7 +64,6 @@ class Solution:
         chi2_per_dof: about 1 where the noise model is right; outliers are left out.
         observation_factor: how many times as large as stated the observations' variances are, if the priors'
             are right; outliers are left out.
-        time_s: wall time.
         covariance: of everything estimated, on demand.
     """
 
@@ -82,7 +81,6 @@ class Solution:
     gap: float
     chi2_per_dof: float
     observation_factor: float
-    time_s: float
     covariance: Covariance = field(repr=False)
 
     @property

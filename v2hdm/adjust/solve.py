@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -40,17 +38,16 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     >>> solution.cam_from_vehicle.shape, solution.corners_map.shape[1:]
     ((1, 4, 4), (2,))
     """
-    began = time.perf_counter()
     options = options or SolveOptions()
     check_options(options)
     check_problem(problem)
     check_model(problem, options)
     compiled = options.on_cpu and options.engine != "torch"
     with one_thread_in_torch(len(problem.observations.corner), compiled):
-        return _solve(problem, options, began)
+        return _solve(problem, options)
 
 
-def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
+def _solve(problem: Problem, options: SolveOptions) -> Solution:
     """Solve what has been checked."""
     origin_map = nearby_origin(problem)
     near = shifted(problem, -origin_map)
@@ -69,7 +66,7 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
         opening,
     )
     del opening
-    return _report(problem, origin_map, options, descent, spent, began)
+    return _report(problem, origin_map, options, descent, spent)
 
 
 def _start(
@@ -119,7 +116,6 @@ def _report(
     options: SolveOptions,
     descent: Descent,
     spent: int,
-    began: float,
 ) -> Solution:
     """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
     robust = Loss(options.loss, options.loss_scale)
@@ -160,7 +156,6 @@ def _report(
         gap=descent.gap,
         chi2_per_dof=variance.all,
         observation_factor=variance.observations,
-        time_s=time.perf_counter() - began,
         covariance=Covariance(descent),
     )
 

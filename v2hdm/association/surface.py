@@ -20,7 +20,9 @@ poses by which they are moved, a corner then fits its pixels exactly where its p
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -59,12 +61,19 @@ _SIZES = 2.0  # standard deviation of the logarithm of their size, over all road
 _STATION_M = 1.0  # nearer frames are one place of the path: a vehicle that stands drives none in its noise
 _AHEAD_M = 30.0  # beyond this way, ahead or behind, the path is another time's
 _REACH_M = 40.0  # ground farther from the camera stays as it is: H is known beside the path alone
+_TURN_M = 10.0  # by which places count as apart for a heading that differs by a radian
 _STEPS = 12  # of the secant method, where four to six are enough
 _SURE_M = 1e-7  # of its end
 _STEP_PX = 0.5  # of the differences by pixel
 _LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell from the road's, all the way
 _MOST_RECORDED = 500  # places of the path whose records are taken, evenly
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
+
+
+FILE = "ground.json"  # in a result folder
+
+_STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")
+"""Of the paths; their frames are another matter."""
 
 
 @dataclass(frozen=True)
@@ -188,6 +197,18 @@ class Paths:
         near = np.searchsorted(self.station_m, station_m).clip(max=len(self.station_m) - 1)
         return at[:, :2], ahead, self.sense[near]
 
+    def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
+        """The same paths with the frames of vehicles at poses (F, 4, 4), in any order."""
+        position, ahead = map_from_vehicle[:, :2, 3], map_from_vehicle[:, :2, 0]
+        ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+        # Where a route crosses itself, the place that was passed in this direction.
+        passed = cKDTree(np.hstack([self.points_map, _TURN_M * self.ahead]))
+        _, place = passed.query(np.hstack([position, _TURN_M * ahead]))
+        station = self.station_m[place]
+        ends = self.visit_ends[np.searchsorted(self.visit_ends[:, 1], station)]
+        bounds = np.clip(station[:, None] + np.array([-_AHEAD_M, _AHEAD_M]), ends[:, :1], ends[:, 1:])
+        return replace(self, place=place, bounds_m=bounds, position_map=position, heading=ahead)
+
     def nearest_frame(self, points_map: FloatArray) -> IntArray:
         """The frame (K,) at the place nearest to each point (K, 2)."""
         _, place = cKDTree(self.points_map).query(points_map)
@@ -289,6 +310,49 @@ class Surface:
         columns = self._columns(station_m, left_m)
         variance = np.asarray((columns @ self.covariance * columns.toarray()).sum(axis=1))
         return columns @ self.parameters + self.datum_m, np.sqrt(np.maximum(variance, 0.0))
+
+    def seen_from(self, map_from_vehicle: FloatArray) -> Surface:
+        """The same ground for what vehicles at poses (F, 4, 4) on the flat road see of it."""
+        return replace(self, paths=self.paths.seen_from(map_from_vehicle))
+
+    def on_plane(self, points_map: FloatArray, cam_from_map: FloatArray, frame: int) -> FloatArray:
+        """Points (K, 2) of the plane z = 0 that are seen where the ground's points (K, 2) are.
+
+        By a camera at ``cam_from_map`` (4, 4) at a frame; the other way round than :meth:`flattened_px`.
+        """
+        height_m = self.seen_height_m(points_map, np.full(len(points_map), frame))
+        centre = camera_centre(cam_from_map)
+        off = points_map - centre[:2]
+        known = (np.linalg.norm(off, axis=1) < _REACH_M) & (height_m < centre[2] / 2)
+        return points_map + off * np.where(known, height_m / (centre[2] - height_m), 0.0)[:, None]
+
+    def stored(self) -> dict[str, Any]:
+        """What :meth:`from_stored` makes it from, for a file; without the covariance."""
+        arrays = {name: getattr(self.paths, name).tolist() for name in _STORED}
+        parameters = {"parameters": self.parameters.tolist(), "knots": self.knots, "datum_m": self.datum_m}
+        return arrays | parameters
+
+    @classmethod
+    def from_stored(cls, content: Mapping[str, Any], map_from_vehicle: FloatArray) -> Surface:
+        """The ground under vehicles at poses (F, 4, 4); raises ValueError where anything is missing."""
+        try:
+            points, ahead, sense, station, ends, parameters = (
+                np.array(content[name], dtype=np.float64) for name in (*_STORED, "parameters")
+            )
+            begin_m, step_m, along = content["knots"]
+            datum_m = float(content["datum_m"])
+        except (KeyError, TypeError, ValueError):
+            raise ValueError("not a ground: numbers are missing") from None
+        places, none = len(station), np.zeros((0, 2))
+        shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
+        expected = ((places, 2), (places, 2), (places,), (2,), (_HINGES + along * _ACROSS,))
+        finite = (np.isfinite(one).all() for one in (points, ahead, sense, station, ends, parameters))
+        if shapes != expected or not places or not all(finite):
+            raise ValueError("not a ground: its numbers do not belong together")
+        paths = Paths(np.zeros(0, np.int64), points, ahead, sense, station, none, none, none, ends)
+        unknown = np.zeros((len(parameters), len(parameters)))
+        knots = (begin_m, step_m, along)
+        return cls(paths.seen_from(map_from_vehicle), parameters, unknown, knots, datum_m)
 
     def strips(self) -> tuple[GroundStrip, ...]:
         """The ground by session, half a metre to half a metre."""

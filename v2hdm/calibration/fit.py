@@ -201,7 +201,7 @@ def _starts(seen: Seen, count: int) -> list[FloatArray]:
         return []
     covariance = seen.covariance(candidates)
     square = seen.squared(candidates, covariance)
-    scores = [seen.log_posterior(square, covariance, np.full(len(candidates), q)) for q in _FACTORS]
+    scores = seen.log_posterior(square, covariance, np.tile(_FACTORS[:, None], len(candidates)))
     best = np.argsort(-np.max(scores, axis=0), kind="stable")[:count].tolist()
     return [candidates[k] for k in best]
 
@@ -223,7 +223,7 @@ def _refine(seen: Seen, mounting: FloatArray, rounds: int) -> Fit:
     """The optimum that a start (4, 4) leads to."""
     covariance = seen.covariance(mounting)
     square = seen.squared(mounting, covariance)
-    factor = float(_FACTORS[np.argmax([seen.log_posterior(square, covariance, q) for q in _FACTORS])])
+    factor = float(_FACTORS[np.argmax(seen.log_posterior(square, covariance, _FACTORS))])
     before = -np.inf
     for _ in range(rounds):
         covariance = seen.covariance(mounting)

@@ -2,7 +2,8 @@
 
 A table that fits no mounting is read in other ways: columns exchanged, axes reversed, another unit, another
 image size. Each reading is a hypothesis with a prior; the mounting that it leads to counts by how well it
-explains the points and by where cameras sit on vehicles. The likeliest one is named in the error.
+explains the points and by where cameras sit on vehicles. Another is that the pixels may be anywhere in the
+image. The likeliest one is named in the error.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
-from v2hdm.calibration.picture import save_picture
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
 from v2hdm.errors import ConfigError, DriveError
@@ -27,6 +27,7 @@ from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.outputs import write_json
+from v2hdm.report.photos import save_points
 from v2hdm.store.files import dump_yaml, replace_csv
 from v2hdm.verdict.verdict import Verdict
 
@@ -44,6 +45,8 @@ _UNUSUAL = 8.0  # log odds at most against an unusual mounting: some cameras han
 _HEIGHT_M, _LOG_HEIGHT = 2.0, 0.7
 _SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)  # usual ratios of the sizes of one camera's images
 _STARTS, _ROUNDS = 1, 6  # enough to tell a reading that explains the points from one that does not
+_TOLD = 300  # points, at most, that readings are compared by
+_UNRELATED = "the pixels have nothing to do with the places; check which pixel belongs to which place"
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     """
     fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
-        cause = _misreading(points, info, noise, fits[0] if fits else None)
+        cause = _misreading(points, info, noise)
         if cause is not None:
             raise DriveError(f"{points.path}: the points fit no mounting of this camera: {cause}")
     if not fits or not np.isfinite(fits[0].covariance).all() or _height_m(fits[0]) <= 0:
@@ -167,16 +170,25 @@ def _doubtful(fits: list[Fit]) -> bool:
     return scatter(fits[0], CHANCE).probability < CHANCE
 
 
-def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise, given: Fit | None) -> str | None:
-    """The cause under which the points make sense, if they make none as they are."""
-    cause, highest = None, -np.inf
-    for words, points_px, points_vehicle in _readings(points, info):
-        seen = Seen.of(points_px, points_vehicle, info, noise)
-        for fit in fit_mountings(seen, _STARTS, _ROUNDS):
-            if _score(fit) > highest:
-                cause, highest = words, _score(fit)
-    as_given = -np.inf if given is None else _score(given)
-    return cause if highest > -np.inf and highest + np.log(_MISREAD) - as_given > _SURE else None
+def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> str | None:
+    """The likeliest reason why the points make no sense as they are; None where none is likely."""
+    some = slice(None, None, -(-len(points.names) // _TOLD))
+    px, ground = points.points_px[some], points.points_vehicle[some]
+
+    def score(points_px: FloatArray, points_vehicle: FloatArray, *effort: int) -> float:
+        fits = fit_mountings(Seen.of(points_px, points_vehicle, info, noise), *effort)
+        return max((_score(fit) for fit in fits), default=-np.inf)
+
+    as_given = score(px, ground)
+    # Pixels that are scaled have another density: by scale^2 each in those of the table.
+    causes = {
+        words: score(read_px, read_vehicle, _STARTS, _ROUNDS) + 2 * len(px) * float(np.log(scale))
+        for words, read_px, read_vehicle, scale in _readings(px, ground, info)
+    }
+    if as_given > -np.inf:
+        causes[_UNRELATED] = -len(px) * float(np.log(info.width * info.height))
+    cause = max(causes, key=lambda words: causes[words])
+    return cause if causes[cause] > as_given + _SURE - np.log(_MISREAD) else None
 
 
 def _score(fit: Fit) -> float:
@@ -187,19 +199,21 @@ def _score(fit: Fit) -> float:
     return fit.log_posterior - min(float(unusual), _UNUSUAL)
 
 
-def _readings(points: SurveyedPoints, info: CameraInfo) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Causes, and the pixels and places without them."""
-    px, ground = points.points_px, points.points_vehicle
+def _readings(
+    px: FloatArray, ground: FloatArray, info: CameraInfo
+) -> Iterator[tuple[str, FloatArray, FloatArray, float]]:
+    """Causes, the pixels and places without them, and the scale of these pixels."""
     mirrored = "y is counted to the right, or x backward; write y positive to the left, x forward"
-    yield mirrored, px, ground * [1.0, -1.0]
-    yield "x and y are exchanged; x is forward, y to the left", px, ground[:, ::-1].copy()
+    yield mirrored, px, ground * [1.0, -1.0], 1.0
+    yield "x and y are exchanged; x is forward, y to the left", px, ground[:, ::-1].copy(), 1.0
     swapped = px[:, ::-1].copy()
-    yield "u and v are exchanged; u counts columns to the right, v rows down", swapped, ground
+    yield "u and v are exchanged; u counts columns to the right, v rows down", swapped, ground, 1.0
     upward = np.column_stack([px[:, 0], info.height - 1 - px[:, 1]])
-    yield "v is counted upward from the image's lower edge; count it down from the upper one", upward, ground
+    counted = "v is counted upward from the image's lower edge; count it down from the upper one"
+    yield counted, upward, ground, 1.0
     for scale in _SCALES:
         size = f"the pixels are of an image {1 / scale:.3g} times as large as that of the intrinsics"
-        yield f"{size}; give both for one size", (px + 0.5) * scale - 0.5, ground
+        yield f"{size}; give both for one size", (px + 0.5) * scale - 0.5, ground, scale
 
 
 _COLUMNS = (
@@ -228,8 +242,8 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
         place = [*points.points_px[k].tolist(), *points.points_vehicle[k].tolist()]
         rows.append([name, *place, *shift, *known])
     replace_csv(folder / POINTS_FILE, [_COLUMNS, *rows])
-    labels = found.points.labels
-    save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
+    seen = zip(points.labels, points.points_px, off.off_px, found.fit.is_right.tolist(), strict=True)
+    save_points(folder / PICTURE_FILE, image, info, found.fit.cam_from_vehicle, found.roi_vehicle, list(seen))
 
 
 def summary_lines(found: PointCalibration) -> list[str]:

@@ -1,7 +1,7 @@
 """``v2hdm fleet drives/*.yaml``: many drives on the cores of this machine, or a share of them.
 
 A drive whose result is finished and was made of the same is not done again; one that fails is a row of the
-table that says why, and the others go on. With --site all drives are mapped together (docs/fleet.md).
+table that says why, and the others go on (docs/fleet.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ def run(arguments: Sequence[str]) -> int:
         metavar="FOLDER",
         help="takes the table of verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
     )
-    parser.add_argument("--site", metavar="NAME", help="map all drives together, as one site of that name")
     parser.add_argument(
         "--share", metavar="K/N", help="map every N-th drive, from the K-th on; its table is FOLDER-K-of-N"
     )
@@ -48,9 +47,7 @@ def run(arguments: Sequence[str]) -> int:
     if parsed.share is not None:
         share = _share(parsed.share)
         table = table.with_name(f"{table.name}-{share[0]}-of-{share[1]}")
-        if parsed.site is not None:
-            raise ConfigError("a site is mapped as a whole: leave out --share or --site")
-    options = FleetOptions(table, parsed.workers, parsed.again, parsed.site, share)
+    options = FleetOptions(table, parsed.workers, parsed.again, share)
     return exit_code(fleet_on_terminal(files, overrides, options))
 
 

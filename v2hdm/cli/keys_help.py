@@ -27,6 +27,7 @@ Usage: {command} [key=value ...] [--config-dir FOLDER]
 """
 _OFTEN = {
     "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",
+    "report.background",
 }  # fmt: skip
 """Keys below others that are often set; the rest is for experts."""
 

@@ -35,6 +35,8 @@ def _map(job: Job) -> int:
 
     config, console = job.settings, Console(file=patient(sys.stdout))
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
+    # The verdict's lines, which stand at the end, once and unbroken.
+    handler.addFilter(lambda record: record.levelno > logging.INFO or record.msg != "%s")
     with logging_to(handler), progress_bars(console) as progress:
         result = run(config, job.yaml, progress)
     console.print()

@@ -26,6 +26,7 @@ def run(arguments: Sequence[str]) -> None:
     from v2hdm.io.drive.of_result import single_drive_of
     from v2hdm.mosaic.result import write_mosaic
     from v2hdm.pipeline.config import check_device
+    from v2hdm.report.page.document import write_page
     from v2hdm.store.results import added_to
 
     logging.basicConfig(format="%(message)s")
@@ -35,11 +36,6 @@ def run(arguments: Sequence[str]) -> None:
     drive = single_drive_of(parsed.result, parsed.drive, "a mosaic is")
     with added_to(parsed.result, "RESULT") as folder:
         steps = steps_of("put images on the ground")
-        found = write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)["sharpness"]
-    if found["edges"]:
-        print(
-            f"paint edges {100 * found['edge_width_before_m']:.1f} cm wide before, "
-            f"{100 * found['edge_width_after_m']:.1f} cm after the optimisation: "
-            f"{found['after_over_before']:.1f} times as sharp (median of {found['edges']} sides)"
-        )
-    print(f"mosaic in {parsed.result}")
+        write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)
+        write_page(folder, drive)
+    print(f"mosaic in {parsed.result}, and under the map of its report.html")

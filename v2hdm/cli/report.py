@@ -19,8 +19,8 @@ def run(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--background",
         type=Path,
-        metavar="FILE.tif",
-        help="a GeoTIFF under the map, such as an aerial picture",
+        metavar="PATH",
+        help="under the map: a GeoTIFF, such as an aerial picture, or a folder of XYZ tiles",
     )
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive.of_result import drive_of

@@ -30,10 +30,12 @@ RECIPES: Mapping[str, str] = {
 class Site:
     """One port of the experiment, as ``conf/run/port1.yaml`` describes it.
 
-    ``simulate`` is rendered once with every seed. Without it ``drive`` is read, and mapped once.
+    ``simulate`` is rendered once with every seed. Without it ``drive`` is read, and mapped once. A ``mosaic``
+    is made by a run alone.
     """
 
     name: str | None = None
+    mosaic: bool = False
     simulate: PortConfig | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.table import Table
 from rich.text import Text
 
 from v2hdm.cli.compose import compose_run_file, to_dataclass, to_yaml
 from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, ConfigError, V2hdmError, one_line
-from v2hdm.io.safe.texts import shown, take_name
+from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.report.terminal import new_table
 from v2hdm.store.remote import place_of
@@ -30,7 +30,7 @@ class Row:
     """The outcome of one drive: ``says`` is the worst finding, or the error, in one line.
 
     ``kept`` says that an earlier result of the same content was found. ``folder`` is that of the result,
-    or its URL, empty without one; ``source`` is the run file, or those of a site.
+    or its URL, empty without one; ``source`` is the run file.
     """
 
     drive: str
@@ -91,10 +91,7 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 @dataclass(frozen=True)
 class Job:
-    """One drive to map, or several of one site together; ``source`` is its run file, or those of its drives.
-
-    ``config_yaml`` is the configuration as text, kept beside the results.
-    """
+    """One drive to map; ``source`` is its run file, ``config_yaml`` its configuration, to be kept as text."""
 
     name: str
     source: str
@@ -145,37 +142,6 @@ def plan(files: Sequence[Path], overrides: Sequence[str], share: tuple[int, int]
     return Plan(mine, [one for one in refused if one.source in sources], sources)
 
 
-def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Plan:
-    """All drives of run files, whose other settings are equal, as the one site of that name.
-
-    Raises ConfigError where the site's name cannot be that of a folder.
-    """
-    take_name(site, "--site", ConfigError)
-    source = ", ".join(map(str, files))
-    try:
-        return Plan([_site_job(files, overrides, site, source)], [], [source])
-    except V2hdmError as error:
-        return Plan([], [Row.of_error(site, source, str(error))], [source])
-
-
-def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source: str) -> Job:
-    first, settings = _composed(files[0], overrides)
-    paths: list[str] = []
-    for file in files:
-        _, config = _composed(file, overrides)
-        if not config.drive.paths:
-            raise ConfigError(f"{file}: --site joins drives that lie in folders; set drive.path")
-        for key, *values in _differences(settings, config):
-            raise ConfigError(
-                f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {files[0]}: a site has one "
-                f"set of settings; say the same in both, or {key}=... for all"
-            )
-        paths += map(str, config.drive.path if isinstance(config.drive.path, list) else [config.drive.path])
-    OmegaConf.update(first, "name", site)
-    OmegaConf.update(first, "drive.path", paths)
-    return Job(site, source, to_dataclass(first, RunConfig, f"set it in {files[0]}"), to_yaml(first))
-
-
 def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConfig]:
     composed = compose_run_file(file, "map", RunConfig, overrides)
     config = to_dataclass(composed, RunConfig, f"set it in {file}")
@@ -183,19 +149,3 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
         if place.startswith("memory:"):
             raise ConfigError(f"{place}: is gone with the process that wrote it, and a fleet has many")
     return composed, config
-
-
-def _differences(settings: RunConfig, config: RunConfig) -> Iterator[tuple[str, Any, Any]]:
-    """Every setting besides name and path that is another in the second: its key, and both values."""
-    without = [replace(one, name=None, drive=replace(one.drive, path=None)) for one in (settings, config)]
-    mine, its = (dict(_leaves(asdict(one))) for one in without)
-    return ((key, mine.get(key), its.get(key)) for key in [*mine, *its] if mine.get(key) != its.get(key))
-
-
-def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting by its dotted key."""
-    for key, value in settings.items():
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, f"{before}{key}.")
-        else:
-            yield f"{before}{key}", value

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from v2hdm.errors import WorkerError, describe
-from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
+from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan
 from v2hdm.pipeline.run import take_or_run
 from v2hdm.progress import Progress, patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
@@ -27,14 +27,13 @@ class FleetOptions:
     """The choices of a user beside the drives.
 
     ``workers`` are the cores that are used, 0 for all. ``folder`` takes the table; ``again`` does what is
-    finished again. ``site`` names the one that all drives are of; without a name each is mapped by itself.
-    ``share`` = (k, n) maps every n-th drive, beginning with the k-th; other machines map the others.
+    finished again. ``share`` = (k, n) maps every n-th drive, beginning with the k-th; other machines map the
+    others.
     """
 
     folder: Path
     workers: int = 0
     again: bool = False
-    site: str | None = None
     share: tuple[int, int] = (1, 1)
 
 
@@ -54,13 +53,12 @@ def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: 
 def run_fleet(
     files: Sequence[Path], overrides: Sequence[str], options: FleetOptions, progress: DriveProgress
 ) -> list[Row]:
-    """Map the drives of run files: a row for each file, in their order, or one for a site.
+    """Map the drives of run files: a row for each file, in their order.
 
     The table is written anew whenever a drive is done. Raises V2hdmError where it cannot.
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
-    site, share = options.site, options.share
-    todo = plan(files, settings, share) if site is None else plan_site(files, settings, site)
+    todo = plan(files, settings, options.share)
     with growing_folder(options.folder, "--table", "v2hdm fleet") as write:
         table = _Table(write, todo.sources, progress)
         for row in todo.refused:

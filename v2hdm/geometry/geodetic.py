@@ -21,8 +21,7 @@ from v2hdm.records import FloatArray, GeodeticOrigin
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
 _SAME_ELLIPSOID_M = 1e-3  # GRS80's semi-minor axis is 0.1 mm longer than WGS84's
-_STEP_M = 50.0  # half of the stretch along which the grid's north is measured
-_CONFORMAL_RAD = 1e-5  # by which a conformal grid's axes may be off a right angle, for rounding
+_CONFORMAL_DEG = 1e-3  # angles of a conformal grid are as true as this, for rounding
 
 
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
@@ -188,23 +187,15 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
     """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
 
-    Measured along 100 m of the grid's lines. Raises ``error`` as :func:`geodetic_from_grid`, and when the
-    projection is not conformal: then a grid has no north that all directions turn with.
+    Raises ``error`` as :func:`geodetic_from_grid`, and when the projection is not conformal: then a grid has
+    no north that all directions turn with.
     """
     here = geodetic_from_grid(crs, points, where, error)
-    axes = enu_axes(here)
-    step = _STEP_M / _system(crs, where, error).axis_info[0].unit_conversion_factor
-
-    def azimuth_rad(offset: FloatArray) -> FloatArray:
-        ends = [geodetic_from_grid(crs, points + side * offset, where, error) for side in (1, -1)]
-        toward_ecef = _ecef_from_geodetic(ends[0]) - _ecef_from_geodetic(ends[1])
-        east, north, _ = np.einsum("nij,ni->jn", axes, toward_ecef)
-        return np.asarray(np.arctan2(east, north))
-
-    north, east = azimuth_rad(np.array([0.0, step, 0.0])), azimuth_rad(np.array([step, 0.0, 0.0]))
-    if np.abs(np.sin(east - north - np.pi / 2)).max() > _CONFORMAL_RAD:
+    pyproj = need("pyproj", "map", f"{where}: crs", error)
+    factors = pyproj.Proj(_horizontal(crs)).get_factors(here[:, 1], here[:, 0])
+    if np.max(factors.angular_distortion) > _CONFORMAL_DEG:
         raise error(f"{where}: {crs} does not keep angles; give headings from true north (heading: true)")
-    return north
+    return np.asarray(np.radians(factors.meridian_convergence))
 
 
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
@@ -245,10 +236,14 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
 @lru_cache(maxsize=8)
 def _inverse_of(crs: str) -> Any:
     """The transformer from a projected system to its own longitude and latitude."""
-    pyproj = need("pyproj", "map", "a projected system", MapFileError)
-    system = pyproj.CRS.from_user_input(crs)
-    horizontal = system.sub_crs_list[0] if system.is_compound else system
+    pyproj, horizontal = need("pyproj", "map", "a projected system", MapFileError), _horizontal(crs)
     return pyproj.Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
+
+
+def _horizontal(crs: str) -> Any:
+    """A system without its heights."""
+    system = _system(crs, crs, MapFileError)
+    return system.sub_crs_list[0] if system.is_compound else system
 
 
 def position_of(origin: GeodeticOrigin) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from v2hdm.ground.results import (
     Reading,
 )
 from v2hdm.ground.start import Readings, contradicts, start_pairs, try_readings
-from v2hdm.records import Calibration, Drive, IntArray, PoseNoise
+from v2hdm.records import Calibration, Drive, PoseNoise
 from v2hdm.workers import share_out
 
 STEEP_RAD = np.deg2rad(10)
@@ -85,6 +85,7 @@ _STAGES = (
     _Stage(0.24, 1.0, 1, 2.0),
     _Stage(0.12, 1.0, 1, 1.0),
 )
+_HELD_STAGES = tuple(stage._replace(loosened=min(stage.loosened, 2.0)) for stage in _STAGES)
 
 
 def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = None) -> GroundEstimate:
@@ -101,12 +102,16 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     readings = try_readings(drive, camera, matcher, stated, options.readings)
     out, start = _nothing(camera, readings), readings.start
     if readings.best is Reading.AS_GIVEN:
-        solved: _Solved | _Lost = _Lost(start_pairs(stated), start.share)
+        solved = None
         if start.mount is not None:
-            solved = _solve(matcher, stated, start.mount, options)
-        if isinstance(solved, _Solved):
+            # Few pairs do not hold poses that may be far off.
+            solved = _solve(matcher, stated, start.mount, options, _STAGES)
+            solved = solved or _solve(matcher, stated, start.mount, options, _HELD_STAGES)
+        if solved is not None:
             out = _found(out, solved, options.free)
-        elif out.status is GroundStatus.NO_MATCH and not contradicts(matcher, stated.guess, *solved):
+        elif out.status is GroundStatus.NO_MATCH and not contradicts(
+            matcher, stated.guess, start_pairs(stated), start.share
+        ):
             out = replace(out, status=GroundStatus.NO_TEXTURE)
     return replace(out, seconds=time.perf_counter() - began_s)
 
@@ -121,15 +126,10 @@ class _Solved:
     clock: Parameter | None
 
 
-class _Lost(NamedTuple):
-    """A round without enough matches: only a ``share`` of the patches was found again in ``pairs``."""
-
-    pairs: IntArray
-    share: float
-
-
-def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | _Lost:
-    """Match and adjust in turn, each round from the last one's solution."""
+def _solve(
+    matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions, stages: Sequence[_Stage]
+) -> _Solved | None:
+    """Match and adjust in turn, each round from the last one's solution; None where too little matches."""
     path_m = stated.path_m()
     pairs = spread_pairs(path_m, options.pairs, *_APART_M)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
@@ -137,16 +137,16 @@ def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOption
         moves = stated.motion.moves_ground_mps()
         pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, *_CLOCK_APART_M)])
     poses = stated.poses()
-    for stage in _STAGES:
+    for stage in stages:
         matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * _GRID_M)
         if len(matched) < _LEAST_MATCHES:
-            return _Lost(pairs[:: stage.every], matched.share)
+            return None
         used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
         # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
         freed = free if stage.loosened <= _CLOCK_LOOSENED else None
         adjusted = adjust(used, prior, mount, freed, max(stage.loosened / 2, 1.0))
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
-            return _Lost(pairs[:: stage.every], 0.0)
+            return None
         mount = adjusted.mount
         if freed is not None:
             stated = replace(stated, clock_s=stated.clock_s + adjusted.extra)

@@ -293,7 +293,7 @@ def _constraints(
     model: Model,
 ) -> tuple[KnownLengths | None, ControlPoints | None]:
     """The constraints by stated sizes and a survey; ``rig`` must tell one corner from the next."""
-    if not model.sizes.by_class_m and not model.survey.control:
+    if not model.sizes.by_class_m and not model.survey.points:
         return None, None
     located = locate(sightings, rig)
     located = replace(located, valid=located.valid & usable, informs=located.informs & usable)
@@ -366,8 +366,8 @@ def control_points(
     ``corners_map`` and ``corner_index`` are as of :func:`known_lengths`. ``poses`` is how far the recorded
     poses are off; neighbouring corners share their drift.
     """
-    points = np.array([one.position_map for one in survey.control], dtype=np.float64).reshape(-1, 2)
-    sigma_m = np.array([one.sigma_m for one in survey.control], dtype=np.float64).reshape(-1, 2)
+    points = np.array([one.position_map for one in survey.points], dtype=np.float64).reshape(-1, 2)
+    sigma_m = np.array([one.sigma_m for one in survey.points], dtype=np.float64).reshape(-1, 2)
     known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
     if not len(points) or not known.any():
         return None
@@ -391,10 +391,10 @@ def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> Fl
 
 def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:
     """The name of the control point at ``point_map`` (2,), which is one of those of the survey."""
-    return next(one.id for one in survey.control if np.array_equal(one.position_map, point_map))
+    return next(one.id for one in survey.points if np.array_equal(one.position_map, point_map))
 
 
 def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list[str]:
     """The names of the control points that ``control`` makes no use of."""
     used = set() if control is None else set(map(tuple, control.points_map.tolist()))
-    return [one.id for one in survey.control if tuple(one.position_map) not in used]
+    return [one.id for one in survey.points if tuple(one.position_map) not in used]

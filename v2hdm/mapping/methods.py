@@ -7,7 +7,6 @@ is the naive strategy under the IPM that the optimisation found.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -184,9 +183,8 @@ def run_methods(
         if all(known_as in ipm for ipm in ipms.values()):
             progress(name)
             results[name] = run_naive(name, given, {one: ipm[known_as] for one, ipm in ipms.items()})
-    begin_s = time.perf_counter()
     outcome, optimised = optimise(given, progress)
-    optimal = _optimised_result(outcome, optimised, begin_s)
+    optimal = _optimised_result(outcome, optimised)
     if base is not None:
         progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
@@ -200,7 +198,6 @@ def run_methods(
 
 def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:
     """The naive strategy under one IPM per camera, for instance that of a known extrinsic."""
-    begin_s = time.perf_counter()
     drive, sightings = inputs.drive, inputs.sightings
     extrinsic = {c: extrinsic_from_ipm(drive.cameras[c].info, matrix) for c, matrix in ipm.items()}
     ground = ground_by_ipm(drive, ipm, extrinsic, inputs.optimiser.initial_rig)
@@ -211,7 +208,6 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
         cameras=sightings.cameras,
         hd_map=HdMap(tuple(markings), lanes, drive.origin),
         excluded=tuple(excluded),
-        diagnostics={"time_s": time.perf_counter() - begin_s},
     )
 
 
@@ -276,7 +272,7 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
     )
 
 
-def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) -> MethodResult:
+def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     inputs = outcome.inputs
     options, drive, cameras, bundle = inputs.options, inputs.drive, inputs.cameras, optimised.bundle
     solution, noise = bundle.solution, drive.pose_noise
@@ -288,7 +284,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
     if len(lost):
         _log.warning(
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
-            len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
+            len(lost), len(options.survey.points), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
     known = observability(bundle.problem, solution)
     surface = inputs.optimiser.surface
@@ -320,7 +316,6 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
             "evaluations": float(solution.evaluations),
             "gap": solution.gap,
             "chi2_per_dof": solution.chi2_per_dof,
-            "time_s": time.perf_counter() - begin_s,
         },
         certainty={name: known[index].sentence(name) for name, index in bundle.camera_index.items()},
         evidence=outcome.evidence,
@@ -329,6 +324,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         joint_covariance=partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
+        surface=surface,
     )
 
 

@@ -81,37 +81,26 @@ class SurveyOptions:
     ``file`` is a CSV of control points and of check points, which are held out (docs/accuracy.md); ``crs`` is
     the projected system of its eastings and northings, such as ``EPSG:32632``, and ``geoid_m`` the height of
     the geoid above the ellipsoid where its heights count from the sea.
-    ``points_map`` are x and y of control points, m, in the frame of the recorded poses, as in
-    ``[[3.21, 4.05]]``; ``points`` are such with names and sigmas of their own. The others are known up to
-    ``sigma_m``. Each ties down the nearest corner of the map within ``reach_m``. Nothing else can tell the
-    drift of a receiver from the ground: no camera sees what moves the vehicle and its map alike.
+    ``points`` are control points in the frame of the recorded poses. A point of the file that states no sigma
+    is known up to ``sigma_m``. Each control point ties down the nearest corner of the map within ``reach_m``.
+    Nothing else can tell the drift of a receiver from the ground: no camera sees what moves the vehicle and
+    its map alike.
     """
 
     file: str | None = None
     crs: str | None = None
     geoid_m: float | None = None
-    points_map: list[list[float]] = field(default_factory=list)
     points: list[ControlOptions] = field(default_factory=list)
     sigma_m: float = 0.01
     reach_m: float = 0.25
 
-    @property
-    def control(self) -> tuple[ControlOptions, ...]:
-        """All control points; those of ``points_map`` are named after where they lie."""
-        sigma_m = [self.sigma_m, self.sigma_m]
-        unnamed = (
-            ControlOptions(id=f"({x:.2f}, {y:.2f})", position_map=[x, y], sigma_m=sigma_m)
-            for x, y in self.points_map
-        )
-        return (*unnamed, *self.points)
-
     def without(self, name: str) -> SurveyOptions:
         """The survey without the control point of that name."""
-        return self.only([point for point in self.control if point.id != name])
+        return self.only([point for point in self.points if point.id != name])
 
     def only(self, points: Sequence[ControlOptions]) -> SurveyOptions:
         """The survey with these control points, and no file left to read."""
-        return replace(self, file=None, points_map=[], points=list(points))
+        return replace(self, file=None, points=list(points))
 
 
 @dataclass(kw_only=True)
@@ -180,16 +169,13 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
             raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
         if len(size) != 2 or not 0 < size[1] <= size[0]:
             raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
-    for number, point in enumerate(options.survey.points_map):
-        if len(point) != 2:
-            raise ConfigError(f"mapping.survey.points_map[{number}] is {list(point)}; give x and y in m.")
     for number, one in enumerate(options.survey.points):
         key = f"mapping.survey.points[{number}]"
         if len(one.position_map) != 2:
             raise ConfigError(f"{key}.position_map is {list(one.position_map)}; give x and y in m.")
         if len(one.sigma_m) != 2 or not all(value > 0 for value in one.sigma_m):
             raise ConfigError(f"{key}.sigma_m is {list(one.sigma_m)}; give those of x and y in m, above 0.")
-    names = [one.id for one in options.survey.control]
+    names = [one.id for one in options.survey.points]
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
         raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")

@@ -35,17 +35,15 @@ from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
-CONTRADICTED_SIGMAS = 4.0
-"""From so many sigmas an input is contradicted: in one of 400 right drives one of its forty tests exceeds
-it by chance."""
+CLEAR_SIGMAS = 4.0
+"""What is off by so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
 
 
-_CHANGE_SIGMAS = 4.5
-"""The same where an input changes on the way: few stretches speak of it, and its p-values are too small."""
+_PRIOR_ODDS = 1 / 800
+"""That an input is wrong: one drive in twenty of a new vehicle, say, has a wrong one of forty."""
 
-
-_LIKELY = math.log(1e3 * 40)
-"""Log odds from which a fault is likelier than none: one drive in a thousand has one, of forty inputs."""
+_DOUBT = 0.05
+"""Probability of a wrong input that a PASS leaves, which speaks of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -247,9 +245,9 @@ def _foreign(
 
 def _is_bent(inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest]) -> bool:
     """Whether the ground surely falls or rises, if only by as little as outliers leave."""
-    if any(one.fault is Fault.CROWN and one.sigmas > CONTRADICTED_SIGMAS for one in found):
+    if any(one.fault is Fault.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
         return True
-    return inputs.optimiser.ground_gain(settled) > CONTRADICTED_SIGMAS**2 / 2
+    return inputs.optimiser.ground_gain(settled) > CLEAR_SIGMAS**2 / 2
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
@@ -273,7 +271,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
     """False of a surveyed point held to a candidate that did not enter the map, such as a worn marking."""
     if one.fault is not Fault.CONTROL:
         return True
-    point_map = next(point.position_map for point in survey.control if point.id == one.about)
+    point_map = next(point.position_map for point in survey.points if point.id == one.about)
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
     if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
         return True
@@ -336,13 +334,34 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
 
 
 def is_contradicted(one: ScoreTest) -> bool:
-    """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
-    return matters(one) and one.sigmas > (_CHANGE_SIGMAS if one.fault in CHANGES else CONTRADICTED_SIGMAS)
+    """Whether an input is off by more than matters, and this drive observes it, likelier than not."""
+    return matters(one) and one.sigmas > even_sigmas(one)
 
 
-def is_likely(one: ScoreTest) -> bool:
-    """Whether an input is likelier off than right by more than matters, if not surely."""
-    return matters(one) and log_odds(one) > _LIKELY
+def is_doubtful(one: ScoreTest) -> bool:
+    """Whether an input is off by more than matters, if not surely, then with more than 5 % probability."""
+    return matters(one) and one.sigmas > even_sigmas(one, _DOUBT / (1 - _DOUBT))
+
+
+def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
+    """The sigmas from which the ``odds`` are, 1 to 1 or others, that the input is off.
+
+    An error is Cauchy about the usual size, which hardly changes within the value's sigma; the p-value, and
+    so the sigmas, say how far in the tail of no error the value lies.
+    """
+    return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
+
+
+def doubt(one: ScoreTest) -> float:
+    """Log odds that an input is off, by its sigmas and its size."""
+    return one.sigmas**2 / 2 + _log_spread(one) + math.log(_PRIOR_ODDS)
+
+
+def _log_spread(one: ScoreTest) -> float:
+    """Log of the share of likely errors that lie within the sigma about the value of one."""
+    usual = _SIZES[one.fault].usual
+    size = math.sqrt(2 * math.pi) * one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
+    return math.log(max(size, 1e-300))
 
 
 def matters(one: ScoreTest) -> bool:

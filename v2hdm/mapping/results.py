@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.adjust import ScoreTest
+from v2hdm.association.surface import Surface
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, JointCovariance
 from v2hdm.site.candidates import Exclusion
@@ -135,6 +136,7 @@ class MethodResult:
         residuals: of the accepted corner observations.
         suspicions: of the most suspicious markings, the worst first.
         changes: of an earlier map that was brought up to date.
+        surface: of the ground, None where it is a plane.
     """
 
     name: str
@@ -153,3 +155,4 @@ class MethodResult:
     residuals: Residuals | None = None
     suspicions: Sequence[Suspicion] = ()
     changes: Changes | None = None
+    surface: Surface | None = None

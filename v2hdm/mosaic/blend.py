@@ -6,17 +6,16 @@ coordinate of the mapped point. That is proportional to its depth, so that near 
 the image is trusted for is warped with its colours, in one pass.
 
 The canvas is done in sheets, so that memory does not grow with the drive, and each sheet in tiles of which an
-image touches only those that it shows. Within a tile homography, lens and weight are smooth: kornia
-evaluates them at Chebyshev nodes, the polynomial through these gives them at every pixel, and kornia's
-``remap`` samples the image there.
+image touches only those that it shows. kornia maps their pixels by homography and lens, and its ``remap``
+samples the image there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -26,8 +25,9 @@ from kornia.geometry.linalg import transform_points
 from kornia.geometry.transform import remap
 from torch import Tensor
 
+from v2hdm.association.surface import Surface
 from v2hdm.detection.frames import read_bgr
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.errors import DriveError
 from v2hdm.geometry import tensors
 from v2hdm.geometry.ipm import (
     apply_homography,
@@ -119,12 +119,14 @@ class Lens:
 class Shot:
     """One image: its file, its camera, and the homography (3, 3) of the ground plane of the map.
 
-    The homography's third coordinate is positive in front of the camera.
+    The homography's third coordinate is positive in front of the camera. ``on_plane`` gives the points (K, 2)
+    of that plane that are seen where the ground's are, None where it is the plane.
     """
 
     path: Path
     camera: str
     pinhole_px_from_map: FloatArray
+    on_plane: Callable[[FloatArray], FloatArray] | None = None
 
     def outline_map(self, lens: Lens) -> FloatArray:
         """The ground (N, 2), m, that is trusted: a convex polygon."""
@@ -171,11 +173,13 @@ def adjusted_shots(
     calibrations: Mapping[str, Calibration],
     clock_s: Mapping[str, float],
     adjusted: Trajectory,
+    surface_at: Callable[[FloatArray], Surface | None] = lambda poses: None,
 ) -> list[Shot]:
     """The images of calibrated cameras under adjusted extrinsics and poses.
 
     ``clock_s`` is by camera how much later than stamped its images were taken. ``adjusted`` is in the frame
-    of the recorded poses; where the drive's road was not flat, its own have been laid flat.
+    of the recorded poses; where the drive's road was not flat, its own have been laid flat. ``surface_at``
+    gives the ground under vehicles at poses (F, 4, 4).
     """
     images = [image for image in drive.images if image.camera in calibrations]
     taken_s = np.array([image.stamp_s + clock_s[image.camera] for image in images])
@@ -183,20 +187,20 @@ def adjusted_shots(
     if drive.recorded is not None and drive.trajectory is not None:
         recorded, flat = (interpolate(one, taken_s, np.inf)[0] for one in (drive.recorded, drive.trajectory))
         poses = flat @ np.linalg.inv(recorded) @ poses
-    shots = []
-    for image, pose in zip(images, poses, strict=True):
+    shots, surface = [], surface_at(poses)
+    for frame, (image, pose) in enumerate(zip(images, poses, strict=True)):
         own = calibrations[image.camera]
-        px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
-        shots.append(Shot(image.path, image.camera, px_from_map))
+        cam_from_map = own.cam_from_vehicle @ inverse(pose)
+        px_from_map = pinhole_px_from_ground(own.info.intrinsic, cam_from_map)
+        on_plane = None
+        if surface is not None:
+            on_plane = partial(surface.on_plane, cam_from_map=cam_from_map, frame=frame)
+        shots.append(Shot(image.path, image.camera, px_from_map, on_plane))
     return shots
 
 
-TILES_PX = (128, 64, 32, 16)
-"""Sides that a tile may have, px of the canvas: as large as :data:`WARP_ERROR_PX` allows."""
-
+TILE_PX = 64  # side of a tile, px of the canvas
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
-WARP_ERROR_PX = 0.02  # by so much of an image's pixels may interpolated positions be off
-_NODES = 8  # Chebyshev nodes along a tile's side
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
 
@@ -236,18 +240,17 @@ def blend(
     ``shots`` are in driving order; ``progress`` counts images put onto sheets. Raises DriveError where an
     image is missing, damaged or of the wrong size.
     """
-    tiling = Tiling.of(canvas, shots, lenses)
-    plan = _plan(canvas, shots, lenses, tiling.side_px)
+    plan = _plan(canvas, shots, lenses)
     full_weight = _full_weight(canvas, shots, lenses)
     order = [index for _, views in plan for index, _ in views]
     sources = _sources(shots, lenses, device, order)
     done = 0
     for (row, column), views in plan:
         rows, columns = min(SHEET_PX, canvas.rows - row), min(SHEET_PX, canvas.columns - column)
-        sums = _Sums((rows, columns), views, tiling, device)
+        sums = _Sums((rows, columns), views, device)
         map_from_sheet = canvas.window(row, column, rows, columns).map_from_canvas
         for index, tiles in views:
-            sums.add(next(sources), shots[index].pinhole_px_from_map @ map_from_sheet, tiles)
+            sums.add(next(sources), shots[index], map_from_sheet, tiles)
             done += 1
             if progress:
                 progress(done, len(order))
@@ -259,16 +262,16 @@ _Views = list[tuple[int, FloatArray]]
 
 
 def _plan(
-    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], side_px: int
+    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]
 ) -> list[tuple[tuple[int, int], _Views]]:
     """By the first pixel (row, column) of each sheet, in the order of the first image: its views."""
     canvas_from_map = canvas.canvas_from_map
-    in_sheet = SHEET_PX // side_px
-    limit = np.ceil([canvas.columns / side_px, canvas.rows / side_px]).astype(int)
+    in_sheet = SHEET_PX // TILE_PX
+    limit = np.ceil([canvas.columns / TILE_PX, canvas.rows / TILE_PX]).astype(int)
     plan: dict[tuple[int, int], _Views] = {}
     for index, shot in enumerate(shots):
         outline = shot.outline_map(lenses[shot.camera])
-        tiles = _tiles_under(outline @ canvas_from_map[:2, :2].T + canvas_from_map[:2, 2], limit, side_px)
+        tiles = _tiles_under(outline @ canvas_from_map[:2, :2].T + canvas_from_map[:2, 2], limit)
         for sheet in np.unique(tiles // in_sheet, axis=0):
             mine = tiles[(tiles // in_sheet == sheet).all(axis=1)] - sheet * in_sheet
             key = (int(sheet[1]) * SHEET_PX, int(sheet[0]) * SHEET_PX)
@@ -287,20 +290,20 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
     return min(least, default=1.0)
 
 
-def _tiles_under(polygon: FloatArray, limit: np.ndarray, side_px: int) -> np.ndarray:
+def _tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
     """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels.
 
     Two convex shapes are apart if a side of either parts them; the polygon's box is the tiles' sides.
     """
-    low = np.maximum(np.floor((polygon.min(axis=0) - 1) / side_px).astype(int), 0)
-    high = np.minimum(np.floor((polygon.max(axis=0) + 1) / side_px).astype(int) + 1, limit)
+    low = np.maximum(np.floor((polygon.min(axis=0) - 1) / TILE_PX).astype(int), 0)
+    high = np.minimum(np.floor((polygon.max(axis=0) + 1) / TILE_PX).astype(int) + 1, limit)
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
     tiles = np.column_stack([columns.ravel(), rows.ravel()])
     along = np.roll(polygon, -1, axis=0) - polygon
     normal = np.column_stack([-along[:, 1], along[:, 0]])
     normal *= np.sign(np.einsum("ni,ni->n", normal, polygon.mean(axis=0) - polygon))[:, None]
-    corners = side_px * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - 0.5
-    reach = ((side_px * tiles[:, None, None] + corners[:, None] - polygon) * normal).sum(axis=-1)
+    corners = TILE_PX * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - 0.5
+    reach = ((TILE_PX * tiles[:, None, None] + corners[:, None] - polygon) * normal).sum(axis=-1)
     return np.asarray(tiles[(reach.max(axis=1) >= 0).all(axis=1)])
 
 
@@ -344,77 +347,21 @@ def _sources(
             yield _Source(values, (box[1].start, box[0].start), lenses[shot.camera])
 
 
-class Tiling:
-    """Tiles of ``side_px``: from Chebyshev nodes of the first kind in each to all of its pixels."""
-
-    def __init__(self, side_px: int):
-        self.side_px = side_px
-        at_nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-        nodes = (side_px - 1) / 2 * (1 + at_nodes)
-        self.nodes = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
-        vandermonde = np.polynomial.chebyshev.chebvander
-        at_pixels = vandermonde(np.linspace(-1, 1, side_px), _NODES - 1)
-        self.pixels_from_nodes = at_pixels @ np.linalg.inv(vandermonde(at_nodes, _NODES - 1))
-
-    @classmethod
-    def of(cls, canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> Tiling:
-        """The largest tiles in which the first image of each camera lies as exactly as it has to.
-
-        Raises ConfigError where not even the smallest do; the canvas is too coarse for the cameras.
-        """
-        first = {shot.camera: shot for shot in reversed(shots)}
-        for side_px in TILES_PX:
-            tiling = cls(side_px)
-            errors = [tiling.error_px(canvas.cell_m, shot, lenses[name]) for name, shot in first.items()]
-            if max(errors, default=0.0) <= WARP_ERROR_PX:
-                return tiling
-        raise ConfigError(
-            f"resolution of {canvas.cell_m:g} m is too coarse for these cameras; choose a finer"
-        )
-
-    def error_px(self, cell_m: float, shot: Shot, lens: Lens) -> float:
-        """The largest error, px, of interpolated positions in an image over the tiles that it shows."""
-        outline_map = shot.outline_map(lens)
-        canvas = Canvas.around(outline_map, cell_m)
-        px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
-        outline = apply_homography(canvas.canvas_from_map, outline_map)
-        tiles = _tiles_under(outline, np.full(2, np.iinfo(np.int64).max), self.side_px)
-        at = np.arange(self.side_px, dtype=np.float64)
-        corners = self.side_px * tiles[:, None]
-        pixels = corners + np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
-        nodes = corners + self.nodes
-        if min((one @ px_from_canvas[2, :2] + px_from_canvas[2, 2]).min() for one in (pixels, nodes)) <= 0:
-            return np.inf
-        exact, known = (
-            _recorded_px(lens, px_from_canvas, one).reshape(len(tiles), *shape, 2).movedim(3, 1)
-            for one, shape in ((pixels, (self.side_px, self.side_px)), (nodes, (_NODES, _NODES)))
-        )
-        across = torch.from_numpy(self.pixels_from_nodes)
-        return float((across @ known @ across.mT - exact).abs().max())
-
-
-def _recorded_px(lens: Lens, pinhole_px_from_canvas: FloatArray, points: FloatArray) -> Tensor:
-    """Where an image shows points (T, N, 2) of a canvas, recorded px (T, N, 2), by kornia."""
-    at = torch.from_numpy(points)
-    homography = torch.from_numpy(pinhole_px_from_canvas)
-    pinhole_px = transform_points(homography.expand(len(at), 3, 3), at)
-    return tensors.distort_points(lens.info, pinhole_px.reshape(-1, 2)).reshape(at.shape)
-
-
 class _Sums:
     """The weighted sums (tiles, 4, side, side) of colours and weights on one sheet."""
 
-    def __init__(self, shape: tuple[int, int], views: _Views, tiling: Tiling, device: str):
-        self._shape, self._tiling, self._device = shape, tiling, device
+    def __init__(self, shape: tuple[int, int], views: _Views, device: str):
+        self._shape, self._device = shape, device
         self._tiles = np.unique(np.concatenate([tiles for _, tiles in views]), axis=0)
         self._at = {(int(c), int(r)): k for k, (c, r) in enumerate(self._tiles)}
-        side = tiling.side_px
-        self._sums = torch.zeros((len(self._tiles), 4, side, side), device=device)
-        self._rows = torch.from_numpy(tiling.pixels_from_nodes).float().to(device)
+        self._sums = torch.zeros((len(self._tiles), 4, TILE_PX, TILE_PX), device=device)
+        self._pixels = torch.cartesian_prod(*2 * [torch.arange(TILE_PX, device=device)]).flip(1)
+        x, y = (self._pixels / TILE_PX).T
+        self._across = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=1)
 
-    def add(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> None:
+    def add(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> None:
         """Add an image to the tiles (T, 2) of (column, row) that it shows."""
-        x, y, density = self._warp(source, pinhole_px_from_sheet, tiles)
+        x, y, density = self._warp(source, shot, map_from_sheet, tiles)
         image = source.values.expand(len(tiles), -1, -1, -1)
         values: Tensor = remap(image, x, y, align_corners=True, normalized_coordinates=True)
         weight = values[:, 3] * density
@@ -423,22 +370,44 @@ class _Sums:
         at = torch.tensor([self._at[int(c), int(r)] for c, r in tiles], device=self._device)
         self._sums.index_add_(0, at, values)
 
-    def _warp(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
+    def _warp(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
         """Where the pixels of tiles lie in an image, and how many of its pixels each covers.
 
         Returns:
             (3, T, side, side): x and y in [-1, 1] over the cut image, as of ``grid_sample``, and the
             density in px of the image a px of the sheet.
         """
-        nodes = self._tiling.side_px * tiles[:, None] + self._tiling.nodes
-        third = nodes @ pinhole_px_from_sheet[2, :2] + pinhole_px_from_sheet[2, 2]
-        density = torch.from_numpy(np.linalg.det(pinhole_px_from_sheet) / third**3)
-        px = _recorded_px(source.lens, pinhole_px_from_sheet, nodes)
+        points = (TILE_PX * torch.from_numpy(tiles).to(self._device)[:, None] + self._pixels).float()
+        if shot.on_plane is not None:
+            points = points + self._across @ self._moved_px(tiles, shot.on_plane, map_from_sheet).to(points)
+        pinhole_px_from_sheet = shot.pinhole_px_from_map @ map_from_sheet
+        homography = torch.from_numpy(pinhole_px_from_sheet).to(points)
+        third = points @ homography[2, :2] + homography[2, 2]
+        pinhole_px = transform_points(homography.expand(len(tiles), 3, 3), points)
+        px = tensors.distort_points(source.lens.info, pinhole_px.reshape(-1, 2)).reshape(points.shape)
         height, width = source.values.shape[1:]
-        size = px.new_tensor([width - 1, height - 1])
-        x, y = (2 * (px - px.new_tensor(source.corner_px)) / size - 1).unbind(-1)
-        known = torch.stack([x, y, density]).float().to(self._device)
-        return self._rows @ known.reshape(3, len(tiles), _NODES, _NODES) @ self._rows.mT
+        x, y = (
+            2 * (px - px.new_tensor(source.corner_px)) / px.new_tensor([width - 1, height - 1]) - 1
+        ).unbind(-1)
+        density = float(np.linalg.det(pinhole_px_from_sheet)) / third**3
+        # A tile may reach beyond the horizon, where no image shows the ground.
+        known = torch.where(
+            third > 0, torch.stack([x, y, density]), px.new_tensor([-9.0, -9.0, 0.0])[:, None, None]
+        )
+        return known.reshape(3, len(tiles), TILE_PX, TILE_PX)
+
+    @staticmethod
+    def _moved_px(
+        tiles: np.ndarray, on_plane: Callable[[FloatArray], FloatArray], map_from_sheet: FloatArray
+    ) -> Tensor:
+        """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet.
+
+        Within a tile, about a metre, ground is as good as flat.
+        """
+        corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
+        sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
+        seen = on_plane(apply_homography(map_from_sheet, corners.astype(np.float64)))
+        return torch.from_numpy(apply_homography(sheet_from_map, seen) - corners).reshape(-1, 4, 2)
 
     def mean(self, full_weight: float) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA, opaque from ``full_weight`` on."""
@@ -446,7 +415,7 @@ class _Sums:
         colours = self._sums[:, [2, 1, 0]] / weight.where(weight > 0, torch.ones_like(weight))
         alpha = (255 / full_weight * weight).clamp(max=255)
         rgba = torch.cat([colours, alpha], dim=1).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
-        (rows, columns), side = self._shape, self._tiling.side_px
+        (rows, columns), side = self._shape, TILE_PX
         down, across = -(-rows // side), -(-columns // side)
         out = np.zeros((down, side, across, side, 4), dtype=np.uint8)
         out[self._tiles[:, 1], :, self._tiles[:, 0]] = rgba

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,6 @@ from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import crs_of
-from v2hdm.geometry.ipm import apply_homography
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import (
@@ -35,92 +35,8 @@ from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.report import style
 from v2hdm.report.outputs import write_json
-from v2hdm.report.page.facts import read_cameras
+from v2hdm.report.page.facts import read_cameras, read_surface
 from v2hdm.store.files import whole_file
-
-REACH_M = 0.75  # half of the length of a profile, m: misplaced paint is found within it
-_MIDDLE = (0.2, 0.8)  # part of a side over which its profile is averaged: without its corners
-_SAMPLES = 12  # places along a side's middle part
-_LEAST_SIDE_M = 0.4  # shorter sides have no middle part that pixels of some centimetres would resolve, m
-
-
-@dataclass(frozen=True)
-class Edges:
-    """The largest ``slope`` (S,), grey values per m, and ``contrast`` (S,), grey values, of S paint sides.
-
-    Both are nan where the mosaic does not show the whole profile.
-    """
-
-    slope: FloatArray
-    contrast: FloatArray
-
-    def with_those_of(self, other: Edges) -> Edges:
-        """These edges, completed by those of another part of the same mosaic."""
-        known = np.isfinite(self.slope)
-        return Edges(np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast))
-
-
-@dataclass(frozen=True)
-class PaintSides:
-    """S sides of markings and symbols: ``ends_map`` (S, 2, 2), m, and the ``sightings`` (S,) of each."""
-
-    ends_map: FloatArray
-    sightings: FloatArray
-
-
-def paint_sides(hd_map: HdMap) -> PaintSides:
-    """The sides of a map's markings and symbols that are long enough to be measured."""
-    painted = [(m.corners_map, m.sightings) for m in hd_map.markings]
-    painted += [(s.outline_map, s.sightings) for s in hd_map.symbols]
-    ends = [np.stack([outline, np.roll(outline, -1, axis=0)], axis=1) for outline, _ in painted]
-    all_ends = np.concatenate([np.empty((0, 2, 2)), *ends])
-    sightings = np.repeat([float(seen) for _, seen in painted], [len(own) for own in ends])
-    long = np.linalg.norm(all_ends[:, 1] - all_ends[:, 0], axis=1) >= _LEAST_SIDE_M
-    return PaintSides(all_ends[long], sightings[long])
-
-
-def no_edges(count: int) -> Edges:
-    """Edges of ``count`` sides that no mosaic has shown yet."""
-    return Edges(np.full(count, np.nan), np.full(count, np.nan))
-
-
-def measure_edges(rgba: np.ndarray, canvas: Canvas, sides: FloatArray) -> Edges:
-    """The edges across sides (S, 2, 2), m, in a mosaic (rows, columns, 4)."""
-    out = no_edges(len(sides))
-    points = apply_homography(canvas.canvas_from_map, _profiles(sides, canvas.cell_m / 2))
-    low, high = points.min(axis=(1, 2)), points.max(axis=(1, 2))
-    inside = (low >= 0).all(axis=1) & (high <= [canvas.columns - 1, canvas.rows - 1]).all(axis=1)
-    if not inside.any():
-        return out
-    grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    seen = rgba[..., 3].astype(np.float32)
-    for k in np.flatnonzero(inside):
-        x, y = points[k].astype(np.float32).transpose(2, 0, 1)
-        if cv2.remap(seen, x, y, cv2.INTER_NEAREST).min() < _SEEN_ALPHA:
-            continue
-        profile = cv2.remap(grey, x, y, cv2.INTER_LINEAR).mean(axis=0)
-        out.slope[k] = np.abs(profile[2:] - profile[:-2]).max() / canvas.cell_m
-        out.contrast[k] = np.ptp(profile)
-    return out
-
-
-def edge_widths_m(mosaics: Sequence[Edges]) -> list[FloatArray]:
-    """The widths, m, of those edges that all mosaics show, for each mosaic: contrast over slope."""
-    contrast = np.max([one.contrast for one in mosaics], axis=0)
-    shown = np.all([np.isfinite(one.slope) & (one.slope > 0) for one in mosaics], axis=0)
-    return [contrast[shown] / one.slope[shown] for one in mosaics]
-
-
-def _profiles(sides: FloatArray, step_m: float) -> FloatArray:
-    """Points (S, along, across, 2), m, of the profiles across sides (S, 2, 2)."""
-    along = sides[:, 1] - sides[:, 0]
-    unit = along / np.linalg.norm(along, axis=1, keepdims=True)
-    normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
-    at = np.linspace(*_MIDDLE, _SAMPLES)
-    across = np.linspace(-REACH_M, REACH_M, round(2 * REACH_M / step_m) + 1)
-    middle = sides[:, 0, None] + at[:, None] * along[:, None]
-    return np.asarray(middle[:, :, None] + across[:, None] * normal[:, None, None])
-
 
 AHEAD_M, ACROSS_M = 12.0, 8.0  # length and width of the ground that is compared
 _CELL_M = 0.01
@@ -128,20 +44,18 @@ _PANEL_IN = 5.2
 _BAR_M = 2.0
 
 
-def richest_place(drive: Drive, sides: PaintSides, contrast: FloatArray) -> FloatArray:
-    """The image's pose (4, 4) about which the most paint edges are to be seen, and were seen most often.
+def richest_place(drive: Drive, hd_map: HdMap) -> FloatArray:
+    """The image's pose (4, 4) about which the most paint was found, counted by the images that show it."""
+    painted = [(m.corners_map, m.sightings) for m in hd_map.markings]
+    painted += [(s.outline_map, s.sightings) for s in hd_map.symbols]
+    centres = np.array([outline.mean(axis=0) for outline, _ in painted]).reshape(-1, 2)
+    sightings = np.array([seen for _, seen in painted])
 
-    Its worth is the sum, over the sides that lie whole on the ground about it, of their ``contrast`` (S,) in
-    the mosaic, nan where it does not show them, times the number of images that they were found in.
-    """
-    worth = np.nan_to_num(contrast) * sides.sightings
+    def worth(pose: FloatArray) -> float:
+        offset = (centres - pose[:2, 3]) @ pose[:2, :2]
+        return float(sightings[(np.abs(offset) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=1)].sum())
 
-    def of_place(pose: FloatArray) -> float:
-        offset = (sides.ends_map - pose[:2, 3]) @ pose[:2, :2]
-        inside = (np.abs(offset) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=(1, 2))
-        return float(worth[inside].sum())
-
-    return max((image.map_from_vehicle for image in drive.images), key=of_place)
+    return max((image.map_from_vehicle for image in drive.images), key=worth)
 
 
 def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:
@@ -157,7 +71,6 @@ class Panel(NamedTuple):
     """One of the pictures that are compared."""
 
     title: str
-    caption: str
     shots: Sequence[Shot]
 
 
@@ -180,7 +93,7 @@ def save_comparison(
             axes.imshow(
                 1 - seen * (1 - stretched), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased"
             )
-            axes.set(title=panel.title, xlabel=panel.caption, xticks=[], yticks=[])
+            axes.set(title=panel.title, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
             axes.plot([0.4, 0.4 + _BAR_M], [0.4, 0.4], color="white", lw=3, solid_capstyle="butt")
             axes.text(0.4 + _BAR_M / 2, 0.52, f"{_BAR_M:g} m", color="white", ha="center", va="bottom")
@@ -302,14 +215,6 @@ def write_mosaic(
         )
     hd_map = read_geojson(folder / "map.geojson")
     ground = ground_of(folder, drive, resolution_m)
-    sides = paint_sides(hd_map)
-    edges = {when: no_edges(len(sides.ends_map)) for when in ("before", "after")}
-
-    def measure(when: str, sheet: Sheet) -> None:
-        rows, columns = sheet.rgba.shape[:2]
-        part = ground.canvas.window(sheet.row, sheet.column, rows, columns)
-        edges[when] = edges[when].with_those_of(measure_edges(sheet.rgba, part, sides.ends_map))
-
     picture = Picture(ground.canvas)
     with ExitStack() as stack:
         try:
@@ -317,20 +222,11 @@ def write_mosaic(
         except ConfigError as missing:
             _log.warning("no GeoTIFF is written: %s", missing)
             put = None
-        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, _half(progress, 0)):
+        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, progress):
             if put is not None:
                 put(sheet)
             picture.put(sheet)
-            measure("after", sheet)
-    for sheet in blend(ground.canvas, ground.before, ground.lenses, device, _half(progress, 1)):
-        measure("before", sheet)
     picture.write(folder / PICTURE)
-    before_m, after_m = edge_widths_m([edges["before"], edges["after"]])
-    sharpness: dict[str, float | int] = {"edges": len(after_m)}
-    if len(after_m):
-        before, after = float(np.median(before_m)), float(np.median(after_m))
-        sharpness |= {"edge_width_before_m": before, "edge_width_after_m": after}
-        sharpness["after_over_before"] = before / after
     content = {
         "image": PICTURE,
         "bounds_m": ground.canvas.bounds_m,
@@ -338,18 +234,12 @@ def write_mosaic(
         "geotiff": None if put is None else TIFF,
         "geotiff_resolution_m": resolution_m,
         "crs": crs_of(drive.origin),
-        "sharpness": sharpness,
     }
-    panels = []
-    for when, title, shots in (
-        ("before", "before: initial calibration, recorded poses", ground.before),
-        ("after", "after: optimised calibration, adjusted poses", ground.after),
-    ):
-        width = sharpness.get(f"edge_width_{when}_m")
-        caption = "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)"
-        panels.append(Panel(title, caption, shots))
-    pose = richest_place(drive, sides, edges["after"].contrast)
-    save_comparison(folder / COMPARISON, pose, panels, ground.lenses, device)
+    panels = [
+        Panel("before: initial calibration, recorded poses", ground.before),
+        Panel("after: optimised calibration, adjusted poses", ground.after),
+    ]
+    save_comparison(folder / COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
     write_json(folder / EXTENT, content)
     return content
 
@@ -381,14 +271,9 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
         for name, calibration in calibrations.items()
         if name in drive.cameras
     }
-    after = adjusted_shots(drive, calibrations, clock_s, adjusted)
+    after = adjusted_shots(drive, calibrations, clock_s, adjusted, partial(read_surface, folder))
     before = [shot for shot in recorded_shots(drive) if shot.camera in lenses]
     seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
     if not np.isfinite(seen).all():
         raise DriveError(f"drive {drive.name}: an ROI reaches the horizon; draw it nearer to the camera")
     return Ground(lenses, after, before, Canvas.around(seen, resolution_m, MULTIPLE_PX))
-
-
-def _half(progress: Steps | None, number: int) -> Steps | None:
-    """The progress of one of two passes of about the same work."""
-    return progress and (lambda done, total: progress(number * total + done, 2 * total))

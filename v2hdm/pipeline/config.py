@@ -9,6 +9,7 @@ from typing import Any
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
+from v2hdm.extras import need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.io.maps.formats import check_formats
@@ -59,6 +60,13 @@ class MapConfig:
 
 
 @dataclass(kw_only=True)
+class ReportConfig:
+    """The report; ``background`` is a GeoTIFF or a folder of XYZ tiles under its map, None for none."""
+
+    background: str | None = None
+
+
+@dataclass(kw_only=True)
 class RunConfig:
     """Everything about one run.
 
@@ -66,6 +74,7 @@ class RunConfig:
         name: names the results, ``<output>/<name>/``; None takes the drive's own name.
         drive: the drive to map, or several that are mapped together.
         map: an earlier map that the drive brings up to date, if there is one.
+        report: what its page shows (docs/report.md).
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
@@ -91,6 +100,7 @@ class RunConfig:
     name: str | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
     simulate: PortConfig | None = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
@@ -132,7 +142,7 @@ _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
     (Within(-2, 2), "simulate.cameras.*.", "distortion"),
     (Within(0.2, 20), "simulate.cameras.*.", "mount.z_m borrowed_mount.z_m"),
     (Within(-1e5, 1e5), "simulate.route.", "pieces"),
-    (Within(0.01, 1e3), "simulate.route.", "image_spacing_m"),
+    (Within(0.01, 1e3), "simulate.route.", "image_spacing_m speed_mps"),
     (Within(0.1, 1e4), "simulate.route.", "pose_rate_hz"),
     (Within(0, 1), "simulate.exposure.", "exposure_s"),
     (Within(0, 1, open=True), "simulate.exposure.", "level"),
@@ -144,7 +154,16 @@ _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
     ),
     (NOT_NEGATIVE, "simulate.calibration.", "survey_sigma_m click_sigma_px centre_sigma_m"),
     (POSITIVE, "simulate.disturbance.", "jitter_correlation_s rtk_correlation_m heading_correlation_s"),
+    (SHARE, "simulate.paint.", "wear dirt"),
+    (NOT_NEGATIVE, "simulate.paint.", "placing_sigma_m placing_sigma_deg dash_gap_m"),
+    (POSITIVE, "simulate.paint.", "diamond_length_m diamond_width_m line_width_m"),
+    # Closer, a port's paint would never be finished.
+    (Within(0.1), "simulate.paint.", "dash_length_m diamond_spacing_m arrow_spacing_m lettering_spacing_m"),
+    (Within(0.1), "simulate.paint.", "stop_line_spacing_m"),
     (SHARE, "simulate.surface.", "albedo wet_fraction"),
+    (NOT_NEGATIVE, "simulate.surface.", "contrast stains joint_width_m tyre_marks"),
+    (NOT_NEGATIVE, "simulate.yard.", "stack_fill stack_clearance_m sun_strength"),
+    (NOT_NEGATIVE, "simulate.exposure.", "level_sigma read_noise"),
     (Within(0, 1e5), "simulate.surface.", "patches oil_stains"),
     (Within(0, 1e4), "simulate.yard.", "parked_trucks barriers lamp_posts moving_trucks shadow_strips"),
     (POSITIVE, "simulate.yard.", "haze_m"),
@@ -175,6 +194,10 @@ def admit(config: RunConfig) -> str:
     if config.map.corrections is not None:
         read_corrections(Path(config.map.corrections))
     check_formats(config.export, "export")
+    if config.report.background is not None:
+        need("rasterio", "gis", "report.background", ConfigError)
+        if not Path(config.report.background).exists():
+            raise ConfigError(f"report.background: no file or folder {config.report.background}")
     if config.mosaic and len(config.drive.paths) > 1:
         raise ConfigError("mosaic=true shows the ground of one drive; map the drives one by one for it")
     has_base = config.map.base is not None

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
+from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.io.drive.truth import has_truth, read_truth
-from v2hdm.mapping.methods import run_naive
-from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.recovery import Inputs
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Drive, ImageDetections, Truth
+from v2hdm.records import Drive, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_figures
 
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
@@ -34,35 +31,20 @@ class Judgement:
     truth: Truth | None
 
 
-def evaluate(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    methods: CameraSets,
-    options: MappingOptions,
-    progress: Callable[[int, int], None],
-) -> Judgement:
+def evaluate(drive: Drive, methods: CameraSets) -> Judgement:
     """Compare every method on every camera set with the truth, where the drive has one."""
     truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
-    reference: dict[str, Any] = {}
-    for done, (name, by_method) in enumerate(methods.items()):
-        progress(done, len(methods))
+    for name, by_method in methods.items():
         cameras = next(iter(by_method.values())).cameras
         expected = driven_past(drive, truth, cameras) if truth else None
         results[name] = {
             method: map_figures(result.hd_map, truth, expected) | _own_figures(result)
             for method, result in by_method.items()
         }
-        if truth is not None:
-            # The best that any calibration could make of the naive strategy.
-            infos = {camera: drive.cameras[camera].info for camera in cameras}
-            ipms = {one: ipm_from_extrinsic(infos[one], truth.cam_from_vehicle[one]) for one in cameras}
-            ideal = run_naive("true extrinsic", Inputs(drive, detections, cameras, options), ipms)
-            reference[name] = {"naive_true_extrinsic": map_figures(ideal.hd_map, truth, expected)}
-    progress(len(methods), len(methods))
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
-        metrics |= {"reference": reference, "disturbances": truth.disturbances}
+        metrics["disturbances"] = truth.disturbances
     headlines = [headline(name, by_method) for name, by_method in results.items()]
     if truth is not None and truth.disturbances:
         disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())

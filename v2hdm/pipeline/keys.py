@@ -63,7 +63,8 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     if config.map.base is not None:
         hd_map, trajectories, excluded = base_files(Path(config.map.base))
         files += [hd_map, *trajectories, excluded]
-    files += [Path(one) for one in (config.mapping.survey.file, config.map.corrections) if one is not None]
+    named = (config.mapping.survey.file, config.map.corrections, config.report.background)
+    files += [Path(one) for one in named if one is not None]
     truths = [drive.truth_dir for drive in drives if drive.truth_dir is not None]
     files += [path for truth in truths for path in sorted(truth.rglob("*"))]
     read = [(str(path), file_digest(path)) for path in files if path.is_file()]

@@ -192,7 +192,9 @@ def _with_wear(
     ids = (k if one.id is None else one.id for k, one in enumerate(best.hd_map.markings, start=1))
     number = {one: k for k, one in enumerate(ids)}
     shown = {(index[image], number[marking]) for image, marking in whole if marking in number}
-    worn = with_wear(best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads)
+    worn = with_wear(
+        best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads, best.surface
+    )
     methods = {**last.methods, BEST: replace(best, hd_map=worn)}
     return {**sets, name: replace(last, methods=methods)}
 
@@ -212,12 +214,12 @@ def _judge(
         found = check_result(checked.drive, methods, checked.ground)
         unfit = check_known_sizes(survey.mapping.known_sizes, best)
         unfit += check_corrections(survey.mapping.acceptance.corrections, best)
-        reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.control else "poses")
+        reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.points else "poses")
         surveyed = check_survey(survey, best, compared)
         before = over_surface(checked.findings, best)
         verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
-        judgement = evaluate(result.drive, detections, methods, survey.mapping, context.steps("evaluate"))
+        judgement = evaluate(result.drive, methods)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
     figures = {**judgement.metrics, **changes, "seconds": context.seconds}
     headlines = tuple(judgement.headlines)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2hdm import __version__
+from v2hdm.association.surface import FILE as GROUND
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError, MappingError
-from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
+from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import inverse
 from v2hdm.geometry.trajectory import interpolate
@@ -37,7 +39,6 @@ from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.keys import Contents, made_of_drives
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
-from v2hdm.report.figures import save_birdseye
 from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
@@ -200,13 +201,14 @@ class Result:
         mosaic: bool,
         context: Context,
         crs: str | None = None,
+        background: str | None = None,
     ) -> None:
         """Write what :meth:`save` does into a folder that is still unfinished."""
         from v2hdm.mosaic.result import write_mosaic
         from v2hdm.report.page.document import write_page
 
         if self.judgement is not None:
-            _write_map(folder, self, formats, self.judgement, crs)
+            _write_map(folder, self, formats, crs)
             for name, methods in self.methods.items() if all_maps else ():
                 for method, made in methods.items():
                     path = folder / "maps" / f"{name}_{method}.geojson"
@@ -219,12 +221,10 @@ class Result:
             grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
             write_qgis(self.map, folder / "map.qgs", grid=grid)
         with context.timed("report"):
-            write_page(folder, self.drive)
+            write_page(folder, self.drive, None if background is None else Path(background))
 
 
-def _write_map(
-    folder: Path, result: Result, formats: Sequence[str], judgement: Judgement, crs: str | None
-) -> None:
+def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | None) -> None:
     drive, best, verdict = result.drive, result.best, result.verdict.as_json()
     geojson = [one for one in formats if one == "geojson"]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
@@ -244,6 +244,8 @@ def _write_map(
             except MapFileError as error:
                 _log.info("no %s calibration is written: %s", form, error)
     write_trajectories(result.trajectory, drive, folder)
+    if best.surface is not None:
+        write_json(folder / GROUND, best.surface.stored())
     if best.residuals is not None:
         write_residuals(best.residuals, folder / RESIDUALS)
     if best.changes is not None:
@@ -256,17 +258,9 @@ def _write_map(
         for one in methods[BEST].excluded
     ]
     write_exclusions(excluded, folder / "excluded.geojson", drive.origin, drive.road)
-    maps = {name: one.hd_map for name, one in list(result.methods.values())[-1].items()}
-    save_birdseye(folder / "birdseye.png", maps, BEST, _route(drive), judgement.truth)
     for name in best.calibrations:
         image = _fullest_image(drive, name, result.detections)
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
-
-
-def _route(drive: Drive) -> FloatArray:
-    """Positions (N, 2) of the vehicle, with a nan between one visit and the next."""
-    ends = np.flatnonzero(np.diff([image.visit for image in drive.images])) + 1
-    return np.insert(drive.route_map, ends, np.nan, axis=0)
 
 
 _BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")
@@ -295,9 +289,18 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
     initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
     cam_from_map = best.calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(adjusted)
     ipm = facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
-    views = {
-        initial: np.linalg.inv(ipm) @ flat_motion(inverse(image.map_from_vehicle)),
-        BEST: pinhole_px_from_ground(camera.info.intrinsic, cam_from_map),
+    before = np.linalg.inv(ipm) @ flat_motion(inverse(image.map_from_vehicle))
+    after = pinhole_px_from_ground(camera.info.intrinsic, cam_from_map)
+    ground = None if best.surface is None else best.surface.seen_from(adjusted[None])
+
+    def optimised(points_map: FloatArray) -> FloatArray:
+        if ground is not None:
+            points_map = ground.on_plane(points_map, cam_from_map, 0)
+        return apply_in_front(after, points_map)
+
+    views: dict[str, Callable[[FloatArray], FloatArray]] = {
+        initial: partial(apply_in_front, before),
+        BEST: optimised,
     }
     position_map = adjusted[:2, 3]
     save_overlay(path, read_image(image, camera), camera.info, best.hd_map, position_map, views)

@@ -81,15 +81,14 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     ``work`` makes a result in folders of this machine; a finished one of the same is taken where ``take``
     says so. Raises V2hdmError as ``work``; or a store does not work, or holds what is not ours.
     """
-    output, folder = place_of(config.output, "output="), place_of(config.cache, "cache=")
-    if isinstance(folder, RemoteFolder):
+    output = place_of(config.output, "output=")
+    if is_url(config.cache):
         raise ConfigError(f"cache={config.cache}: is a URL; give a folder, on a disk that machines may share")
     if isinstance(output, RemoteFolder):
-        output.check()
-    local, stages = _local(config, folder, progress), StageCache(folder, config.resume)
+        output.below(run_name(config)).listed()  # what is wrong there is told before any work
+    local, stages = _local(config, progress), StageCache(Path(config.cache), config.resume)
     if isinstance(output, RemoteFolder):
         return _take_or_upload(local, output, stages, work, take, progress)
-    local.output = str(output)
     there = finished(local, stages) if take else None
     return (work(local, stages), False) if there is None else (there, True)
 
@@ -139,20 +138,19 @@ def _is_of(config: RunConfig, key: str) -> bool:
     return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
 
 
-def _local(config: RunConfig, folder: Path, progress: Progress) -> RunConfig:
-    """The settings with folders of this machine for the cache and the drives."""
+def _local(config: RunConfig, progress: Progress) -> RunConfig:
+    """The settings with folders of this machine for the drives."""
     drive = config.drive
     given = drive.path if isinstance(drive.path, list) else [drive.path]
     paths = [place_of(one, "drive.path=") if isinstance(one, str) and is_url(one) else one for one in given]
     if any(isinstance(one, RemoteFolder) for one in paths):
         config = replace(config, name=run_name(config))  # as before anything was copied
-    copy = partial(remote.download, cache=folder, report=partial(progress, "copy"))
+    copy = partial(remote.download, cache=Path(config.cache), report=partial(progress, "copy"))
     paths = [copy(one) if isinstance(one, RemoteFolder) else one for one in paths]
     if paths != given:
         local = [str(one) for one in paths]
         drive = replace(drive, path=local if isinstance(drive.path, list) else local[0])
-    imports = str(folder) if is_url(drive.cache) else drive.cache
-    return replace(config, cache=str(folder), drive=replace(drive, cache=imports))
+    return replace(config, drive=drive)
 
 
 def _take_or_upload(
@@ -260,7 +258,8 @@ def map_and_save(
                 context=context,
             )
             key = result_key(config, found.drives, found.contents, context.cache.key())
-            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs)
+            below = config.report.background
+            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs, below)
             for line in found.verdict.lines:
                 _log.info("%s", line)
         result = RunResult(place, found.metrics, found.headlines, found.verdict)

@@ -69,7 +69,7 @@ def take_survey(drive: Drive, options: MappingOptions) -> Survey:
         for one in points
         if not one.is_check
     ]
-    survey = options.survey.only([*options.survey.control, *control])
+    survey = options.survey.only([*options.survey.points, *control])
     check = tuple(one for one in points if one.is_check)
     _log.info("%s: %d control points and %d check points", table.path, len(control), len(check))
     return Survey(replace(options, survey=survey), check, points, elsewhere)

@@ -1,4 +1,4 @@
-"""The figures of a run as PNG: the map against the truth, and the route."""
+"""Figures as PNG: a map against the truth, and the route of a drive."""
 
 from __future__ import annotations
 
@@ -26,16 +26,14 @@ def save_birdseye(
     maps: Mapping[str, HdMap],
     best: str,
     route_map: FloatArray,
-    truth: Truth | None = None,
+    truth: Truth,
 ) -> None:
     """Draw ``maps[best]`` over the truth from above, beside a close-up with all methods.
 
-    The best map's markings are coloured by their corner error where there is truth. ``route_map`` (N, 2), m,
-    has nan between two drives.
+    The best map's markings are coloured by their corner error. ``route_map`` (N, 2) is in m.
     """
     with site_and_detail(path, route_map) as (site, detail):
-        if truth is not None:
-            draw_truth(site, truth)
+        draw_truth(site, truth)
         _draw_best(site, maps[best], truth)
         site.set_title(f"{best}: {len(maps[best].markings)} markings, {len(maps[best].lanes)} lane lines")
         _close_up(detail, maps, best, truth)
@@ -44,7 +42,7 @@ def save_birdseye(
 @contextmanager
 def site_and_detail(path: Path, route_map: FloatArray) -> Iterator[tuple[Axes, Axes]]:
     """A figure of two panels, the site with the route (N, 2) in it and a close-up; legends below them."""
-    low, high = np.nanmin(route_map, axis=0) - _BESIDE_ROUTE_M, np.nanmax(route_map, axis=0) + _BESIDE_ROUTE_M
+    low, high = route_map.min(axis=0) - _BESIDE_ROUTE_M, route_map.max(axis=0) + _BESIDE_ROUTE_M
     extent_m = high - low
     site_width_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.5, 2.0)) + 1.6
     with style.figure(path, site_width_in + _HEIGHT_IN, _HEIGHT_IN) as fig:
@@ -66,17 +64,10 @@ def draw_truth(axes: Axes, truth: Truth) -> None:
     axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
 
 
-def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
-    solid = style.METHOD["Opt"]
+def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth) -> None:
     lanes = [lane.points_map for lane in hd_map.lanes]
     axes.add_collection(LineCollection(lanes, colors=style.OKABE_ITO["sky"], lw=1.1, label="lane lines"))
-    outlines = [symbol.outline_map for symbol in hd_map.symbols]
-    symbols = PolyCollection(outlines, facecolors="none", edgecolors=solid, lw=0.9, label="symbols")
-    axes.add_collection(symbols)
     polygons = [m.corners_map for m in hd_map.markings]
-    if truth is None:
-        axes.add_collection(PolyCollection(polygons, facecolors=solid, edgecolors=solid, label="markings"))
-        return
     rows, columns = metrics.match_markings(hd_map.markings, truth.map.markings)
     error_cm = np.full(len(polygons), np.nan)
     for row, column in zip(rows, columns, strict=True):
@@ -89,16 +80,15 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     axes.figure.colorbar(shown, ax=axes, shrink=0.6, label="corner error of the marking (cm)")
 
 
-def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | None) -> None:
+def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth) -> None:
     """The neighbourhood of one marking, every method beside the truth; what would be cut off is left out."""
     if not maps[best].markings:
         axes.set_axis_off()
         return
     centre = _common_marking(maps, best)
-    if truth is not None:
-        polygons = _wholly_near(truth.map, centre)
-        axes.add_collection(PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.6))
-        axes.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
+    polygons = _wholly_near(truth.map, centre)
+    axes.add_collection(PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.6))
+    axes.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
     for method in sorted(maps, key=lambda name: name != best):
         look = {"color": style.METHOD.get(method, "k"), "ls": style.LINE.get(method, "-")}
         look |= {"lw": 2.2 if method == best else 1.5}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.geometry.ipm import apply_in_front, project_ground
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.geometry.rigid import camera_centre
@@ -116,18 +116,64 @@ def save_grid(
     """
     canvas = image.copy()
     legend: list[tuple[Pen | None, str]] = [(None, caption)]
-    for name, cam_from_vehicle in mountings.items():
-        pen = PENS[name]
-        for line in _grid_lines(cam_from_vehicle):
-            draw_lines(canvas, project_line(camera.info, cam_from_vehicle, line), pen)
-        draw_lines(canvas, [_horizon(camera.info, cam_from_vehicle)], replace(pen, width=2))
-        legend.append((pen, _WORDS[name]))
+    for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
+        _draw_grid(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
+        legend.append((PENS[name], _WORDS[name]))
     first = next(iter(mountings.values()))
     draw_lines(canvas, project_outline(camera.info, first, camera.roi_vehicle), _ROI)
     legend.append((_ROI, "roi_vehicle, by the guess"))
-    for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
-        _label(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
     _write_image(path, with_legend(canvas, legend), cv2.IMWRITE_JPEG_QUALITY, 88)
+
+
+_ARROW_SHARE = 0.06  # length of the longest arrow of a right point, as a share of the image's width
+_MOST_TIMES = 1000.0  # arrows are not magnified further
+_RIGHT, _WRONG = Pen(OKABE_ITO["blue"]), Pen(OKABE_ITO["vermillion"])
+
+
+def save_points(
+    path: Path,
+    image: np.ndarray | None,
+    info: CameraInfo,
+    cam_from_vehicle: FloatArray,
+    roi_vehicle: FloatArray,
+    points: Sequence[tuple[str, FloatArray, FloatArray, bool]],
+) -> None:
+    """Draw grid, ROI and clicked points into an image (H, W, 3) BGR, or on blank paper of its size.
+
+    Of each point ``points`` has the label, the pixel (2,), how far (2,), px, that is off the predicted one,
+    and whether it is right. Arrows lead to the predicted pixels, those of right points magnified.
+    """
+    canvas = np.full((info.height, info.width, 3), 255, np.uint8) if image is None else image.copy()
+    _draw_grid(canvas, info, cam_from_vehicle, PENS["ground"], to_the_left=False)
+    draw_lines(canvas, project_outline(info, cam_from_vehicle, roi_vehicle), _ROI)
+    longest = max((float(np.hypot(*off)) for _, _, off, right in points if right), default=0.0)
+    times = min(_ARROW_SHARE * info.width / max(longest, 1e-9), _MOST_TIMES)
+    for label, at, off, right in points:
+        pen, (u, v) = _RIGHT if right else _WRONG, np.round(at).astype(int).tolist()
+        sign = cv2.MARKER_DIAMOND if right else cv2.MARKER_TILTED_CROSS
+        cv2.drawMarker(canvas, (u, v), pen.bgr, sign, 14, pen.width, cv2.LINE_AA)
+        if np.isfinite(off).all():
+            tip = np.clip(at - (times if right else 1.0) * off, -_LARGEST_PX, _LARGEST_PX)
+            cv2.arrowedLine(
+                canvas, (u, v), np.round(tip).astype(int).tolist(), pen.bgr, pen.width, cv2.LINE_AA
+            )
+        _write(canvas, label, (u + 8, v + 18), (255, 255, 255))
+    legend: list[tuple[Pen | None, str]] = [(PENS["ground"], f"{info.name}: grid and horizon"), (_ROI, "ROI")]
+    legend.append(
+        (_RIGHT, f"to the predicted pixels, {times:.0f} times as long; the longest {longest:.2f} px")
+    )
+    legend += [(_WRONG, "contradict the others, true to scale")] if not all(one[3] for one in points) else []
+    _write_image(path, with_legend(canvas, legend))
+
+
+def _draw_grid(
+    canvas: np.ndarray, info: CameraInfo, cam_from_vehicle: FloatArray, pen: Pen, to_the_left: bool
+) -> None:
+    """The ground's grid with its coordinates, and the horizon, under a mounting."""
+    for line in _grid_lines(cam_from_vehicle):
+        draw_lines(canvas, project_line(info, cam_from_vehicle, line), pen)
+    draw_lines(canvas, [_horizon(info, cam_from_vehicle)], replace(pen, width=2))
+    _label(canvas, info, cam_from_vehicle, pen, to_the_left)
 
 
 def project_line(
@@ -225,25 +271,24 @@ def save_overlay(
     info: CameraInfo,
     hd_map: HdMap,
     position_map: FloatArray,
-    views: Mapping[str, FloatArray],
+    views: Mapping[str, Callable[[FloatArray], FloatArray]],
 ) -> None:
     """Draw a map into an image, as recorded, as several calibrations and poses project it.
 
-    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` are by name the
-    homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third coordinate is positive in front of
-    the camera.
+    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` give by name the pinhole
+    px (N, 2) of ground points (N, 2), nan behind the camera.
     """
     canvas = image.copy()
     outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
     lines = [*(np.vstack([one, one[:1]]) for one in outlines), *(lane.points_map for lane in hd_map.lanes)]
     legend: list[tuple[Pen | None, str]] = []
-    for name, pinhole_px_from_map in views.items():
+    for name, view in views.items():
         pen = OVERLAY.get(name, _BEFORE)
         for line in lines:
             # Densified, for lenses bend it.
             dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
             near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-            pieces = _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
+            pieces = _visible_pieces(info, view(dense), near, 0.1)
             draw_lines(canvas, pieces, pen)
         said = "found by the run" if name in OVERLAY else "that the run began with"
         legend.append((pen, f"{name}: the map by the calibration and pose {said}"))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -111,6 +111,8 @@ _CORNERS_MOVED = np.concatenate([np.eye(4), np.eye(4)[:2] - np.eye(4)[2:]])
 
 The shape that is fitted to an image is nearly a parallelogram, so that one wrong corner takes another along.
 """
+
+_NOTHING = np.zeros((8, 8))  # of what nothing misplaces
 
 _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
 
@@ -305,6 +307,33 @@ def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(directions @ covariance @ np.swapaxes(directions, 1, 2))
 
 
+@dataclass(frozen=True)
+class _Space:
+    """The hypotheses on N ``candidates`` so far; ``share`` (8,) of the kinds, and what is known of paint."""
+
+    candidates: Candidates
+    share: FloatArray
+    paint: PaintError
+    found: list[_Hypothesis] = field(default_factory=list)
+
+    def add(
+        self,
+        kind: int,
+        part: float,
+        laid: Laid,
+        scatter: FloatArray,
+        misplaced: FloatArray = _NOTHING,
+        one_way: FloatArray | None = None,
+        beside: FloatArray | float = 0.0,
+    ) -> None:
+        """Add one that has a ``part`` of its kind's share; see :class:`_Hypothesis` for the rest."""
+        off = (self.candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
+        residual = (laid.directions @ off)[..., 0]
+        errors = scatter, misplaced, self.paint.sigma_m**2, one_way, beside
+        prior = float(np.log(part * self.share[kind]))
+        self.found.append(_Hypothesis(kind, prior, self.candidates, laid.directions, residual, *errors))
+
+
 def _hypotheses(
     candidates: Candidates,
     shapes: Sequence[Shape],
@@ -319,76 +348,94 @@ def _hypotheses(
     ``weight`` and ``other_length`` (N,) are the probabilities so far of being a marking, and one of another
     length; ``vague`` (N, 4) is the log likelihood ratio of views that do not agree on a corner's place.
     """
-    out: list[_Hypothesis] = []
-    nothing = np.zeros((8, 8))
-
-    def add(
-        kind: int,
-        part: float,
-        laid: Laid,
-        scatter: FloatArray,
-        misplaced: FloatArray = nothing,
-        one_way: FloatArray | None = None,
-        beside: FloatArray | float = 0.0,
-    ) -> None:
-        off = (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
-        residual = (laid.directions @ off)[..., 0]
-        errors = scatter, misplaced, paint.sigma_m**2, one_way, beside
-        prior = float(np.log(part * share[kind]))
-        out.append(_Hypothesis(kind, prior, candidates, laid.directions, residual, *errors))
-
-    total, anything = sum(shape.share for shape in shapes), np.zeros(len(candidates))
+    space = _Space(candidates, share, paint)
+    total, ragged = sum(shape.share for shape in shapes), np.zeros(len(candidates))
     for shape in shapes:
-        part = shape.share / total
-        laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
-        scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
-        add(OF_CLASS, part / 2, laid, scatter)
-        add(OF_CLASS, part / 2, otherwise, scatter)
-        ends = _inwards(laid.corners_map, shape.is_elongated)
-        lengths, angles = [(1.0, scatter)], [[nothing]] * len(ends)
-        worn = [np.zeros(len(candidates))] * len(ends)
-        if shape.is_elongated:
-            worn = _worn_evidence(candidates, [end for end, _ in ends], weight)
-            worn = [
-                ragged + np.sum(end.reshape(-1, 4, 2).any(axis=2) * vague, axis=1) / 2
-                for ragged, (end, _) in zip(worn, ends, strict=True)
-            ]
-            # Of what is no marking any end is as likely ragged as not.
-            anything = np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0)
-            shorter = (ends[0][0] + ends[1][0]) / 2
-            spread_m, again = _other_lengths(candidates, laid, shorter, shape.sigma_m, other_length)
-            longer = scatter + spread_m**2 * _outer(shorter)
-            add(OTHER_LENGTH, part, laid, longer, beside=again)
-            other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
-            lengths = [(1 - other, scatter), (other, longer)]
-            angles = [[nothing, _slanted(laid.corners_map, end)] for end, _ in ends]
-        for (end, extent_m), cuts, ragged in zip(ends, angles, worn, strict=True):
-            ways: tuple[tuple[FloatArray, FloatArray | float], ...] = (
-                (_MISPLACED_M * end, ragged),
-                (_WORN_SHARE * extent_m * end, ragged),
-                (-_RUN_ON_M * end, 0.0),
-            )
-            for (way, beside), cut, (likely, size) in itertools.product(ways, cuts, lengths):
-                each = part * likely / len(ends) / len(ways) / len(cuts)
-                add(WRONG_END, each, laid, size, _outer(way) + cut, way[..., None], beside)
-        for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
-            both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
-            misplaced = both @ np.swapaxes(both, 1, 2) + _slanted(
-                laid.corners_map, one + other_end, _CUT_SHARE
-            )
-            add(PIECE, part / 4, laid, scatter, misplaced, both)
-        for moved in _CORNERS_MOVED:
-            block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
-            add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
+        ragged = _add_shape(space, shape, shape.share / total, weight, other_length, vague)
     centre = candidates.corners_map.mean(axis=1)
     turns, shifts = np.tile(np.eye(2), (len(centre), 1, 1)), np.zeros(len(centre), dtype=np.int64)
     own = Laid(parallelograms(candidates.corners_map) + centre[:, None], turns, centre, shifts)
     own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own
     any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
-    add(OWN_SHAPE, 1.0, own, any_size)
-    add(PART_OF_SYMBOL, 1.0, own, any_size, beside=anything)
-    add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8), beside=anything)
-    return out
+    space.add(OWN_SHAPE, 1.0, own, any_size)
+    space.add(PART_OF_SYMBOL, 1.0, own, any_size, beside=ragged)
+    space.add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8), beside=ragged)
+    return space.found
+
+
+def _add_shape(
+    space: _Space,
+    shape: Shape,
+    part: float,
+    weight: FloatArray,
+    other_length: FloatArray,
+    vague: FloatArray,
+) -> FloatArray:
+    """Add the hypotheses of one shape of the class, a ``part`` of it; arguments as for :func:`_hypotheses`.
+
+    Returns:
+        The log likelihood (N,) that what is no marking has ends as ragged as these.
+    """
+    candidates, share = space.candidates, space.share
+    laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
+    scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
+    space.add(OF_CLASS, part / 2, laid, scatter)
+    space.add(OF_CLASS, part / 2, otherwise, scatter)
+    ends = _inwards(laid.corners_map, shape.is_elongated)
+    for moved in _CORNERS_MOVED:
+        block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
+        space.add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
+    _add_pieces(space, part, laid, scatter, ends)
+    none = np.zeros(len(candidates))
+    if not shape.is_elongated:
+        _add_wrong_ends(space, part, laid, [(1.0, scatter)], ends, [[_NOTHING]] * 4, [none] * 4)
+        return none
+    worn = [
+        ragged + np.sum(end.reshape(-1, 4, 2).any(axis=2) * vague, axis=1) / 2
+        for ragged, (end, _) in zip(
+            _worn_evidence(candidates, [end for end, _ in ends], weight), ends, strict=True
+        )
+    ]
+    shorter = (ends[0][0] + ends[1][0]) / 2
+    spread_m, again = _other_lengths(candidates, laid, shorter, shape.sigma_m, other_length)
+    longer = scatter + spread_m**2 * _outer(shorter)
+    space.add(OTHER_LENGTH, part, laid, longer, beside=again)
+    other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
+    angles = [[_NOTHING, _slanted(laid.corners_map, end)] for end, _ in ends]
+    _add_wrong_ends(space, part, laid, [(1 - other, scatter), (other, longer)], ends, angles, worn)
+    # Of what is no marking any end is as likely ragged as not.
+    return np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
+
+
+def _add_wrong_ends(
+    space: _Space,
+    part: float,
+    laid: Laid,
+    lengths: Sequence[tuple[float, FloatArray]],
+    ends: Sequence[tuple[FloatArray, FloatArray]],
+    angles: Sequence[Sequence[FloatArray]],
+    worn: Sequence[FloatArray],
+) -> None:
+    """Add those of one end that is worn, or runs on: of each length, cut at each angle."""
+    for (end, extent_m), cuts, ragged in zip(ends, angles, worn, strict=True):
+        ways: tuple[tuple[FloatArray, FloatArray | float], ...] = (
+            (_MISPLACED_M * end, ragged),
+            (_WORN_SHARE * extent_m * end, ragged),
+            (-_RUN_ON_M * end, 0.0),
+        )
+        for (way, beside), cut, (likely, size) in itertools.product(ways, cuts, lengths):
+            each = part * likely / len(ends) / len(ways) / len(cuts)
+            space.add(WRONG_END, each, laid, size, _outer(way) + cut, way[..., None], beside)
+
+
+def _add_pieces(
+    space: _Space, part: float, laid: Laid, scatter: FloatArray, ends: Sequence[tuple[FloatArray, FloatArray]]
+) -> None:
+    """Add those of a marking that lacks one end and one side, such as what another vehicle leaves in view."""
+    for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
+        both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
+        slanted = _slanted(laid.corners_map, one + other_end, _CUT_SHARE)
+        space.add(PIECE, part / 4, laid, scatter, both @ np.swapaxes(both, 1, 2) + slanted, both)
 
 
 def _worn_evidence(

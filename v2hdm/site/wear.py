@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
-from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
+from v2hdm.association.surface import Surface
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.geometry.rigid import inverse
@@ -113,16 +114,19 @@ def with_wear(
     shown: Set[tuple[int, int]],
     earlier: HdMap | None = None,
     threads: int = 1,
+    surface: Surface | None = None,
 ) -> HdMap:
     """``hd_map`` with the share of paint that each marking has left, where two images or more show it near.
 
     ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W),
-    ``shown`` are the pairs of an image's index and a marking's that nothing hides there.
+    ``shown`` are the pairs of an image's index and a marking's that nothing hides there, ``surface`` the
+    ground where it is no plane.
     A marking that the ``earlier`` map has, by its id, states the change, and keeps what that says where this
     drive did not look.
     """
     cells = [Cells.of(one.corners_map) for one in hd_map.markings]
-    for number, light in _seen(cells, images, map_from_vehicle, calibrations, grey, shown, threads):
+    ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))
+    for number, light in _seen(cells, images, map_from_vehicle, calibrations, grey, shown, threads, ground):
         cells[number].add(light)
     known = [k for k, one in enumerate(cells) if len(one.contrasts) >= _VIEWS[0]]
     shares = _shares([cells[k].fit() for k in known], [hd_map.markings[k].kind for k in known])
@@ -172,25 +176,34 @@ def _seen(
     grey: Callable[[Image], NDArray[np.float32]],
     shown: Set[tuple[int, int]],
     threads: int,
+    ground: Surface | None,
 ) -> Iterator[tuple[int, FloatArray]]:
     """(marking, light of its cells) in those of the images that show it whole from nearest."""
     if not cells:
         return
+
+    def pinhole_px(index: int, places_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+        own = calibrations[images[index].camera]
+        cam_from_map = own.cam_from_vehicle @ inverse(map_from_vehicle[index])
+        if ground is not None:
+            places_map = ground.on_plane(places_map, cam_from_map, index)
+        return project_ground(own.info.intrinsic, cam_from_map, places_map)
+
     tree = cKDTree([one.places_map.mean(axis=(0, 1)) for one in cells])
     views: list[list[tuple[float, int]]] = [[] for _ in cells]
     for index, (image, pose) in enumerate(zip(images, map_from_vehicle, strict=True)):
         if image.camera not in calibrations:
             continue
         own = calibrations[image.camera]
-        px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
         size = np.array([own.info.width, own.info.height])
         for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
             if (index, number) not in shown:
                 continue
             edge = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
-            if ((edge @ px_from_map[2, :2] + px_from_map[2, 2]) <= 0.3).any():
+            pinhole, depth_m = pinhole_px(index, edge)
+            if (depth_m <= 0.3).any():
                 continue
-            px = distort_points(own.info, apply_homography(px_from_map, edge))
+            px = distort_points(own.info, pinhole)
             if (px >= 2).all() and (px <= size - 3).all():
                 away_m = float(np.linalg.norm(edge.mean(axis=0) - pose[:2, 3]))
                 views[number].append((away_m, index))
@@ -204,12 +217,10 @@ def _seen(
             some = order[start : start + 8 * threads]
             for index, pixels in zip(some, readers.map(lambda one: grey(images[one]), some), strict=True):
                 own = calibrations[images[index].camera]
-                cam_from_map = own.cam_from_vehicle @ inverse(map_from_vehicle[index])
-                px_from_map = pinhole_px_from_ground(own.info.intrinsic, cam_from_map)
                 light = _LIGHT[np.clip(pixels, 0, 255).astype(np.uint8)]
                 for number in wanted[index]:
                     places = cells[number].places_map
-                    px = distort_points(own.info, apply_homography(px_from_map, places.reshape(-1, 2)))
+                    px = distort_points(own.info, pinhole_px(index, places.reshape(-1, 2))[0])
                     at = px.reshape(places.shape).astype(np.float32)
                     seen = cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
                     yield number, np.asarray(seen, dtype=np.float64)

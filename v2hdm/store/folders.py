@@ -165,11 +165,11 @@ def new_entry(folder: Path) -> Iterator[Path]:
         yield partial
         _write_list(partial)
         if folder.exists() and not is_whole(folder):
-            listed = _listed(folder).get("files") or ()
-            bring_over(folder, partial, lambda name: name in (*listed, LIST) or (partial / name).exists())
-            shutil.rmtree(folder)
-        if not folder.exists():  # else another process was faster
+            remove_ours(folder)
+        if not folder.exists():
             partial.replace(folder)
+        elif not is_whole(folder):  # else another process was faster
+            _fill(folder, partial)
         note_use(folder)
     except OSError as failure:
         raise DriveError(
@@ -177,6 +177,18 @@ def new_entry(folder: Path) -> Iterator[Path]:
         ) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _fill(folder: Path, new: Path) -> None:
+    """Move what is in ``new`` into a folder of somebody's files, which stay; the list comes last."""
+    for path in sorted(new.rglob("*"), key=lambda path: (path.name == LIST, path)):
+        place = folder / path.relative_to(new)
+        if path.is_dir():
+            if place.is_symlink():  # what it leads to is not ours
+                place.unlink()
+            place.mkdir(exist_ok=True)
+        else:
+            path.replace(place)
 
 
 def is_stale(folder: Path) -> bool:

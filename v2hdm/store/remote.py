@@ -18,7 +18,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.extras import need
@@ -38,7 +37,6 @@ _PACKAGES = {
 }  # fmt: skip
 """Protocols of stores that replace an object at once, and the package that speaks each."""
 
-_NOTHING = ".v2hdm-nothing"  # a prefix that nobody writes to: cheap to list
 _AT_ONCE = 32  # objects of one call, downloaded side by side
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
 _MESSAGE_LETTERS = 200
@@ -53,18 +51,8 @@ def is_url(place: str) -> bool:
 
 
 def place_of(text: str, option: str) -> Path | RemoteFolder:
-    """The folder or the store that the setting ``option`` names; ``file://`` names a folder.
-
-    Raises ConfigError where it is no place that we can write to.
-    """
-    if not is_url(text):
-        return Path(text)
-    protocol, rest = text.split("://", 1)
-    if protocol != "file":
-        return RemoteFolder.at(text, option)
-    if not rest.startswith("/"):
-        raise ConfigError(f"{option} {text}: a folder is named as in file:///data/results")
-    return Path(unquote(rest))
+    """The folder or the store that the setting ``option`` names; raises ConfigError as a store does."""
+    return RemoteFolder.at(text, option) if is_url(text) else Path(text)
 
 
 @dataclass(frozen=True)
@@ -114,12 +102,6 @@ class RemoteFolder:
 
     def __str__(self) -> str:
         return self.url
-
-    def check(self) -> None:
-        """Ask once, so that what is wrong is reported before any work: as :meth:`listed`."""
-        with self._asked(in_bucket=True):
-            self._files.invalidate_cache()
-            self._files.find(f"{self._root}/{_NOTHING}", detail=True)
 
     def below(self, name: str) -> RemoteFolder:
         """The objects whose names begin with ``name`` and a slash."""

@@ -196,9 +196,10 @@ def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iter
                     raise ConfigError(
                         f"{folder / name}: was changed after we wrote it: move it, or give another {option}"
                     )
-            unfinished.mkdir()
-            _write_list(unfinished, made)
         try:
+            with there.explained():
+                unfinished.mkdir()
+                _write_list(unfinished, made)
             with there.explained(_FULL):
                 yield unfinished
             with there.explained():

@@ -227,7 +227,7 @@ SPOILS: Mapping[str, Spoil] = {
         Spoil("lever", _LEVER, partial(_lever, 1.2, 0.0), _LEVER),
         Spoil("lever left", _LEVER, partial(_lever, 0.0, 0.3), _LEVER),
         Spoil("focal length", r"focal", partial(_lens, 0.02, 0.0)),
-        Spoil("principal point", r"principal", partial(_lens, 0.0, 20.0)),
+        Spoil("principal point", r"principal", partial(_lens, 0.0, 20.0), r"principal"),
     )
 }
 """All faults by their names."""

@@ -60,6 +60,20 @@ def test_the_map_is_drawn_and_fits_its_window(browser, report, width, height, sc
         is_quiet(watched)
 
 
+RIGHT_ENDS = """() => {
+    for (const one of document.querySelectorAll("details")) one.open = true;
+    return [...document.querySelectorAll(".findings td:last-child, .chart svg")]
+        .map((one) => one.getBoundingClientRect().right);
+}"""
+
+
+def test_a_phone_shows_findings_and_charts_to_their_right_ends(browser, report):
+    with opened(browser, report, 390, 844) as watched:
+        ends = watched.page.evaluate(RIGHT_ENDS)
+        assert len(ends) > 5
+        assert max(ends) <= 390
+
+
 def test_every_layer_changes_the_picture_when_it_is_switched(browser, report):
     with opened(browser, report) as watched:
         page = watched.page

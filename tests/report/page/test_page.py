@@ -106,7 +106,7 @@ def test_key_figures_and_tables_state_what_the_files_do(page):
     assert mounting["centre forward"][2] == "+100 mm"
     assert mounting["pitch, down"][:2] == ["14.324°", "0.006°"]
     assert mounting["clock, images later"][:2] == ["1.0 ms", "0.5 ms"]
-    assert page.summary == "4 markings, 1 lane line and 1 symbol, mapped along 3 m with 1 camera (front)."
+    assert page.summary == "4 markings, 1 lane line and 1 symbol, mapped along 3\u00a0m with 1 camera (front)."
     assert len(page.residuals) == 4
 
 
@@ -235,13 +235,34 @@ def write_tif(path, centre, dtype="uint8", count=3, crs="EPSG:32632"):
         dataset.write(pixels)
 
 
-@pytest.mark.parametrize(("dtype", "count"), [("uint8", 3), ("uint16", 1)])
+def write_tiles(folder, centre):
+    """The tiles of :func:`write_tif` in colour, as GDAL cuts them in Web Mercator at some 15 cm a pixel."""
+    rasterio, warp, vrt = (pytest.importorskip(f"rasterio{part}") for part in ("", ".warp", ".vrt"))
+    write_tif(folder / "aerial.tif", centre)
+    zoom, half = 20, 20037508.342789244
+    side = 2 * half / 2**zoom
+    with rasterio.open(folder / "aerial.tif") as source:
+        box = warp.transform_bounds(source.crs, "EPSG:3857", *source.bounds)
+        for x in range(int((box[0] + half) // side), int((box[2] + half) // side) + 1):
+            for y in range(int((half - box[3]) // side), int((half - box[1]) // side) + 1):
+                place = rasterio.Affine(side / 256, 0, x * side - half, 0, -side / 256, half - y * side)
+                with vrt.WarpedVRT(source, crs="EPSG:3857", transform=place, width=256, height=256) as cut:
+                    path = folder / "tiles" / str(zoom) / str(x) / f"{y}.png"
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    cv2.imwrite(str(path), np.moveaxis(cut.read(), 0, 2))
+    return folder / "tiles"
+
+
+@pytest.mark.parametrize(
+    ("dtype", "count"), [("uint8", 3), ("uint16", 1), ("uint8", 4), ("tiles", 3)], ids=str
+)
 def test_a_picture_of_the_users_own_lies_under_the_map_where_it_belongs(result, tmp_path, dtype, count):
-    write_tif(tmp_path / "aerial.tif", in_grid(8.0, -3.0), dtype, count)
+    if dtype == "tiles":
+        path = write_tiles(tmp_path, in_grid(8.0, -3.0))
+    else:
+        write_tif(path := tmp_path / "aerial.tif", in_grid(8.0, -3.0), dtype, count)
     facts = read_facts(result, None)
-    shown = background_layer(
-        tmp_path / "aerial.tif", replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
-    )
+    shown = background_layer(path, replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG)))
     pixels = cv2.imdecode(np.frombuffer(base64.b64decode(shown["src"]), np.uint8), cv2.IMREAD_COLOR)
     west, south, east, north = shown["bounds"]
     row, column = np.argwhere(pixels[..., 1] > 200).mean(axis=0) + 0.5
@@ -258,7 +279,7 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
     for name, of, told in (
         ("elsewhere", placed, "none of this map's ground"),
-        ("none", placed, "no GeoTIFF"),
+        ("none", placed, "neither a GeoTIFF"),
         ("nowhere", placed, "no coordinate system"),
         ("aerial", facts, "no place on the earth"),
     ):
@@ -284,13 +305,7 @@ def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypat
     random = np.random.default_rng(0).integers(0, 255, (600, 800, 4), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "result" / "mosaic.webp"), random)
     cv2.imwrite(str(tmp_path / "result" / "mosaic_before_after.png"), random[..., :3])
-    sharpness = {
-        "edges": 9,
-        "edge_width_before_m": 0.06,
-        "edge_width_after_m": 0.02,
-        "after_over_before": 3.0,
-    }
-    told = {"image": "mosaic.webp", "bounds_m": [-1.0, -4.0, 15.0, 8.0], "sharpness": sharpness}
+    told = {"image": "mosaic.webp", "bounds_m": [-1.0, -4.0, 15.0, 8.0]}
     write_json(tmp_path / "result" / "mosaic.json", told)
     monkeypatch.setattr(ground, "LARGEST_BYTES", 60_000)
     page = document(read_facts(tmp_path / "result", drive))
@@ -299,7 +314,7 @@ def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypat
     assert len(layer["src"]) <= 60_000
     shown = cv2.imdecode(np.frombuffer(base64.b64decode(layer["src"]), np.uint8), cv2.IMREAD_UNCHANGED)
     assert shown.shape[1] / shown.shape[0] == pytest.approx(800 / 600, rel=0.02)
-    assert "6.0 cm wide before and 2.0 cm after: 3.0 times as sharp" in page.ground.caption
+    assert page.ground
     (tmp_path / "result" / "mosaic.webp").unlink()
     with pytest.raises(MapFileError, match=r"mosaic\.webp: no picture"):
         document(read_facts(tmp_path / "result", drive))

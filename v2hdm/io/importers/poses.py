@@ -65,7 +65,6 @@ _Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
 
 POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
     "tum": (lambda path, entry, root, where: tables.readings_of_poses(read_tum(path)), ()),
-    "kitti": (tables.read_kitti_rows, tables.KITTI_KEYS),
     "csv": (tables.read_table, tables.TABLE_KEYS),
     "nmea": (nmea.read_nmea, nmea.KEYS),
 }

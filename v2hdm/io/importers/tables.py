@@ -1,8 +1,7 @@
-"""Readings of a pose file or topic, before frames, antenna and noise; from KITTI's rows and from CSV files.
+"""Readings of a pose file or topic, before frames, antenna and noise; from CSV files.
 
-KITTI's odometry benchmark writes twelve numbers per row, with a file of times beside it. The columns of a CSV
-file say by their names what they hold and in which unit; ``columns`` in ``drive.yaml`` translates their
-names.
+Their columns say by their names what they hold and in which unit; ``columns`` in ``drive.yaml`` translates
+these names.
 """
 
 from __future__ import annotations
@@ -17,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError, one_line
-from v2hdm.geometry.mounting import LEVEL
-from v2hdm.geometry.rigid import make_transform, rotation_from_euler
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import FloatArray, Trajectory
-from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
+from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
 
-KITTI_KEYS, TABLE_KEYS = ("stamps", "axes"), ("columns",)
+TABLE_KEYS = ("columns",)
 
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
@@ -72,10 +70,6 @@ class Readings:
     antenna: bool = field(default=False)
 
 
-_UPRIGHT = 0.5  # least cosine between the poses' z axis and up for poses of a ground vehicle
-_ROTATION_TOLERANCE = 1e-3
-
-
 def readings_of_poses(poses: Trajectory) -> Readings:
     """Poses in the map, whose sigmas nobody has stated, as readings."""
     unknown = np.full(len(poses.stamp_s), np.nan)
@@ -83,54 +77,18 @@ def readings_of_poses(poses: Trajectory) -> Readings:
     return Readings(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], False, unknown, attitudes)
 
 
-def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    """Read rows of 3 x 4 matrices.
-
-    ``axes: camera`` are those of the benchmark, x right, y down, z forward, in the map as on the vehicle;
-    ``axes: vehicle`` x forward, y left, z up.
-    """
-    if "stamps" not in entry:
-        raise DriveError(f"{where}: KITTI's rows have no times: add stamps, a file with one time in s a line")
-    axes = take_choice(entry.get("axes", "vehicle"), ("vehicle", "camera"), f"{where}, axes", DriveError)
-    poses = _numbers(path, 12).reshape(-1, 3, 4)
-    stamps = root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
-    stamp_s = read_stamps(stamps, len(poses), f"poses of {path}")
-    rotation, points = poses[:, :, :3], poses[:, :, 3]
-    wrong = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
-    if wrong.any():
-        raise DriveError(f"{path}: line {int(np.argmax(wrong)) + 1}: its 3 x 3 part is no rotation; mend it")
-    if axes == "camera":
-        rotation, points = LEVEL @ rotation @ LEVEL.T, points @ LEVEL.T
-    elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
-        raise DriveError(f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's")
-    rows = in_order(stamp_s, str(path))
-    return readings_of_poses(Trajectory(stamp_s[rows], make_transform(rotation[rows], points[rows])))
-
-
 def read_stamps(path: Path, count: int, things: str) -> FloatArray:
     """Times (``count``,) in s, one per line; raises DriveError where there are not as many as ``things``."""
-    stamp_s = _numbers(path, 1)[:, 0]
+    stamp_s = np.array(
+        [
+            parse_number(line, f"{path}: line {number}")
+            for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
+    )
     if len(stamp_s) != count:
         raise DriveError(f"{path}: {len(stamp_s)} times of {count} {things}; give one of each")
     return stamp_s
-
-
-def _numbers(path: Path, columns: int) -> FloatArray:
-    rows = []
-    for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        try:
-            row = [float(part) for part in line.replace(",", " ").split()]
-        except ValueError:
-            row = []
-        if len(row) != columns or not np.isfinite(row).all():
-            problem = f"expected {columns} finite numbers, got '{line[:60]}'"
-            raise DriveError(f"{path}: line {number}: {problem}; mend it")
-        rows.append(row)
-    if not rows:
-        raise DriveError(f"{path}: holds no numbers; expected {columns} a line")
-    return np.array(rows)
 
 
 _STAMPS: Mapping[str, float] = {f"stamp_{unit}": scale for unit, scale in UNITS.items()}

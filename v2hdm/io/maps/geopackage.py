@@ -8,11 +8,14 @@ they are local metres in an engineering CRS, which no GIS takes for degrees.
 
 from __future__ import annotations
 
+import filecmp
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from textwrap import shorten
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -52,6 +55,8 @@ type="Map">{}</Option>
 </layer></symbol>"""
 _OPTION = '<Option type="QString" name="{}" value="{}"/>'
 
+_MESSAGE_LETTERS = 200  # of an error of GDAL's, which may hold whole statements
+
 AnyArray = NDArray[Any]
 
 
@@ -73,33 +78,50 @@ def write_geopackage(
     if grid is not None:
         about["crs"] = grid.crs
         crs = LOCAL_CRS if grid.is_local else grid.crs
-    styles = []
-    with whole_file(path) as partial:
-        # GDAL recognises the format of a file by its ending.
-        unfinished = partial.with_name(f"{partial.name}.gpkg")
+    now = np.datetime64("now", "ms")
 
-        def write(
-            layer: str, columns: Mapping[str, Any], shapes: AnyArray | None = None, **options: Any
-        ) -> None:
-            values = [np.array(v, dtype=object) if isinstance(v, list) else v for v in columns.values()]
-            raw.write(str(unfinished), shapes, values, list(columns), layer=layer, driver="GPKG", **options)
+    def write(
+        place: Path, layer: str, columns: Mapping[str, Any], shapes: AnyArray | None = None, **options: Any
+    ) -> None:
+        values = [np.array(v, dtype=object) if isinstance(v, list) else v for v in columns.values()]
+        raw.write(str(place), shapes, values, list(columns), layer=layer, driver="GPKG", **options)
 
-        try:
-            with _gdal_errors(path):
-                for key, layer in LAYERS.items():
-                    mine = [feature for feature in features if feature.key == key]
-                    kind = "LineString Z" if key == POINTS else "Polygon Z"
-                    shapes = _shapes(mine, grid or hd_map.origin)
-                    write(layer, _columns(key, mine), shapes, geometry_type=kind, crs=crs)
-                    styles.append(_style_row(layer, sorted({one.kind for one in mine}), key != POINTS))
-                write("v2hdm", {key: [json.dumps(value)] for key, value in about.items()})
-                # The table in which QGIS looks for the style of a GeoPackage's layers.
-                texts = {name: [row[name] for row in styles] for name in styles[0]}
-                now, default = np.full(len(styles), np.datetime64("now", "ms")), np.ones(len(styles), bool)
-                write("layer_styles", texts | {"useAsDefault": default, "update_time": now}, FID="id")
-                unfinished.replace(partial)
-        finally:
-            unfinished.unlink(missing_ok=True)
+    def write_all(place: Path) -> None:
+        styles = []
+        for key, layer in LAYERS.items():
+            mine = [feature for feature in features if feature.key == key]
+            kind = "LineString Z" if key == POINTS else "Polygon Z"
+            shapes = _shapes(mine, grid or hd_map.origin)
+            write(place, layer, _columns(key, mine), shapes, geometry_type=kind, crs=crs)
+            styles.append(_style_row(layer, sorted({one.kind for one in mine}), key != POINTS))
+        write(place, "v2hdm", {key: [json.dumps(value)] for key, value in about.items()})
+        # The table in which QGIS looks for the style of a GeoPackage's layers.
+        texts = {name: [row[name] for row in styles] for name in styles[0]}
+        rest = {"useAsDefault": np.ones(len(styles), bool), "update_time": np.full(len(styles), now)}
+        write(place, "layer_styles", texts | rest, FID="id")
+
+    with whole_file(path) as partial, TemporaryDirectory(".part", f".{path.name}.", path.parent) as folder:
+        # GDAL goes on after some calls that fail: only two files that are alike are whole.
+        first, second = (Path(folder, name) for name in ("first.gpkg", "second.gpkg"))
+        with _gdal_errors(path), _gdal_options(now):
+            for place in (first, second):
+                write_all(place)
+        if not filecmp.cmp(first, second, shallow=False):
+            raise MapFileError(f"{path}: cannot be written (the disk failed meanwhile); set another folder")
+        first.replace(partial)
+
+
+@contextmanager
+def _gdal_options(now: np.datetime64) -> Iterator[None]:
+    """Within, GDAL's GeoPackages are of this date, and made without what would undo a failure."""
+    gdal = need("pyogrio", "gis", "the format gpkg", ConfigError)
+    options = {"OGR_CURRENT_DATE": f"{now}Z", "OGR_SQLITE_JOURNAL": "OFF", "OGR_SQLITE_SYNCHRONOUS": "OFF"}
+    before = {name: gdal.get_gdal_config_option(name) for name in options}
+    gdal.set_gdal_config_options(options)
+    try:
+        yield
+    finally:
+        gdal.set_gdal_config_options(before)
 
 
 @contextmanager
@@ -108,7 +130,7 @@ def _gdal_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-        first = str(failure).splitlines()[0]
+        first = shorten(str(failure).splitlines()[0], _MESSAGE_LETTERS)
         raise MapFileError(f"{path}: cannot be written ({first}); set another folder") from None
 
 

@@ -27,6 +27,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
 CELLS = (9, 16)  # rows and columns that an image is divided into for the mean residual of each
+_SINGLE_IN = 5.0  # width of a chart alone in its row: its words can be read on a phone
 _LEAST_IN_CELL = 10  # observations from which a mean is drawn: its error is a third of one's
 
 _RC: dict[Any, Any] = RC | {
@@ -149,7 +150,7 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
     names = residuals.cameras
     fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
     longest = max([float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)] or [0.1])
-    panel_in, charts = 7.2 if len(names) == 1 else 3.5, ""
+    panel_in, charts = _SINGLE_IN if len(names) == 1 else 3.5, ""
     for number, name in enumerate(names):
         width_px, height_px = sizes[name]
         with _chart(f"field {name}", panel_in, 0.84 * panel_in * height_px / width_px + 0.75) as (
@@ -161,7 +162,8 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
             span, colour = 1.5 * width_px / CELLS[1], OKABE_ITO[_ORDER[number % len(_ORDER)]]
             draw_arrows(axes, *fields[number], longest, span, color=colour, width=0.005, headwidth=3.6)
             set_image_axes(axes, 0, width_px, height_px, 0)
-            axes.set(aspect="equal", title=name)
+            axes.set_aspect("equal")
+            axes.set_title(name, pad=14)  # room for the key of the arrows, which the layout overlooks
             for side in ("top", "right"):
                 axes.spines[side].set_visible(True)
         charts += out[0]
@@ -221,7 +223,7 @@ def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[F
 def _route_chart(route: Route, residuals: GroundResiduals) -> str:
     """Along the way: the residuals, and what was taken off the recorded poses."""
     rows = 1 if route.recorded is None else 2
-    with _chart("route", 7.2, 1.9 * rows + 0.3) as (figure, out):
+    with _chart("route", _SINGLE_IN, 1.7 * rows + 0.3) as (figure, out):
         panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
         way_m, fit = route.way_m, panels[0]
         total = max(float(way_m[-1]), 1.0)
@@ -253,7 +255,7 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
 
 def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
     """How many corners are known how well: shares of corners by the 95 % ellipse's larger half axis."""
-    with _chart("ellipse", 7.2, 2.3) as (figure, out):
+    with _chart("ellipse", _SINGLE_IN, 2.2) as (figure, out):
         axes = figure.subplots()
         top = max((float(values.max(initial=0.0)) for values in semi_axes_cm.values()), default=1.0)
         for number, (name, values) in enumerate(semi_axes_cm.items()):

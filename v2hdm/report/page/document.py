@@ -16,7 +16,7 @@ import numpy as np
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
-from v2hdm.report.page.layers import background_layer, ground_page, layers
+from v2hdm.report.page.layers import background_layer, comparison, layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.tables import in_words
 from v2hdm.store.files import replace_text
@@ -49,7 +49,7 @@ def document(facts: Facts) -> SimpleNamespace:
         pictures=pictures(facts),
         suspicious=_suspicious(facts),
         cameras=tables.camera_pages(facts, overlays(facts)),
-        ground=ground_page(facts.folder),
+        ground=comparison(facts.folder),
         residuals=charts.residual_charts(facts, residuals) if residuals else {},
         excluded=tables.reason_table(facts),
         contents=tables.content_table(facts),
@@ -69,7 +69,7 @@ def _summary(facts: Facts) -> str:
         words.append(in_words(len(hd_map.symbols), "symbol"))
     sentence = f"{', '.join(words[:-1])} and {words[-1]}"
     if facts.route is not None:
-        sentence += f", mapped along {facts.route.way_m[-1]:.0f} m"
+        sentence += f", mapped along {facts.route.way_m[-1]:.0f}\u00a0m"
     if facts.cameras:
         sentence += f" with {in_words(len(facts.cameras), 'camera')} ({', '.join(facts.cameras)})"
     return f"{sentence}."
@@ -104,8 +104,8 @@ def write_page(folder: Path, drive: Drive | None, background: Path | None = None
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
     ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand: the
-    pictures are then those of the report that is there. ``background`` is a GeoTIFF under the map; None keeps
-    that of the report that is there.
+    pictures are then those of the report that is there. ``background`` is a GeoTIFF or a folder of XYZ tiles
+    under the map; None keeps that of the report that is there.
 
     Raises MapFileError where the folder is no result, or a file in it or the background is damaged,
     DriveError where an image or the truth of the drive is damaged.

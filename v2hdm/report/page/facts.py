@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from v2hdm.association.surface import FILE as GROUND
+from v2hdm.association.surface import Surface
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.planar import length_along
@@ -45,6 +47,10 @@ class Route:
         """How far the vehicle has driven (F,), m."""
         return length_along(self.map_from_vehicle[:, :2, 3])
 
+    def frames_of(self, residuals: Residuals) -> IntArray:
+        """The pose (I,) of each of the images."""
+        return np.searchsorted((self.stamp_s[1:] + self.stamp_s[:-1]) / 2, residuals.taken_s)
+
 
 @dataclass(frozen=True)
 class CameraFacts:
@@ -62,7 +68,8 @@ class Facts:
     """A result folder, read; what is not in it is None or empty.
 
     ``excluded`` are the candidates that the map of all cameras left out, ``check_points`` the rows of
-    ``check_points.csv`` by its columns; ``truth`` is there if the drive was rendered.
+    ``check_points.csv`` by its columns; ``truth`` is there if the drive was rendered. ``surface`` is the
+    ground under the poses of ``route``, None where it is a plane.
     """
 
     folder: Path
@@ -72,6 +79,7 @@ class Facts:
     excluded: tuple[ExcludedMarking, ...]
     cameras: Mapping[str, CameraFacts]
     route: Route | None
+    surface: Surface | None
     residuals: Residuals | None
     check_points: tuple[Mapping[str, str], ...]
     drive: Drive | None
@@ -103,6 +111,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
     excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
     features = features_of(hd_map) if hd_map else []
     residuals, config = folder / RESIDUALS, folder / "config.yaml"
+    route = _route(folder, drive)
     heading, *checked = _table(folder / "check_points.csv") or ((),)
     return Facts(
         folder=folder,
@@ -111,7 +120,8 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         hd_map=map_of(features, [one.id for one in features], hd_map.origin) if hd_map else None,
         excluded=tuple(one for one in excluded if not sets or one.cameras == sets[-1]),
         cameras=read_cameras(folder),
-        route=_route(folder, drive),
+        route=route,
+        surface=None if route is None else read_surface(folder, route.flat),
         residuals=read_residuals(residuals) if residuals.is_file() else None,
         check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked),
         drive=drive,
@@ -155,6 +165,20 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
     elif drive is not None and drive.recorded is not None:
         recorded = interpolate(drive.recorded, stamp_s, float("inf"))[0]
     return Route(stamp_s, poses, recorded, moved, table[:, 2:], table[:, 1] > 0)
+
+
+def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
+    """The ground of a result folder under vehicles at poses (F, 4, 4), None where it is a plane.
+
+    Raises MapFileError where its file is damaged.
+    """
+    path = folder / GROUND
+    if not path.is_file():
+        return None
+    try:
+        return Surface.from_stored(load_json(path, MapFileError), map_from_vehicle)
+    except ValueError as damage:
+        raise MapFileError(f"{path}: {damage}; map the drive again") from None
 
 
 def _table(path: Path) -> tuple[tuple[str, ...], ...]:
@@ -231,7 +255,7 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
 
 def cams_from_map(residuals: Residuals, route: Route, calibrations: Mapping[str, Calibration]) -> FloatArray:
     """Where each image (I, 4, 4) was taken from, by the adjusted poses; nan for cameras not calibrated."""
-    nearest = np.searchsorted((route.stamp_s[1:] + route.stamp_s[:-1]) / 2, residuals.taken_s)
+    nearest = route.frames_of(residuals)
     out = np.full((len(residuals.image), 4, 4), np.nan)
     for i, name in enumerate(residuals.camera):
         if name in calibrations:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
@@ -12,10 +13,11 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
+from v2hdm.io.safe.pixels import read_header
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
-from v2hdm.store.files import load_json, take_array, take_mapping, take_text
+from v2hdm.store.files import load_json, take_array, take_text
 
 
 def jpeg(pixels: np.ndarray, quality: int) -> str:
@@ -39,13 +41,6 @@ EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 LARGEST_BYTES = 3_500_000  # budget of the mosaic, as text in the page
 _QUALITY = 72
 _COMPARISON_WIDTH_PX = 1400
-
-
-class GroundPage(NamedTuple):
-    """The same ground before and after the optimisation (JPEG in base64), and what to see in it."""
-
-    picture: str
-    caption: str
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
@@ -77,12 +72,30 @@ def _webp(pixels: np.ndarray) -> str:
 
 _BACKGROUND_PX = 3000  # longer side of the background: at most 20 cm a pixel over 600 m
 _FINEST_M = 0.05
+_HALF_WORLD_M = 20037508.342789244  # half a side of Web Mercator's square
+_TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{ending}</ServerUrl></Service>
+<DataWindow><UpperLeftX>-{half}</UpperLeftX><UpperLeftY>{half}</UpperLeftY><LowerRightX>{half}</LowerRightX>
+<LowerRightY>-{half}</LowerRightY><TileLevel>{finest}</TileLevel><TileCountX>1</TileCountX>
+<TileCountY>1</TileCountY><YOrigin>top</YOrigin></DataWindow><Projection>EPSG:3857</Projection>
+<BlockSizeX>{px}</BlockSizeX><BlockSizeY>{px}</BlockSizeY><BandsCount>4</BandsCount>
+<OverviewCount>{coarser}</OverviewCount></GDAL_WMS>"""  # GDAL's description of tiles, here of a folder
+
+
+def _source(path: Path) -> dict[str, Any]:
+    """What rasterio is to open: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
+    levels = sorted(int(one.name) for one in path.glob("*") if one.name.isdecimal())
+    tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
+    if tile is None:
+        return {"fp": path, "driver": "GTiff"}
+    told = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
+    told |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
+    return {"fp": _TILES.format(**told), "driver": "WMS"}
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
-    """A GeoTIFF of the user's own in the map's frame, as :func:`mosaic_layer` gives one.
+    """A GeoTIFF or XYZ tiles of the user's own in the map's frame, as :func:`mosaic_layer` gives one.
 
-    Raises MapFileError where it cannot be read or laid under the map.
+    Raises MapFileError where they cannot be read or laid under the map, DriveError where a tile is damaged.
     """
     rasterio, warped = (
         need(name, "gis", "a background", MapFileError) for name in ("rasterio", "rasterio.vrt")
@@ -97,15 +110,16 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
     frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
     try:
-        with rasterio.open(path, driver="GTiff") as source:
+        with rasterio.open(**_source(path)) as source:
             if source.crs is None:
                 raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
             bilinear = rasterio.enums.Resampling.bilinear
-            with warped.WarpedVRT(source, **frame, **size, resampling=bilinear, add_alpha=True) as there:
+            frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
+            with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as there:
                 bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
                 seen = there.dataset_mask()
     except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
-        raise MapFileError(f"{path}: no GeoTIFF that can be read ({failure})") from None
+        raise MapFileError(f"{path}: neither a GeoTIFF nor XYZ tiles that can be read ({failure})") from None
     if not seen.any():
         raise MapFileError(f"{path}: shows none of this map's ground; give a picture of its site")
     if bands.dtype != np.uint8:
@@ -126,25 +140,13 @@ def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
     return both.min(axis=0) - 50.0, both.max(axis=0) + 50.0
 
 
-def ground_page(folder: Path) -> GroundPage | None:
-    """The comparison, with its sharpness; None where the folder has none."""
+def comparison(folder: Path) -> str | None:
+    """The same ground before and after the optimisation, JPEG in base64; None where the folder has none."""
     path = folder / COMPARISON
     pixels = cv2.imread(str(path)) if path.is_file() else None
-    if pixels is None:
-        return None
-    shown = shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1]))
-    caption = "All images laid on the ground, by the initial and by the optimised calibration and poses."
-    extent = folder / EXTENT
-    content = load_json(extent, MapFileError) if extent.is_file() else {}
-    sharpness = take_mapping(content.get("sharpness", {}), f"{extent}: sharpness", MapFileError)
-    if sharpness.get("edges"):
-        before, after = (100 * float(sharpness[f"edge_width_{one}_m"]) for one in ("before", "after"))
-        caption += (
-            f" Paint edges are {before:.1f} cm wide before and {after:.1f} cm after: "
-            f"{float(sharpness['after_over_before']):.1f} times as sharp "
-            f"(median of {sharpness['edges']} sides)."
-        )
-    return GroundPage(jpeg(shown, 84), caption)
+    return (
+        None if pixels is None else jpeg(shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1])), 84)
+    )
 
 
 SIGMAS_95 = 2.4477

@@ -136,7 +136,11 @@ def _cut_out(
 ) -> dict[str, Any] | None:
     """The piece of an image around a feature, no larger than it needs to be; None where it shows nothing."""
     info = facts.cameras[image.camera].calibration.info
-    px, depth_m = project_ground(info.intrinsic, cam_from_map, cut.shape_map)
+    shape_map = cut.shape_map
+    if facts.surface is not None and facts.residuals is not None and facts.route is not None:
+        frame = int(facts.route.frames_of(facts.residuals)[cut.row])
+        shape_map = facts.surface.on_plane(shape_map, cam_from_map, frame)
+    px, depth_m = project_ground(info.intrinsic, cam_from_map, shape_map)
     if not (depth_m > 0).all():
         return None
     shape_px = distort_points(info, px)

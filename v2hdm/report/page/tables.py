@@ -62,7 +62,7 @@ def in_words(count: int, what: str) -> str:
 
 def pair_table(content: Mapping[str, Any]) -> Table | None:
     """Names and values as they stand in ``metrics.json``."""
-    rows = [[name_of(str(key)), _plain(value)] for key, value in content.items()]
+    rows = [[name_of(str(key)), _plain(value)] for key, value in content.items() if value is not None]
     return table(("", ""), rows, words=2) if rows else None
 
 

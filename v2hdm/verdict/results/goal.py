@@ -16,6 +16,7 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, FloatArray, Marking
 from v2hdm.site.markings import LACKS_A_CORNER, TOO_UNCERTAIN
+from v2hdm.verdict.results.solution import relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status
 
 _AHEAD_M = 10.0  # within which a vehicle uses what it sees on the ground
@@ -34,6 +35,9 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         reached_m = _radius_of_all_m(radius_m.ravel())
         corners = f"95 % of the corners of {len(markings)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
+        relied = [] if best.evidence is None else relied_on(best.evidence)
+        if relied:
+            says += f", if {' and '.join(relied)} are right, which this drive does not show"
         relative_m = [_CIRCLE_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
         if relative_m:
             says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"

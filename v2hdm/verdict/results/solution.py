@@ -18,11 +18,13 @@ from v2hdm.adjust import Fault
 from v2hdm.adjust.bench import STRETCHES
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.recovery import (
+    CLEAR_SIGMAS,
     CLOCK_OBSERVABLE_S,
-    CONTRADICTED_SIGMAS,
     OBSERVABLE_SIGMA,
+    doubt,
+    even_sigmas,
     is_contradicted,
-    is_likely,
+    is_doubtful,
     is_physical,
     log_odds,
     matters,
@@ -53,7 +55,7 @@ _VARIANCE_LIMIT = 3.0
 # Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
 _POSE_NOISE_LIMIT = 3.0
 # Log odds from which a cause is named that no score test looks for.
-_ODDS_LIMIT = CONTRADICTED_SIGMAS**2 / 2
+_ODDS_LIMIT = CLEAR_SIGMAS**2 / 2
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
 _LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
@@ -183,7 +185,8 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
     least = max(causes.values(), default=0.0) - _RIVAL_LOG_ODDS
     named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
-    named = named or [_likely(one) for one in evidence.score_tests if is_likely(one)][:1]
+    doubtful = sorted(filter(is_doubtful, evidence.score_tests), key=doubt, reverse=True)
+    named = named or [_doubtful(one) for one in doubtful[:1]]
     findings += named if foreign in causes else [*named, foreign]
     findings += [stamps] if stamps.status is Status.WARN else []
     raised |= {one.check for one in named}
@@ -234,7 +237,7 @@ def _unknown(one: Contradiction) -> Finding:
         "the markings contradict the inputs, and no wrong input of a plausible size explains them: compare "
         "images and poses, in time and in place"
     )
-    return Finding("cause unknown", Status.FAIL, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, "map")
+    return Finding("cause unknown", Status.FAIL, one.sigmas, even_sigmas(one), "sigmas", says, "map")
 
 
 def _contradicted(still: list[Contradiction]) -> Finding:
@@ -244,14 +247,14 @@ def _contradicted(still: list[Contradiction]) -> Finding:
     return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
 
 
-def _likely(one: Contradiction) -> Finding:
+def _doubtful(one: Contradiction) -> Finding:
     says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {_CHECKS[one.fault][1]}"
     return _input(one, Status.WARN, says)
 
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
     check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
-    return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
+    return Finding(check, status, one.sigmas, even_sigmas(one), "sigmas", says, about)
 
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
@@ -282,19 +285,32 @@ def _sigma(one: Contradiction) -> float:
 def _least_shown(one: Contradiction) -> str:
     """The size from which on a drive shows an error, with its unit."""
     scale, unit = _SHOWN[one.fault.unit]
-    return f"{CONTRADICTED_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
+    return f"{CLEAR_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
+
+
+def relied_on(evidence: SolveEvidence) -> list[str]:
+    """The inputs that would move the whole map if they erred in all cameras alike, unseen by this drive."""
+    loose = {"the clocks": _loosest_clock_s(evidence) > CLOCK_OBSERVABLE_S}
+    loose["the surveyed centres"] = bool(_loose_levers(evidence))
+    return [name for name, is_loose in loose.items() if is_loose]
+
+
+def _loosest_clock_s(evidence: SolveEvidence) -> float:
+    return max((one.sigma for one in _of_all(evidence, Fault.CLOCK, Fault.CLOCK)), default=0.0)
+
+
+def _loose_levers(evidence: SolveEvidence) -> list[Contradiction]:
+    levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
+    return [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
 
 
 def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
     """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
-    clocks = _of_all(evidence, Fault.CLOCK, Fault.CLOCK)
-    loosest_s = max((one.sigma for one in clocks), default=0.0)
+    loosest_s, loose = _loosest_clock_s(evidence), _loose_levers(evidence)
     if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
         yield passed("clock", "all cameras", says)
-    levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    loose = [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
     if loose and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
         worst_m = max(one.sigma for one in loose)
