@@ -247,7 +247,7 @@ def find_blobs(
     level = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
     groups = _Groups(output.classes, catalogue)
-    cells, score, votes, sure = _class_scores(output, piece, level, len(contours), groups)
+    cells, score, votes = _class_scores(output, piece, level, len(contours), groups)
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
     blobs: list[Blob] = []
@@ -264,8 +264,7 @@ def find_blobs(
             blobs.append(replace(_blob(wholes[box] == label, raised, output, box), traced=False))
         box = _framed(*cv2.boundingRect(contours[index]))
         inside = piece[box] == index + 1
-        may_split = sure[index] > 1 or (votes[index] >= groups.least_share).sum() > 1
-        parts = _split(inside, level[box], output, box, groups, votes[index]) if may_split else []
+        parts = _split(inside, level[box], output, box, groups, votes[index])
         scores = dict(zip(output.classes, score[:, index].tolist(), strict=True))
         outline_px = _origin_px(output, 0, 0) + output.stride * outlines[index]
         signed, origin_px = _signed(inside, level[box]), _origin_px(output, box[0].start, box[1].start)
@@ -325,28 +324,20 @@ def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], n
 
 def _class_scores(
     output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int, groups: _Groups
-) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
-    """Sizes (B,) of pieces in cells, mean probability (K, B) of each class, votes (B, G) of groups.
-
-    The last are the numbers (B,) of parts of sure paint of which each piece consists.
-    """
+) -> tuple[np.ndarray, FloatArray, FloatArray]:
+    """Sizes (B,) of pieces in cells, mean probability (K, B) of each class, votes (B, G) of groups."""
     at = np.flatnonzero(piece > 0)
-    own = piece.take(at) - 1
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((level > _SURE).view(np.uint8), ltype=cv2.CV_16U)
-    of_part = np.zeros(len(stats), dtype=np.intp)
-    of_part[labels.take(at)] = own
-    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _MIN_CELLS) + 1
-    sure = np.bincount(of_part[large], minlength=count)
+    own = piece.ravel()[at] - 1
     cells = np.bincount(own, minlength=count)
     share = 1 / np.maximum(cells, 1)
-    certainty = np.bincount(own, as_probability(level.take(at)), count) * share
+    certainty = np.bincount(own, as_probability(level.ravel()[at]), count) * share
     i, j = np.divmod(at, piece.shape[1])
     probability = output.class_probability(i - 1, j - 1)
     score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
     several = len(groups.least_share)
     best = own * several + groups.of_class[probability.argmax(axis=0)]
     votes = np.bincount(best, minlength=count * several).reshape(count, several)
-    return cells, certainty * score, votes / np.maximum(cells, 1)[:, None], sure
+    return cells, certainty * score, votes / np.maximum(cells, 1)[:, None]
 
 
 def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
