@@ -23,7 +23,7 @@ def check_problem(problem: Problem) -> None:
     _check_finite(problem)
     _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
     _check_rigid("map_from_vehicle", problem.map_from_vehicle)
-    _check_observations(problem)
+    check_observations(problem)
     _check_priors(problem)
     _check_control(problem)
     _check_lengths(problem)
@@ -72,14 +72,6 @@ def _check_lengths(problem: Problem) -> None:
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
     """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
-    prior, clocks = problem.camera_prior, problem.visit_count * int(options.clock_offset)
-    each = 6 + clocks + int(options.read_out)
-    if prior is not None:
-        size = len(problem.intrinsic) * each
-        shapes = problem.cam_from_vehicle.shape, (len(problem.intrinsic), each), (size, size)
-        for (name, values), shape in zip(vars(prior).items(), shapes, strict=True):
-            if np.shape(values) != shape or not np.isfinite(values).all():
-                raise AdjustError(f"camera_prior.{name} must hold finite numbers in the shape {shape}")
     if options.clock_offset and problem.twist_vehicle is None:
         raise AdjustError("a clock offset needs twist_vehicle: say how the vehicle moves at each frame")
     if options.read_out or problem.read_out_s is not None:
@@ -173,36 +165,33 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
     _refuse((transforms[:, 3] != [0, 0, 0, 1]).any(1), said + "last row is not 0, 0, 0, 1")
 
 
-def _check_observations(problem: Problem) -> None:
-    seen, sizes = problem.observations, _sizes(problem)
-    sound = np.ones(len(seen.corner), dtype=bool)
-    for name, size in sizes.items():
-        index = getattr(seen, name)
-        sound &= (index >= 0) & (index < size)
-    intrinsic = problem.intrinsic[np.where(sound, seen.camera, 0)]
-    with np.errstate(invalid="ignore", over="ignore"):
-        (xx, xy), (yx, yy) = seen.covariance_px.astype(np.float64).transpose(1, 2, 0)
-        sound &= (xx > 0) & (xx * yy > yx**2) & (xx * yy < np.inf)
-        sound &= (xy - yx) ** 2 <= _SYMMETRIC_TO**2 * xx * yy
-        sound &= (np.abs((seen.pinhole_px - intrinsic[:, 2:]) / intrinsic[:, :2]) <= _MAX_SLOPE).all(1)
-    if not sound.all():
-        raise AdjustError(_fault(problem, int(sound.argmin())))
-    for name in ("corner", "camera"):
-        times = np.bincount(getattr(seen, name), minlength=sizes[name])
+def check_observations(problem: Problem) -> None:
+    """Raise :class:`AdjustError` for the first observation that cannot be solved with."""
+    from v2hdm.adjust.engines.numba.prepare import Seen, first_unsound  # loads numba
+
+    frames = len(problem.map_from_vehicle)
+    by_corner = np.zeros(problem.corner_count, dtype=np.int64)
+    by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
+    k = first_unsound(
+        Seen.of(problem.observations.columns, problem.intrinsic),
+        frames,
+        _SYMMETRIC_TO,
+        _MAX_SLOPE,
+        by_corner,
+        by_camera,
+    )
+    if k >= 0:
+        raise AdjustError(_fault(problem, k))
+    for name, times in (("corner", by_corner), ("camera", by_camera)):
         if not times.all():
             raise AdjustError(f"{name} {times.argmin()} has no observation: leave it out of the problem")
-
-
-def _sizes(problem: Problem) -> dict[str, int]:
-    """How many there are of each thing that an observation names."""
-    frames = len(problem.map_from_vehicle)
-    return {"camera": len(problem.intrinsic), "frame": frames, "corner": problem.corner_count}
 
 
 def _fault(problem: Problem, k: int) -> str:
     """The message for observation k, which is unsound."""
     seen = problem.observations
-    for name, size in _sizes(problem).items():
+    sizes = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
+    for name, size in zip(("camera", "frame", "corner"), sizes, strict=True):
         index = getattr(seen, name)[k]
         if not 0 <= index < size:
             return f"observation {k} names {name} {index}, but there are only {size}"
