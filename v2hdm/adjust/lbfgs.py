@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 from collections.abc import Callable
@@ -64,11 +65,11 @@ def minimise(
             last, cost more than that and the few steps from nearby, this one was made too far away.
     """
     scale = float(gradient.abs().sum())
-    u = torch.zeros_like(gradient, requires_grad=True)
+    u = torch.zeros_like(gradient)
     seen = _Evaluations(lambda point: objective(point * scale), torch.zeros_like(gradient), cost, gradient)
 
     def closure() -> float:
-        new_cost, new_gradient = seen.at(u.detach())
+        new_cost, new_gradient = seen.at(u)
         # An infinite cost is but a step too far, whatever its gradient.
         if math.isnan(new_cost) or not (math.isinf(new_cost) or bool(new_gradient.isfinite().all())):
             raise _NoNumberError
@@ -87,28 +88,30 @@ def minimise(
         history_size=_HISTORY,
         line_search_fn="strong_wolfe",
     )
+    # Without the hooks of profilers around it, which take as long.
+    step = inspect.unwrap(torch.optim.LBFGS.step)
     best, best_gradient = cost, gradient
     gap, slow = predicted_gap(best, best_gradient), False
     for iteration in range(max_iterations):
         if gap <= tolerance or slow:
             break
         try:
-            optimizer.step(closure)  # type: ignore[no-untyped-call]
-            reached, reached_gradient = seen.at(u.detach())
+            step(optimizer, closure)
+            reached, reached_gradient = seen.at(u)
         except _NoNumberError:
             reached = math.inf
         if not math.isfinite(reached):
             # A line search over a singular direction has run off; the point before it still stands.
-            u.data.copy_(seen.start)
+            u.copy_(seen.start)
             break
-        seen.begin_step(u.detach(), reached, reached_gradient)
+        seen.begin_step(u, reached, reached_gradient)
         progress = best - reached
         best, best_gradient = reached, reached_gradient
         if progress <= _NO_PROGRESS * best:
             break
         before, gap = gap, predicted_gap(best, best_gradient)
         slow = iteration > 0 and _steps_left(before, gap, tolerance) > renewal + _STEPS_FROM_NEARBY
-    return Minimum(u.detach() * scale, best, best_gradient, slow)
+    return Minimum(u * scale, best, best_gradient, slow)
 
 
 def _steps_left(before: float, gap: float, tolerance: float) -> float:

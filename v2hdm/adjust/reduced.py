@@ -242,7 +242,9 @@ class ReducedSystem:
         by_pair = self._own
         if self.arrays.camera_unknowns > 6:
             by_pair = self.spread.camera.mT @ by_pair @ self.spread.camera
-        tip = priors.camera + torch.block_diag(*by_pair.sum(1))  # type: ignore[no-untyped-call]
+        tip, each = priors.camera.clone(), self.arrays.camera_unknowns
+        for begin, own in zip(range(0, len(tip), each), by_pair.sum(1), strict=True):
+            tip[begin : begin + each, begin : begin + each] += own
         self.matrix.tiles[TIP, TIP].add_(tip)
         return torch.diagonal(tip)
 

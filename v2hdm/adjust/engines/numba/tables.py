@@ -11,6 +11,7 @@ forces and of their moments p x force. Extrinsics, frame states and clock offset
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,6 @@ from v2hdm.adjust.engines.numba.motion import compose
 from v2hdm.adjust.model import (
     Estimate,
     Gradient,
-    centre_residual,
     clock_residual,
     frame_tangent,
     moved,
@@ -68,7 +68,7 @@ def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
 
 def _half_square(residual: Tensor) -> float:
     flat = residual.flatten()
-    return float(flat @ flat) / 2
+    return float(flat @ flat) / 2 if len(flat) else 0.0
 
 
 def with_priors(
@@ -83,12 +83,13 @@ def with_priors(
         costs: (3,) of the observations, the survey and the known lengths.
         wrench: (C, M, 6) the observations' gradient by the pairs' left tangents.
     """
-    centre = centre_residual(arrays, estimate.cam_from_vehicle)
+    cameras, centre_root = estimate.cam_from_vehicle.numpy(), arrays.centre_information_root.numpy()
+    centre = (rigid.camera_centre(cameras) - arrays.centre.numpy()) * centre_root
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
     clock = clock_residual(arrays, estimate.clock_s) if arrays.camera_unknowns > 6 else estimate.clock_s
     terms = {
         "observations": float(costs[0]),
-        "camera_centre": _half_square(centre),
+        "camera_centre": float(np.vdot(centre, centre)) / 2,
         "frame_states": _half_square(state),
         "clock_offsets": _half_square(clock),
         "control_points": float(costs[1]),
@@ -98,8 +99,8 @@ def with_priors(
     by_corner = state.new_empty(0, 2)
     gradient = Gradient(gathered.camera[:, :6], gathered.frame_state, by_corner, gathered.camera[:, 6:])
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
-    rotation = estimate.cam_from_vehicle[:, :3, :3]
-    gradient.extrinsic[:, :3] -= (rotation @ (centre * arrays.centre_information_root)[..., None])[..., 0]
+    by_centre = (centre * centre_root)[..., None]
+    gradient.extrinsic.numpy()[:, :3] -= (cameras[:, :3, :3] @ by_centre)[..., 0]
     if arrays.states:
         innovation = state * arrays.state_information_root
         gradient.frame_state.add_(innovation)
@@ -111,16 +112,15 @@ def with_priors(
 
 def prior_blocks_of(arrays: Arrays, estimate: Estimate) -> PriorBlocks:
     """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
-    rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
-    each = arrays.camera_unknowns
-    count = arrays.camera_count
-    cameras = rotation.new_zeros(count, each, count, each)
-    by_camera = cameras.diagonal(dim1=0, dim2=2)
-    by_camera[:3, :3] = (rotation * root.square()[:, None] @ rotation.mT).permute(1, 2, 0)
-    by_camera.diagonal()[:, 6:] = arrays.clock_information_root**2
-    cameras = cameras.view(count * each, -1)
+    count, each = arrays.camera_count, arrays.camera_unknowns
+    by_camera = np.zeros((count, each, count, each))
+    root, clock_root = arrays.centre_information_root.numpy(), arrays.clock_information_root.numpy()
+    for c, turn in enumerate(estimate.cam_from_vehicle.numpy()[:, :3, :3]):
+        by_camera[c, :3, c, :3] = turn * root[c] ** 2 @ turn.T
+        by_camera[c, 6:, c, 6:] = np.diag(clock_root**2)
+    cameras = torch.from_numpy(by_camera).view(count * each, -1)
     if not arrays.states:
-        none = rotation.new_zeros(arrays.frame_count, 0, 0)
+        none = cameras.new_zeros(arrays.frame_count, 0, 0)
         return PriorBlocks(cameras, none, none)
     carried = arrays.state_information_root[..., None] * arrays.state_transition
     frame = torch.diag_embed(arrays.state_information_root.square())
