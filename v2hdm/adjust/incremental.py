@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -122,37 +122,6 @@ class _Quadratic:
         added[own.rows[:, None], own.rows] += sign * own.information
         moved[own.rows] += sign * own.vector
         return replace(self, information=added, vector=moved)
-
-
-@dataclass(frozen=True)
-class _Share:
-    """What a marking adds to ``earlier``, by the factor of a whitening that holds the cameras.
-
-    ``chart`` is that of :func:`_moved`.
-    """
-
-    earlier: _Quadratic
-    rows: IntArray
-    factor: TiledCholesky
-    chart: FloatArray
-
-    def at(self, at: FloatArray, gradient: Tensor) -> tuple[_Own, _Quadratic, Tensor, float]:
-        """At the unknowns of all cameras, where the marking's whitened gradient is this one.
-
-        Returns it, the sum, the step in whitened variables to where that is least, and twice what it gains.
-        """
-        factor, step = self.factor, -gradient
-        assert factor.held is not None
-        cameras = step[factor.size - len(self.rows) : factor.size]
-        information = self.chart.T @ factor.held.cpu().numpy() @ self.chart
-        vector = information @ at[self.rows] + self.chart.T @ cameras.cpu().numpy()
-        own = _Own(self.rows, information, vector)
-        joint = self.earlier.plus(own, 1.0)
-        change = joint.mean - at
-        cameras.zero_()
-        gain = float(step @ step) + float(change @ joint.information @ change)
-        cameras.copy_(torch.from_numpy(self.chart @ change[self.rows]))
-        return own, joint, step, gain
 
 
 class IncrementalMap:
@@ -311,11 +280,11 @@ class IncrementalMap:
         for _ in range(options.max_refreshes):
             loss = narrowed(engine, estimate, robust, loss)
             held = factorise(engine, plan, estimate, loss, hold_cameras=True)
-            share = _Share(earlier, rows, held.reduced_factor, chart)
-            _, joint, step, _ = share.at(at, held.gradient)
+            share = partial(_joined, earlier, rows, held.reduced_factor, chart)
+            _, joint, step, _ = share(at, held.gradient)
             done, at = held.linearised.evaluate(*held.step(step)), joint.mean
             left = done.gradient, done.coupled, done.whitened
-            own, joint, _, gained = share.at(at, whitened_gradient(plan, held.reduced_factor, *left))
+            own, joint, _, gained = share(at, whitened_gradient(plan, held.reduced_factor, *left))
             gap = gained / max(sum(done.terms.values()), 1.0)
             if not gap > _GAP_TOLERANCE and loss.scale <= robust.scale:
                 break
@@ -340,6 +309,26 @@ class IncrementalMap:
         changes["control"] = _known([one.control for one in sighted], starts)
         changes["lengths"] = _known([one.lengths for one in sighted], starts)
         return replace(problem, cam_from_vehicle=self.cam_from_vehicle[cameras], **changes), cameras
+
+
+def _joined(
+    earlier: _Quadratic, rows: IntArray, factor: TiledCholesky, chart: FloatArray, at: FloatArray, by: Tensor
+) -> tuple[_Own, _Quadratic, Tensor, float]:
+    """A marking's share, its whitened gradient ``by`` at the unknowns ``at`` of all cameras, and the sum.
+
+    Lastly the step in whitened variables to where the sum is least, and twice what it gains; ``factor`` is of
+    a whitening that holds the cameras, ``chart`` that of :func:`_moved`.
+    """
+    assert factor.held is not None
+    cameras = (step := -by)[factor.size - len(rows) : factor.size]
+    information = chart.T @ factor.held.cpu().numpy() @ chart
+    own = _Own(rows, information, information @ at[rows] + chart.T @ cameras.cpu().numpy())
+    joint = earlier.plus(own, 1.0)
+    change = joint.mean - at
+    cameras.zero_()
+    gained = float(step @ step) + float(change @ joint.information @ change)
+    cameras.copy_(torch.from_numpy(chart @ change[rows]))
+    return own, joint, step, gained
 
 
 def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor, Tensor, FloatArray]:

@@ -201,11 +201,11 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
     """Observations (K,) by corner, then camera, then frame; corner, pair and what was measured of each."""
-    from v2hdm.adjust.engines.numba.prepare import Seen, lay_out, sort_keys  # loads numba
+    from v2hdm.adjust.engines.numba.prepare import Seen, lay_out  # loads numba
 
     seen, count = Seen.of(problem.observations.columns, problem.intrinsic), len(problem.observations.corner)
-    key, frames = np.empty(count, dtype=np.int64), len(problem.map_from_vehicle)
-    sort_keys(seen, rank, frames, key)
+    frames = len(problem.map_from_vehicle)
+    key = (rank[seen.corner] * len(seen.intrinsic) + seen.camera) * frames + seen.frame
     order = np.argsort(key, kind="stable")
     corner, pair = np.empty((2, count), dtype=np.int32)
     measured, root = np.empty((2, count)), np.empty((3, count))

@@ -57,13 +57,6 @@ def first_unsound(
 
 
 @kernel
-def sort_keys(seen: Seen, rank: IntArray, frames: int, key: IntArray) -> None:
-    """Numbers (K,) that ascend with the rank (N,) of the corner, then camera, then frame."""
-    for k in range(len(key)):
-        key[k] = (rank[seen.corner[k]] * len(seen.intrinsic) + seen.camera[k]) * frames + seen.frame[k]
-
-
-@kernel
 def lay_out(
     seen: Seen,
     rank: IntArray,
