@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.adjust.scene import exp, make_scene, with_late_clocks
+from tests.adjust.scene import make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.engines import make_engine
@@ -18,7 +18,7 @@ from v2hdm.adjust.engines.autograd import TorchEngine
 from v2hdm.adjust.engines.numba import pool
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, CameraPrior
+from v2hdm.adjust.problem import LOSSES, POSE_STATES
 from v2hdm.adjust.reduced import ReducedSystem
 from v2hdm.adjust.whitening import factorise
 
@@ -81,17 +81,10 @@ def assert_same(one, other, share=1e-12):
             assert_same(one[name], other[name], share)
     elif is_dataclass(one):
         assert_same(vars(one), vars(other), share)
+    elif isinstance(one, float):
+        assert one == pytest.approx(other, rel=share, abs=0)
     elif other.numel():
         assert float((one - other).abs().max()) <= share * float(other.abs().max())
-
-
-def with_earlier_markings(problem, clock, rng):
-    """The problem, of whose cameras earlier markings say something."""
-    cameras, each = len(problem.intrinsic), 6 + int(clock)
-    root = rng.normal(0, 30.0, (cameras * each, cameras * each))
-    mean = rng.normal(0, 0.01, (cameras, each))
-    base = exp(rng.normal(0, 0.02, (cameras, 6))) @ problem.cam_from_vehicle
-    return replace(problem, camera_prior=CameraPrior(base, mean, root @ root.T))
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -101,15 +94,12 @@ def with_earlier_markings(problem, clock, rng):
     loss=st.sampled_from(LOSSES),
     size=st.sampled_from([0.0, 1e-9, 0.01]),
     lengths=st.booleans(),
-    earlier=st.booleans(),
     behind=st.booleans(),
 )
-def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, lengths, earlier, behind):
+def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, lengths, behind):
     """Cost, gradient and all blocks, of drives with everything that a model can know, to 1e-12."""
     (pose_states, clock), rng = model, np.random.default_rng(seed)
     problem = example(lengths=lengths, frames=14, seed=seed % 7)
-    if earlier:
-        problem = with_earlier_markings(problem, clock, rng)
     numba, by_torch = engines(problem, pose_states, clock)
     robust = Loss(loss, float(rng.uniform(1, 4)))
     estimate = estimate_of(numba, problem, torch.Generator().manual_seed(seed), size, behind)
@@ -235,7 +225,7 @@ def test_what_is_no_number_stays_none():
         estimate = estimate_of(engine, problem, torch.Generator().manual_seed(0))
         whitening = factorise(engine, engine.plan(), estimate, Loss("cauchy", 3.0))
         cost, _ = Objective(whitening)(torch.full_like(whitening.gradient, float("nan")))
-        assert bool(cost.isnan())
+        assert np.isnan(cost)
 
 
 @pytest.mark.parametrize(("pose_states", "clock"), [((), False), (POSE_STATES, True)])

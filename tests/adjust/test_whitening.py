@@ -9,6 +9,7 @@ import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, solve
+from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
@@ -48,7 +49,8 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
         arrays.no_clock(),
     )
     engine = make_engine("auto", arrays)
-    objective = Objective(factorise(engine, engine.plan(), estimate, Loss("none", 1.0)))
+    last = engine, engine.plan(), estimate, Loss("none", 1.0)
+    objective = Objective(factorise(*last))
     direction = torch.randn(
         objective.whitening.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -59,6 +61,9 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
     moves = (gradient - opposite).abs() > 0
     torch.testing.assert_close(((gradient - opposite) / 2)[moves], step[moves], rtol=1e-4, atol=1e-8)
     assert int((~moves).sum()) < 96
+    held, tip = factorise(*last, hold_cameras=True), objective.whitening.reduced_factor.tip
+    torch.testing.assert_close(held.reduced_factor.held, tip @ tip.mT, rtol=1e-8, atol=1e-4)
+    np.testing.assert_allclose(corner_gain(held), corner_gain(objective.whitening), rtol=1e-8, atol=1e-9)
 
 
 def dense(tiles, pattern, size, tip):

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
+from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.engines.numba import engine
 from v2hdm.adjust.problem import Observations, Problem, SolveOptions
 from v2hdm.adjust.solve import solve
@@ -52,8 +53,8 @@ def use_kernels() -> None:
     problem = _small_problem()
     for states in ((), SolveOptions().pose_states):
         solution = solve(problem, SolveOptions(pose_states=states, coarse=not states))
-        solution.covariance.gain()
         descent = solution.covariance.descent
+        corner_gain(descent.whitening)
         pulled = descent.engine.pull(descent.estimate, torch.zeros(2, len(problem.observations.corner)))
         descent.whitening.whiten(pulled)
 

@@ -27,15 +27,6 @@ class Lengths:
 
 
 @dataclass(frozen=True)
-class CameraQuadratic:
-    """Base (C, 4, 4), mean (C, 6 + Q) and information of :class:`v2hdm.adjust.problem.CameraPrior`."""
-
-    base: Tensor
-    mean: Tensor
-    information: Tensor
-
-
-@dataclass(frozen=True)
 class Run:
     """Neighbouring corners and all that was seen of them: k observations of n corners.
 
@@ -53,7 +44,7 @@ class Run:
     measured: Tensor
     root_information: Tensor
 
-    @property
+    @cached_property
     def corner_count(self) -> int:
         """The n corners."""
         return int(self.corners.stop - self.corners.start)
@@ -94,7 +85,6 @@ class Arrays:
         control, control_root: surveyed positions (N, 2) of the corners and a, b, c (N, 3) as those of
             ``root_information``, 0 where there is no survey.
         lengths: known distances between corners.
-        camera_prior: what earlier markings say of the cameras, None if nothing.
         frame_of_moment: (M,) the frame of each moment, None where frames are moments themselves.
         read_out: (C, M, 6) how the vehicle has moved since the frame's stamp by the read-out times as stated.
     """
@@ -118,26 +108,25 @@ class Arrays:
     control: Tensor
     control_root: Tensor
     lengths: Lengths
-    camera_prior: CameraQuadratic | None = None
     frame_of_moment: Tensor | None = None
     read_out: Tensor | None = None
 
-    @property
+    @cached_property
     def frame_count(self) -> int:
         """J."""
-        return len(self.vehicle_from_map)
+        return self.vehicle_from_map.shape[0]
 
-    @property
+    @cached_property
     def camera_count(self) -> int:
         """C."""
-        return len(self.centre)
+        return self.centre.shape[0]
 
-    @property
+    @cached_property
     def corner_count(self) -> int:
         """N."""
-        return len(self.corner_order)
+        return self.corner_order.shape[0]
 
-    @property
+    @cached_property
     def camera_unknowns(self) -> int:
         """6 + Q: a camera's extrinsic and, where they are estimated, its clock offsets and read-out time."""
         return 6 + self.clock_twist.shape[-1]
@@ -147,15 +136,15 @@ class Arrays:
         """Whether images may be of other times than their stamps."""
         return self.clock_twist.shape[-1] > 0 or self.read_out is not None
 
-    @property
+    @cached_property
     def pair_count(self) -> int:
         """P."""
         return self.camera_count * self.moment_count
 
-    @property
+    @cached_property
     def moment_count(self) -> int:
         """M, or J where frames are moments."""
-        return len(self.clock_twist)
+        return self.clock_twist.shape[0]
 
     def camera_of(self, pair: Tensor) -> Tensor:
         """The cameras of pairs."""
@@ -183,18 +172,20 @@ class Arrays:
         return self.centre.new_zeros(self.camera_count, self.clock_twist.shape[-1])
 
     @cached_property
-    def unit_bounds(self) -> tuple[Tensor, Tensor]:
-        """Corners that may begin a run, the end appended, and where their observations begin."""
+    def units(self) -> Tensor:
+        """Corners that may begin a run, the end appended."""
         end = self.joined.new_full((1,), self.corner_count, dtype=torch.int64)
-        corners = torch.cat([(~self.joined).nonzero()[:, 0], end])
-        return corners, torch.searchsorted(self.corner, corners.to(self.corner.dtype))
+        return torch.cat([(~self.joined).nonzero()[:, 0], end])
 
     def bounds(self, size: int) -> list[tuple[int, int]]:
         """(observation, corner) at which runs of about ``size`` observations begin, and the end."""
-        corners, begins = self.unit_bounds
-        wanted = torch.arange(0, len(self.corner) + size, size, device=begins.device)
-        chosen = torch.unique(torch.searchsorted(begins, wanted.clamp(max=len(self.corner))))
-        return list(zip(begins[chosen].tolist(), corners[chosen].tolist(), strict=True))
+        count = self.corner.shape[0]
+        if count <= size:
+            return [(0, 0), (count, self.corner_count)]
+        begins = torch.searchsorted(self.corner, self.units.to(self.corner.dtype))
+        wanted = torch.arange(0, count + size, size, device=begins.device)
+        chosen = torch.unique(torch.searchsorted(begins, wanted.clamp(max=count)))
+        return list(zip(begins[chosen].tolist(), self.units[chosen].tolist(), strict=True))
 
     @cached_property
     def run_bounds(self) -> list[tuple[int, int]]:

@@ -14,7 +14,6 @@ from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.model import (
     Estimate,
     Gradient,
-    camera_offset,
     points_in_camera,
     prior_residuals,
     rigid,
@@ -196,12 +195,7 @@ class Bench:
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
     """All residuals at an estimate; those of the ``observations`` are given."""
     rows = {} if observations is None else {"observations": observations}
-    rows |= prior_residuals(arrays, estimate)
-    if arrays.camera_prior is not None:
-        off = camera_offset(arrays.camera_prior, estimate.cam_from_vehicle, estimate.clock_s).flatten()
-        size, axes = torch.linalg.eigh(arrays.camera_prior.information)
-        rows["earlier_markings"] = size.clamp(min=0).sqrt() * (off @ axes)
-    return rows
+    return rows | prior_residuals(arrays, estimate)
 
 
 def stretches(arrays: Arrays) -> Tensor:

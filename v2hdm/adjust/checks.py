@@ -26,7 +26,7 @@ def check_problem(problem: Problem) -> None:
     _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")
     _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
     _check_rigid("map_from_vehicle", problem.map_from_vehicle)
-    _check_observations(problem)
+    check_observations(problem)
     _check_priors(problem)
     _check_control(problem)
     _check_lengths(problem)
@@ -75,14 +75,6 @@ def _check_lengths(problem: Problem) -> None:
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
     """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
-    prior, clocks = problem.camera_prior, problem.visit_count * int(options.clock_offset)
-    each = 6 + clocks + int(options.read_out)
-    if prior is not None:
-        size = len(problem.intrinsic) * each
-        shapes = problem.cam_from_vehicle.shape, (len(problem.intrinsic), each), (size, size)
-        for (name, values), shape in zip(vars(prior).items(), shapes, strict=True):
-            if np.shape(values) != shape or not np.isfinite(values).all():
-                raise AdjustError(f"camera_prior.{name} must hold finite numbers in the shape {shape}")
     if options.clock_offset and problem.twist_vehicle is None:
         raise AdjustError("a clock offset needs twist_vehicle: say how the vehicle moves at each frame")
     if options.read_out or problem.read_out_s is not None:
@@ -127,7 +119,7 @@ _ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
 
 
 def _check_arrays(problem: Problem) -> None:
-    """Every array is one, has its shape and, but for sigmas of centres, finite numbers."""
+    """Every array is one, has its shape and, but for sigmas of centres and what was seen, finite numbers."""
     seen = problem.observations
     if len(seen.camera) == 0:
         raise AdjustError("there is no observation to adjust: detect and associate markings first")
@@ -144,7 +136,7 @@ def _check_arrays(problem: Problem) -> None:
                 raise AdjustError(f"{prefix}{name} has shape {values.shape}, expected {shape}")
             if name in _sizes(problem) and not np.issubdtype(values.dtype, np.integer):
                 raise AdjustError(f"{prefix}{name} holds {values.dtype}: give whole numbers")
-            if name != "centre_sigma_m":
+            if name not in ("centre_sigma_m", "pinhole_px", "covariance_px"):
                 finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
                 _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or correct its source")
 
@@ -157,25 +149,43 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
     _refuse((transforms[:, 3] != [0, 0, 0, 1]).any(1), said + "last row is not 0, 0, 0, 1")
 
 
-def _check_observations(problem: Problem) -> None:
-    seen, sizes = problem.observations, _sizes(problem)
-    for name, size in sizes.items():
-        index = getattr(seen, name)
-        said = f"observation {{}} names {name} {{}}, but there are only {size}"
-        _refuse((index < 0) | (index >= size), said, index)
-    lens = problem.intrinsic[seen.camera]
-    aside = np.abs((seen.pinhole_px - lens[:, 2:]) / lens[:, :2]).max(1)
-    said = "pinhole_px of observation {} lies {:.3g} focal lengths from the principal point, where no camera "
-    _refuse(aside > _MAX_SLOPE, said + "looks: leave it out", aside)
-    with np.errstate(over="ignore"):
-        (xx, xy), (yx, yy) = seen.covariance_px.astype(np.float64).transpose(1, 2, 0)
-        definite = (xx > 0) & (xx * yy > yx**2) & (xx * yy < np.inf)
-        _refuse(~definite, "covariance_px of observation {} is not positive definite")
-        uneven = (xy - yx) ** 2 > _SYMMETRIC_TO**2 * xx * yy
-        _refuse(uneven, "covariance_px of observation {} is not symmetric")
-    for name in ("corner", "camera"):
-        times = np.bincount(getattr(seen, name), minlength=sizes[name])
-        _refuse(times == 0, f"{name} {{}} has no observation: leave it out of the problem")
+def check_observations(problem: Problem) -> None:
+    """Raise :class:`AdjustError` for the first observation that cannot be solved with."""
+    from v2hdm.adjust.engines.numba.prepare import Seen, first_unsound  # loads numba
+
+    by_corner = np.zeros(problem.corner_count, dtype=np.int64)
+    by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
+    seen = Seen.of(problem.observations.columns, problem.intrinsic)
+    limits = len(problem.map_from_vehicle), _SYMMETRIC_TO, _MAX_SLOPE
+    k = first_unsound(seen, *limits, by_corner, by_camera)
+    if k >= 0:
+        raise AdjustError(_fault(problem, k))
+    for name, times in (("corner", by_corner), ("camera", by_camera)):
+        if not times.all():
+            raise AdjustError(f"{name} {times.argmin()} has no observation: leave it out of the problem")
+
+
+def _fault(problem: Problem, k: int) -> str:
+    """The message for observation k, which is unsound."""
+    seen = problem.observations
+    for name, size in _sizes(problem).items():
+        index = getattr(seen, name)[k]
+        if not 0 <= index < size:
+            return f"observation {k} names {name} {index}, but there are only {size}"
+    for name in ("pinhole_px", "covariance_px"):
+        if not np.isfinite(getattr(seen, name)[k]).all():
+            return f"{name} of observation {k} is not finite: remove it or correct its source"
+    (xx, xy), (yx, yy) = seen.covariance_px[k].astype(np.float64)
+    intrinsic = problem.intrinsic[seen.camera[k]]
+    aside = np.abs((seen.pinhole_px[k] - intrinsic[2:]) / intrinsic[:2]).max()
+    if aside > _MAX_SLOPE:
+        return (
+            f"pinhole_px of observation {k} lies {aside:.3g} focal lengths "
+            "from the principal point, where no camera looks: leave it out"
+        )
+    if xx > 0 and xx * yy > yx**2 and abs(xy - yx) > _SYMMETRIC_TO * np.sqrt(xx * yy):
+        return f"covariance_px of observation {k} is not symmetric"
+    return f"covariance_px of observation {k} is not positive definite"
 
 
 def _sizes(problem: Problem) -> dict[str, int]:

@@ -96,7 +96,7 @@ def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, T
     """
     xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
     lower = cholesky_2x2(xx + CORNER_FLOOR, yx, yy + CORNER_FLOOR)
-    units = arrays.unit_bounds[0]
+    units = arrays.units
     size, groups = torch.diff(units), []
     for corners in torch.unique(size[size > 1]).tolist():
         group = Joint(units[:-1][size == corners], corners, lower)

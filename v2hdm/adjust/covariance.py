@@ -78,37 +78,10 @@ class Covariance:
         tip = self.whitening.reduced_factor.tip
         return np.asarray((tip @ tip.mT).cpu().numpy())
 
-    def gain(self) -> FloatArray:
-        """How corners follow the cameras (N, 2, C (6 + Q)): they move by minus this times their change.
-
-        Frames follow as well. Column by column, x = L_S^-T (0, L_tip' e) is what a change e of the cameras
-        does to the reduced unknowns, so that W' x = (L_S^-1 W)' (0, L_tip' e).
-        """
-        whitening, arrays = self.whitening, self.whitening.engine.arrays
-        tip = whitening.reduced_factor.tip
-        out = np.empty((arrays.corner_count, 2, len(tip)))
-        begin, at_once = 0, self._at_once
-        for end in arrays.unit_bounds[0].tolist()[1:]:
-            if end - begin < at_once and end < arrays.corner_count:
-                continue
-            corners = torch.arange(begin, end, device=tip.device)
-            follow = (tip @ _reduced_root(whitening, corners)[-len(tip) :]).mT
-            factor = whitening.linearised.corner_factor.part(slice(begin, end))
-            gain = factor.solve_transposed(factor.solve(follow.reshape(end - begin, 2, -1)))
-            out[arrays.corner_order[begin:end].cpu().numpy()] = gain.cpu().numpy()
-            begin = end
-        return out
-
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
-        parts = np.array_split(groups, min(max(-(-groups.size // self._at_once), 1), len(groups)))
+        parts = np.array_split(groups, min(max(-(-groups.size // _at_once(self.whitening)), 1), len(groups)))
         return np.concatenate([self._corners(part) for part in parts])
-
-    @property
-    def _at_once(self) -> int:
-        """Corners whose right-hand sides are solved for together."""
-        most = _NUMBERS_AT_ONCE // (2 * self.whitening.reduced_factor.size)
-        return min(max(most, 1), _CORNERS_AT_ONCE)
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays
@@ -128,6 +101,33 @@ class Covariance:
         spread = inverse[rows[:, :, None], _columns(corners, near)[:, None, :]] * _once(near)
         own = own[rows[:, :, None], rows[:, None, :]]
         return np.asarray((own + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
+
+
+def corner_gain(whitening: Whitening) -> FloatArray:
+    """How corners follow the cameras (N, 2, C (6 + Q)): they move by minus this times their change.
+
+    Frames follow as well. Column by column, x = L_S^-T (0, L_tip' e) is what a change e of the cameras
+    does to the reduced unknowns, so that W' x = (L_S^-1 W)' (0, L_tip' e).
+    """
+    arrays, tip = whitening.engine.arrays, whitening.reduced_factor.tip
+    out = np.empty((arrays.corner_count, 2, len(tip)))
+    begin, at_once = 0, _at_once(whitening)
+    for end in arrays.units.tolist()[1:]:
+        if end - begin < at_once and end < arrays.corner_count:
+            continue
+        corners = torch.arange(begin, end, device=tip.device)
+        follow = (tip @ _reduced_root(whitening, corners)[-len(tip) :]).mT
+        factor = whitening.linearised.corner_factor.part(slice(begin, end))
+        gain = factor.solve_transposed(factor.solve(follow.reshape(end - begin, 2, -1)))
+        out[arrays.corner_order[begin:end].cpu().numpy()] = gain.cpu().numpy()
+        begin = end
+    return out
+
+
+def _at_once(whitening: Whitening) -> int:
+    """Corners whose right-hand sides are solved for together."""
+    most = _NUMBERS_AT_ONCE // (2 * whitening.reduced_factor.size)
+    return min(max(most, 1), _CORNERS_AT_ONCE)
 
 
 def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
@@ -158,17 +158,18 @@ def _columns(corners: Tensor, wanted: Tensor) -> Tensor:
 def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     """L_S^-1 W (D, 2 n) for n corners, ascending; of kept ones -L_S^-1 E, where E picks them."""
     plan, estimate = whitening.plan, whitening.estimate
-    run = whitening.engine.arrays.gather(corners)
+    arrays = whitening.engine.arrays
+    run = arrays.whole() if len(corners) == arrays.corner_count else arrays.gather(corners)
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
+    if not len(plan.kept):
+        return whitening.reduced_factor.solve(reduced_coupling(plan, whitening.spread, run, coupling))
     kept = torch.isin(corners, plan.kept)
     coupling[kept[run.corner]] = 0.0
     right = reduced_coupling(plan, whitening.spread, run, coupling)
-    if not bool(kept.any()):
-        return whitening.reduced_factor.solve(right)
     number = torch.searchsorted(plan.kept, corners[kept])
     picked = right.new_zeros(len(plan.kept), 2, len(corners), 2)
     for axis in range(2):
         picked[number, axis, kept.nonzero()[:, 0], axis] = -1.0
-    frames = right.new_zeros(0, len(whitening.engine.arrays.states), right.shape[1])
+    frames = right.new_zeros(0, len(arrays.states), right.shape[1])
     right[: len(right) - len(whitening.reduced_factor.tip)] += to_tiles(plan, frames, picked.flatten(2))
     return whitening.reduced_factor.solve(right)

@@ -44,7 +44,7 @@ class Descent:
     plan: Plan
     estimate: Estimate
     robust: Loss
-    terms: dict[str, Tensor]
+    terms: dict[str, float]
     gap: float
     evaluations: int
     progressing: bool
@@ -66,7 +66,7 @@ class Point(NamedTuple):
 
     whitened: Tensor
     estimate: Estimate
-    terms: dict[str, Tensor]
+    terms: dict[str, float]
 
 
 class Objective:
@@ -77,10 +77,10 @@ class Objective:
         self.evaluations = 0
         self._last: Point | None = None
 
-    def at_base(self) -> tuple[Tensor, Tensor]:
+    def at_base(self) -> tuple[float, Tensor]:
         """Cost and gradient at 0, which the whitening knows."""
         self.evaluations += 1
-        return total(self.whitening.terms), self.whitening.gradient
+        return sum(self.whitening.terms.values()), self.whitening.gradient
 
     def point(self, whitened: Tensor) -> Point:
         """The point that whitened variables stand for; known where they were evaluated last."""
@@ -91,7 +91,7 @@ class Objective:
         assert self._last is not None
         return self._last
 
-    def __call__(self, whitened: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, whitened: Tensor) -> tuple[float, Tensor]:
         """Cost and gradient at whitened variables."""
         self.evaluations += 1
         whitening = self.whitening
@@ -100,18 +100,21 @@ class Objective:
         by_whitened = whitened_gradient(
             whitening.plan, whitening.reduced_factor, done.gradient, done.coupled, done.whitened
         )
-        return total(done.terms), by_whitened
+        return sum(done.terms.values()), by_whitened
 
 
-def total(terms: dict[str, Tensor]) -> Tensor:
-    """The cost: the sum of its terms."""
-    return torch.stack(list(terms.values())).sum()
+def narrowed(engine: Engine, estimate: Estimate, robust: Loss, last: Loss | None = None) -> Loss:
+    """The loss with most residuals in its convex part, and a third as wide as the ``last`` at most.
 
-
-def annealed_scale(engine: Engine, estimate: Estimate, scale: float) -> float:
-    """A scale with most residuals in the convex part: while the fit is poor, all look like outliers."""
+    While the fit is poor, all look like outliers.
+    """
+    if robust.name == "none":
+        return robust
     squared = engine.residuals(engine.poses(estimate), estimate.corners_map).square().sum(0)
-    return max(scale, 2.0 * float(squared.median().sqrt()))
+    scale = 2.0 * float(squared.median().sqrt())
+    if last is not None:
+        scale = min(scale, last.scale / _ANNEALING_STEP)
+    return Loss(robust.name, max(robust.scale, scale))
 
 
 def descend(
@@ -132,8 +135,7 @@ def descend(
     plan, renewal = whitening.plan, RENEWAL_WITH_STATES if engine.arrays.states else RENEWAL
     evaluations, refreshes, progressing, slow = 0, 0, True, False
     while True:
-        scale = whitening.robust.scale
-        final = scale <= robust.scale
+        final = whitening.robust.scale <= robust.scale
         objective = Objective(whitening)
         cost, gradient = objective.at_base()
         gap = predicted_gap(cost, gradient)
@@ -163,18 +165,14 @@ def descend(
             at = engine, plan, point.estimate, used, point.terms
             return Descent(*at, gap, evaluations, progressing, singular, made)
         estimate = point.estimate
-        progressing = float(reached) < float(cost) or not final
+        progressing = reached < cost or not final
         # The old factor and what led away from it go before the new one comes.
         del whitening, objective, whitened, gradient, point
-        if not final:
-            narrowed = annealed_scale(engine, estimate, robust.scale)
-            scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
-        whitening = factorise(engine, plan, estimate, Loss(robust.name, scale))
+        whitening = factorise(
+            engine, plan, estimate, used if final else narrowed(engine, estimate, robust, used)
+        )
 
 
 def open_descent(engine: Engine, estimate: Estimate, robust: Loss) -> Whitening:
     """The first whitening of a descent, under a loss as wide as the residuals ask for."""
-    scale = robust.scale
-    if robust.name != "none":
-        scale = annealed_scale(engine, estimate, scale)
-    return factorise(engine, engine.plan(), estimate, Loss(robust.name, scale))
+    return factorise(engine, engine.plan(), estimate, narrowed(engine, estimate, robust))

@@ -34,7 +34,7 @@ class Evaluated:
     """
 
     estimate: Estimate
-    terms: dict[str, Tensor]
+    terms: dict[str, float]
     gradient: Gradient
     whitened: Tensor
     coupled: Coupled
@@ -50,7 +50,7 @@ class Linearised(ABC):
         whitened, coupled: what :meth:`carry` makes of the gradient's corner part.
     """
 
-    terms: dict[str, Tensor]
+    terms: dict[str, float]
     gradient: Gradient
     corner_factor: CornerFactor
     whitened: Tensor
@@ -106,7 +106,7 @@ class Engine(ABC):
         """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
 
     @abstractmethod
-    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
+    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
         """The cost, by name."""
 
     @abstractmethod

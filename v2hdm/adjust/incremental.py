@@ -15,22 +15,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from v2hdm.adjust.checks import check_observations
+from v2hdm.adjust.covariance import corner_gain
+from v2hdm.adjust.descent import narrowed
 from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.engines.numba.motion import move
 from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.problem import CameraPrior, ControlPoints, KnownLengths, Observations, Problem, SolveOptions
+from v2hdm.adjust.model import Estimate, Loss
+from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
+from v2hdm.adjust.tiles import TiledCholesky
+from v2hdm.adjust.whitening import factorise, whitened_gradient
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.rigid import exp, inverse, left_jacobian, log
 from v2hdm.records import FloatArray, IntArray
 
-# Of a marking's solve: from a cost of a few hundred it then ends within a hundredth of a sigma.
-_GAP_TOLERANCE = 1e-7
+# Of a marking's solve: from a cost of a few hundred it then ends within a thousandth of a sigma.
+_GAP_TOLERANCE = 1e-9
 # Share of an unknown's information, as correlated as it is, below which a difference is what rounding left.
 _LEAST_LEFT = 1e-12
 
@@ -98,7 +106,7 @@ class _Quadratic:
     information: FloatArray
     vector: FloatArray
 
-    @property
+    @cached_property
     def mean(self) -> FloatArray:
         return np.asarray(np.linalg.solve(self.information, self.vector))
 
@@ -111,7 +119,7 @@ class _Quadratic:
     def plus(self, own: _Own, sign: float) -> _Quadratic:
         """With a marking's share added, or with ``sign`` -1 subtracted."""
         added, moved = self.information.copy(), self.vector.copy()
-        added[np.ix_(own.rows, own.rows)] += sign * own.information
+        added[own.rows[:, None], own.rows] += sign * own.information
         moved[own.rows] += sign * own.vector
         return replace(self, information=added, vector=moved)
 
@@ -144,8 +152,7 @@ class IncrementalMap:
         """The extrinsics (C, 4, 4) that all markings together say; where to start from, of unseen cameras."""
         out = self._drive.cam_from_vehicle.copy()
         if self._earlier is not None:
-            tangents = self._earlier.mean.reshape(len(self._earlier.cameras), -1)[:, :6]
-            out[self._earlier.cameras] = exp(tangents) @ self._earlier.base
+            out[self._earlier.cameras] = _moved(self._earlier.base, self._earlier.mean, "cpu")[0].numpy()
         return out
 
     def is_solved(self, marking: int) -> bool:
@@ -197,12 +204,11 @@ class IncrementalMap:
         self._sighted[marking] = joined
         try:
             due = len(self._sighted) >= 2 * self._adjusted_count
-            if earlier is None or due or not np.isin(joined.observations.camera, earlier.cameras).all():
+            cameras = set(joined.observations.camera.tolist())
+            if earlier is None or due or not cameras.issubset(earlier.cameras.tolist()):
                 self.adjust()
             else:
-                own, settled = self._linearised(earlier, marking, joined)
-                self._earlier = earlier.plus(own, 1.0)
-                self._settled[marking] = settled
+                self._earlier, _, self._settled[marking] = self._linearised(earlier, marking, joined)
         except UndeterminedError:
             # The first few of a camera leave its extrinsic free; they wait for those that come.
             self._adjusted_count = 0
@@ -219,7 +225,7 @@ class IncrementalMap:
         """
         if self._earlier is None or marking not in self._settled:
             return self._earlier
-        own = self._settled[marking].own or self._linearised(self._earlier, marking, sighted)[0]
+        own = self._settled[marking].own or self._linearised(self._earlier, marking, sighted)[1]
         less = self._earlier.plus(own, -1.0)
         least = np.linalg.eigvalsh(less.information / _scale(self._earlier.information)).min()
         return less if least > _LEAST_LEFT else None
@@ -243,59 +249,99 @@ class IncrementalMap:
         at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu().numpy()
         self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
         self._adjusted_count = len(every)
-        gain, end = solution.covariance.gain(), 0
+        gain, end = corner_gain(solution.covariance.whitening), 0
         for marking, sighted in self._sighted.items():
             own = slice(end, end := end + sighted.corner_count)
             self._settled[marking] = _Settled(at.ravel(), solution.corners_map[own], gain[own], None)
         return solution
 
-    def _linearised(self, earlier: _Quadratic, marking: int, sighted: Sighted) -> tuple[_Own, _Settled]:
-        """A marking, and what it says of the cameras, where ``earlier`` and it agree."""
-        problem, cameras = self._problem([sighted])
-        rows, mean = earlier.rows(cameras), earlier.mean
-        marginal = np.linalg.inv(np.linalg.inv(earlier.information)[np.ix_(rows, rows)])
-        marginal = (marginal + marginal.T) / 2
-        base = earlier.base[np.searchsorted(earlier.cameras, cameras)]
-        problem = replace(
-            problem,
-            centre_vehicle=None,
-            centre_sigma_m=None,
-            clock_sigma_s=np.inf,
-            read_out_sigma_s=np.inf,
-            camera_prior=CameraPrior(base, mean[rows].reshape(len(cameras), -1), marginal),
-        )
-        options = replace(
-            self._options, coarse=False, gap_tolerance=max(_GAP_TOLERANCE, self._options.gap_tolerance)
-        )
-        solution = _sound(solve(problem, options), f"marking {marking}")
-        tangents = log(solution.cam_from_vehicle @ inverse(base))
-        at = mean[rows].reshape(len(cameras), -1)
-        chart = np.zeros((len(rows), len(rows)))
-        for c, turn in enumerate(left_jacobian(tangents)):
-            part = slice(c * at.shape[1], (c + 1) * at.shape[1])
-            chart[part, part] = np.eye(at.shape[1])
-            chart[part, part][:6, :6] = turn
-        clock_s = solution.covariance.descent.estimate.clock_s.cpu().numpy()
-        reached = np.column_stack([tangents, clock_s]).ravel()
-        information = chart.T @ solution.covariance.camera_information() @ chart - marginal
-        vector = information @ reached + marginal @ (reached - mean[rows])
-        everywhere = mean.copy()
-        everywhere[rows] = reached
-        gain = np.zeros((len(solution.corners_map), 2, len(mean)))
-        gain[:, :, rows] = solution.covariance.gain() @ chart
-        own = _Own(rows, information, vector)
-        return own, _Settled(everywhere, solution.corners_map, gain, own)
+    def _linearised(
+        self, earlier: _Quadratic, marking: int, sighted: Sighted
+    ) -> tuple[_Quadratic, _Own, _Settled]:
+        """What ``earlier`` and a marking say of the cameras together, its share, and itself where they agree.
 
-    def _problem(self, sighted: Sequence[Sighted]) -> tuple[Problem, IntArray]:
+        Gauss-Newton steps: frames and corners are eliminated, and what is left of the cameras is added up.
+        """
+        # All that priors say of the cameras is part of the quadratic.
+        without = {"centre_vehicle": None, "clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
+        problem, cameras = self._problem([sighted], **without)
+        check_observations(problem)
+        options, rows, at = self._options, earlier.rows(cameras), earlier.mean
+        base = earlier.base[np.searchsorted(earlier.cameras, cameras)]
+        estimated = options.clock_offset, options.read_out
+        arrays = make_arrays(problem, tuple(options.pose_states), options.device, *estimated)
+        engine, robust = make_engine(options.engine, arrays), Loss(options.loss, options.loss_scale)
+        plan, loss, gap = engine.plan(), None, np.inf
+        moved, clock_s, chart = _moved(base, at[rows], options.device)
+        corners, fixed = engine.back_project(moved)
+        if not bool(fixed.all()):
+            raise AdjustError(f"marking {marking} cannot be solved for: no ray of a corner meets the ground")
+        estimate = Estimate(moved, torch.zeros_like(arrays.state_information_root), corners, clock_s)
+        for _ in range(options.max_refreshes):
+            loss = narrowed(engine, estimate, robust, loss)
+            held = factorise(engine, plan, estimate, loss, hold_cameras=True)
+            share = partial(_joined, earlier, rows, held.reduced_factor, chart)
+            _, joint, step, _ = share(at, held.gradient)
+            done, at = held.linearised.evaluate(*held.step(step)), joint.mean
+            left = done.gradient, done.coupled, done.whitened
+            own, joint, _, gained = share(at, whitened_gradient(plan, held.reduced_factor, *left))
+            gap = gained / max(sum(done.terms.values()), 1.0)
+            if not gap > _GAP_TOLERANCE and loss.scale <= robust.scale:
+                break
+            moved, clock_s, chart = _moved(base, at[rows], options.device)
+            estimate = replace(done.estimate, cam_from_vehicle=moved, clock_s=clock_s)
+        behind = engine.report(done.estimate, problem.intrinsic[:, :2])[2].any()
+        if behind or not gap <= _GAP_TOLERANCE:
+            status = Status.BEHIND_CAMERA if behind else Status.EVALUATIONS_EXHAUSTED
+            raise AdjustError(f"marking {marking} cannot be solved for ({status.value}): {status.advice}")
+        out = np.empty((problem.corner_count, 2))
+        out[arrays.corner_order.cpu().numpy()] = done.estimate.corners_map.cpu().numpy()
+        gain = np.zeros((len(out), 2, len(at)))
+        gain[:, :, rows] = corner_gain(held) @ chart
+        return joint, own, _Settled(at, out, gain, own)
+
+    def _problem(self, sighted: Sequence[Sighted], **changes: Any) -> tuple[Problem, IntArray]:
         """Some markings as a problem of the cameras and frames that saw them, and which these cameras are."""
         starts = np.cumsum([0, *(one.corner_count for one in sighted)])
         seen = _stacked([one.observations for one in sighted])
         corner = seen.corner + np.repeat(starts[:-1], [len(one.observations.corner) for one in sighted])
-        drive = replace(self._drive, cam_from_vehicle=self.cam_from_vehicle)
-        problem, cameras, _ = drive.seen_by(replace(seen, corner=corner))
-        control = _known([one.control for one in sighted], starts)
-        lengths = _known([one.lengths for one in sighted], starts)
-        return replace(problem, control=control, lengths=lengths), cameras
+        problem, cameras, _ = self._drive.seen_by(replace(seen, corner=corner))
+        changes["control"] = _known([one.control for one in sighted], starts)
+        changes["lengths"] = _known([one.lengths for one in sighted], starts)
+        return replace(problem, cam_from_vehicle=self.cam_from_vehicle[cameras], **changes), cameras
+
+
+def _joined(
+    earlier: _Quadratic, rows: IntArray, factor: TiledCholesky, chart: FloatArray, at: FloatArray, by: Tensor
+) -> tuple[_Own, _Quadratic, Tensor, float]:
+    """A marking's share, its whitened gradient ``by`` at the unknowns ``at`` of all cameras, and the sum.
+
+    Lastly the step in whitened variables to where the sum is least, and twice what it gains; ``factor`` is of
+    a whitening that holds the cameras, ``chart`` that of :func:`_moved`.
+    """
+    assert factor.held is not None
+    cameras = (step := -by)[factor.size - len(rows) : factor.size]
+    information = chart.T @ factor.held.cpu().numpy() @ chart
+    own = _Own(rows, information, information @ at[rows] + chart.T @ cameras.cpu().numpy())
+    joint = earlier.plus(own, 1.0)
+    change = joint.mean - at
+    cameras.zero_()
+    gained = float(step @ step) + float(change @ joint.information @ change)
+    cameras.copy_(torch.from_numpy(chart @ change[rows]))
+    return own, joint, step, gained
+
+
+def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor, Tensor, FloatArray]:
+    """Extrinsics (C, 4, 4) and clock offsets (C, Q) at the unknowns (C (6 + Q),) of cameras around ``base``.
+
+    Lastly the left tangents and clock offsets that a change of the unknowns is, (C (6 + Q), C (6 + Q)).
+    """
+    by_camera = unknowns.reshape(len(base), -1)
+    moved, turns = move(np.ascontiguousarray(by_camera[:, :6]), base)
+    chart, each = np.eye(len(unknowns)), by_camera.shape[1]
+    for begin, turn in zip(range(0, len(unknowns), each), turns, strict=True):
+        chart[begin : begin + 6, begin : begin + 6] = turn
+    return torch.as_tensor(moved, device=device), torch.as_tensor(by_camera[:, 6:], device=device), chart
 
 
 def _scale(information: FloatArray) -> FloatArray:

@@ -16,10 +16,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays, CameraQuadratic, Lengths
+from v2hdm.adjust.arrays import Arrays, Lengths
 from v2hdm.adjust.problem import POSE_STATES, KnownLengths, Problem
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.tensors import inverse
+from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _NEAR_M = 10_000.0
@@ -123,8 +123,7 @@ def make_arrays(
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
-    order, corner, pair = _sorted_observations(problem, rank)
-    measured, root = _whitened(problem, order)
+    order, corner, pair, measured, root = _sorted_observations(problem, rank)
     states, transition, information_root = state_prior(problem, pose_states)
     # Without a survey the information is 0.
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
@@ -156,7 +155,7 @@ def make_arrays(
         corner=index(corner),
         measured=real(measured),
         root_information=real(root),
-        vehicle_from_map=inverse(real(problem.map_from_vehicle)),
+        vehicle_from_map=real(inverse(problem.map_from_vehicle)),
         visit=index(np.asarray(problem.visit_of_frame, dtype=np.int64)),
         states=tuple(states.tolist()),
         centre=real(centre),
@@ -170,9 +169,6 @@ def make_arrays(
         lengths=Lengths(
             index(rank[known.first]), index(rank[known.second]), real(known.length_m), real(1 / known.sigma_m)
         ),
-        camera_prior=None
-        if problem.camera_prior is None
-        else CameraQuadratic(*(real(values) for values in vars(problem.camera_prior).values())),
         frame_of_moment=None if moments is None else index(moments),
         read_out=None if motion is None else real(motion),
     )
@@ -203,34 +199,24 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     return order, np.concatenate([[False], np.diff(unit[order]) == 0])
 
 
-def _sorted_observations(
-    problem: Problem, rank: IntArray
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Observations (K,) by corner, then camera, then frame; the corner and the pair of each."""
-    seen, frames = problem.observations, len(problem.map_from_vehicle)
-    pair, corner = seen.camera.astype(np.int64) * frames + seen.frame, rank[seen.corner]
-    key = corner * (len(problem.intrinsic) * frames) + pair
+def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
+    """Observations (K,) by corner, then camera, then frame; corner, pair and what was measured of each."""
+    from v2hdm.adjust.engines.numba.prepare import Seen, lay_out  # loads numba
+
+    seen, count = Seen.of(problem.observations.columns, problem.intrinsic), len(problem.observations.corner)
+    frames = len(problem.map_from_vehicle)
+    key = (rank[seen.corner] * len(seen.intrinsic) + seen.camera) * frames + seen.frame
     order = np.argsort(key, kind="stable")
-    again = np.flatnonzero(np.diff(key[order]) == 0)
-    if len(again):
-        first, second = order[again[0] : again[0] + 2].tolist()
+    corner, pair = np.empty((2, count), dtype=np.int32)
+    measured, root = np.empty((2, count)), np.empty((3, count))
+    again = lay_out(seen, rank, frames, order, corner, pair, measured, root)
+    if again >= 0:
+        first, second = order[again - 1 : again + 1].tolist()
         raise AdjustError(
             f"observations {first} and {second} are the same corner {seen.corner[first]} in frame "
             f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
         )
-    return order.astype(np.int32), corner[order].astype(np.int32), pair[order].astype(np.int32)
-
-
-def _whitened(problem: Problem, order: NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
-    """``measured`` (2, K) and ``root_information`` (3, K) of the arrays, for observations in an order."""
-    seen = problem.observations
-    intrinsic = problem.intrinsic[seen.camera[order]].T
-    xx, yx, yy = (seen.covariance_px[order, row, column] for row, column in ((0, 0), (1, 0), (1, 1)))
-    first = np.sqrt(xx, dtype=np.float64)
-    below = yx / first
-    last = np.sqrt(yy - below**2)
-    root = np.stack([intrinsic[0] / first, -below * intrinsic[0] / (first * last), intrinsic[1] / last])
-    return (seen.pinhole_px[order].T - intrinsic[2:]) / intrinsic[:2], root
+    return order.astype(np.int32), corner, pair, measured, root
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:

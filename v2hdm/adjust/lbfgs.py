@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-Objective = Callable[[Tensor], tuple[Tensor, Tensor]]
+Objective = Callable[[Tensor], tuple[float, Tensor]]
 """Cost and gradient at whitened variables y."""
 
 _HISTORY = 20
@@ -23,26 +24,26 @@ _STEPS_FROM_NEARBY = 2
 _NO_PROGRESS = 1e-15
 
 
-def predicted_gap(cost: Tensor, gradient: Tensor) -> float:
+def predicted_gap(cost: float, gradient: Tensor) -> float:
     """|g|^2 as a fraction of the cost: twice what a unit Newton step on whitened variables gains.
 
     A cost below 1 is a fit better than one standard deviation in all; the gap is then absolute.
     """
-    return float(gradient.square().sum() / cost.clamp(min=1.0))
+    return float(gradient @ gradient) / max(cost, 1.0)
 
 
 class Minimum(NamedTuple):
     """Where a minimisation ended: y, its cost and its gradient, and whether its whitening was too slow."""
 
     whitened: Tensor
-    cost: Tensor
+    cost: float
     gradient: Tensor
     slow: bool
 
 
 def minimise(
     objective: Objective,
-    cost: Tensor,
+    cost: float,
     gradient: Tensor,
     tolerance: float,
     max_iterations: int,
@@ -63,18 +64,18 @@ def minimise(
         renewal: evaluations that a new whitening costs. Where the steps that are left, at the rate of the
             last, cost more than that and the few steps from nearby, this one was made too far away.
     """
-    scale = gradient.abs().sum()
-    u = torch.zeros_like(gradient, requires_grad=True)
+    scale = float(gradient.abs().sum())
+    u = torch.zeros_like(gradient)
     seen = _Evaluations(lambda point: objective(point * scale), torch.zeros_like(gradient), cost, gradient)
 
-    def closure() -> Tensor:
-        new_cost, new_gradient = seen.at(u.detach())
+    def closure() -> float:
+        new_cost, new_gradient = seen.at(u)
         # An infinite cost is but a step too far, whatever its gradient.
-        if bool(new_cost.isnan()) or bool(new_cost.isfinite() and not new_gradient.isfinite().all()):
+        if math.isnan(new_cost) or not (math.isinf(new_cost) or bool(new_gradient.isfinite().all())):
             raise _NoNumberError
         u.grad = new_gradient / scale
         # Relative to the start, small improvements of a large cost keep their digits.
-        return (new_cost - cost) / scale.square()
+        return (new_cost - cost) / scale**2
 
     _leave_compiler_out()
     # One iteration a step: stopping is this loop's affair.
@@ -87,28 +88,30 @@ def minimise(
         history_size=_HISTORY,
         line_search_fn="strong_wolfe",
     )
+    # Without the hooks of profilers around it, which take as long.
+    step = inspect.unwrap(torch.optim.LBFGS.step)
     best, best_gradient = cost, gradient
     gap, slow = predicted_gap(best, best_gradient), False
     for iteration in range(max_iterations):
         if gap <= tolerance or slow:
             break
         try:
-            optimizer.step(closure)  # type: ignore[no-untyped-call]
-            reached, reached_gradient = seen.at(u.detach())
+            step(optimizer, closure)
+            reached, reached_gradient = seen.at(u)
         except _NoNumberError:
-            reached = torch.full_like(cost, torch.inf)
-        if not bool(reached.isfinite()):
+            reached = math.inf
+        if not math.isfinite(reached):
             # A line search over a singular direction has run off; the point before it still stands.
-            u.data.copy_(seen.start)
+            u.copy_(seen.start)
             break
-        seen.begin_step(u.detach(), reached, reached_gradient)
-        progress = float(best - reached)
+        seen.begin_step(u, reached, reached_gradient)
+        progress = best - reached
         best, best_gradient = reached, reached_gradient
-        if progress <= _NO_PROGRESS * float(best):
+        if progress <= _NO_PROGRESS * best:
             break
         before, gap = gap, predicted_gap(best, best_gradient)
         slow = iteration > 0 and _steps_left(before, gap, tolerance) > renewal + _STEPS_FROM_NEARBY
-    return Minimum(u.detach() * scale, best, best_gradient, slow)
+    return Minimum(u * scale, best, best_gradient, slow)
 
 
 def _steps_left(before: float, gap: float, tolerance: float) -> float:
@@ -125,11 +128,11 @@ class _NoNumberError(Exception):
 class _Evaluations:
     """An objective that knows the points of one step: each asks first where the last one ended."""
 
-    def __init__(self, objective: Objective, start: Tensor, cost: Tensor, gradient: Tensor) -> None:
+    def __init__(self, objective: Objective, start: Tensor, cost: float, gradient: Tensor) -> None:
         self._objective = objective
         self.begin_step(start, cost, gradient)
 
-    def begin_step(self, start: Tensor, cost: Tensor, gradient: Tensor) -> None:
+    def begin_step(self, start: Tensor, cost: float, gradient: Tensor) -> None:
         """Forget all points but the one that a step starts from, with its cost and gradient."""
         self._known = [(start.clone(), cost, gradient)]
 
@@ -138,7 +141,7 @@ class _Evaluations:
         """The point that the current step started from."""
         return self._known[0][0]
 
-    def at(self, point: Tensor) -> tuple[Tensor, Tensor]:
+    def at(self, point: Tensor) -> tuple[float, Tensor]:
         """Cost and gradient at a point, computed if it is none of the known ones."""
         for known, cost, gradient in self._known:
             if torch.equal(known, point):

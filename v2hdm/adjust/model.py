@@ -32,7 +32,7 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import one_hot, pad
 
-from v2hdm.adjust.arrays import Arrays, CameraQuadratic
+from v2hdm.adjust.arrays import Arrays
 from v2hdm.geometry.tensors import NEAR_M, inverse
 
 MIN_DEPRESSION_SINE = 0.01
@@ -197,12 +197,6 @@ def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Te
     return (distance_m - known.length_m) * known.information_root
 
 
-def camera_offset(prior: CameraQuadratic, cam_from_vehicle: Tensor, clock_s: Tensor) -> Tensor:
-    """Tangents and clock offsets (C, 6 + Q) against the mean of what earlier markings say of them."""
-    tangent: Tensor = Se3.from_matrix(cam_from_vehicle @ inverse(prior.base)).log()
-    return torch.cat([tangent, clock_s], dim=1) - prior.mean
-
-
 def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
     """The residuals of everything but the observations, by name."""
     corners, known = estimate.corners_map, arrays.lengths
@@ -217,13 +211,8 @@ def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
 
 def prior_terms(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
     """The cost of everything but the observations, by name."""
-    terms = {
-        name: residual.square().sum() / 2 for name, residual in prior_residuals(arrays, estimate).items()
-    }
-    if arrays.camera_prior is not None:
-        off = camera_offset(arrays.camera_prior, estimate.cam_from_vehicle, estimate.clock_s).flatten()
-        terms["earlier_markings"] = off @ arrays.camera_prior.information @ off / 2
-    return terms
+    residuals = prior_residuals(arrays, estimate)
+    return {name: residual.square().sum() / 2 for name, residual in residuals.items()}
 
 
 def robustified(robust: Loss, squared: Tensor) -> tuple[Tensor, Tensor]:

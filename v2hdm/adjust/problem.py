@@ -70,6 +70,11 @@ class Observations:
     covariance_px: FloatArray
     row_share: FloatArray | None = None
 
+    @property
+    def columns(self) -> tuple[IntArray | FloatArray, ...]:
+        """All but the rows."""
+        return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
+
     def take(self, rows: IntArray | BoolArray) -> Observations:
         """The observations at ``rows``, indices or a mask."""
         taken: list[Any] = [None if one is None else one[rows] for one in vars(self).values()]
@@ -140,21 +145,6 @@ class KnownLengths:
 
 
 @dataclass(frozen=True)
-class CameraPrior:
-    """A prior on the cameras by earlier markings: a quadratic in their tangents and clock offsets.
-
-    With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where they are
-    estimated, clock offsets and the read-out time beyond the stated one, s, are ``mean`` (C, 6 + Q), with the
-    joint ``information`` (C (6 + Q), C (6 + Q)). What the priors on centres and clocks say is part of it; do
-    not state them again.
-    """
-
-    base: FloatArray
-    mean: FloatArray
-    information: FloatArray
-
-
-@dataclass(frozen=True)
 class PoseSigma:
     """How far the recorded poses are off, one standard deviation of each state of a frame.
 
@@ -194,10 +184,9 @@ class Problem:
     is held near zero by ``clock_sigma_s``. ``read_out_s`` (C,) are the cameras' read-out times as stated,
     None for global shutters; estimated ones are held near them by ``read_out_sigma_s``. ``control``, if
     given, ties corners to a survey: the only thing that can tell a shift of the whole map from the drift of
-    the receiver. ``lengths``, if given, are known distances between corners. ``camera_prior``, if given, is
-    what markings outside this problem say of the
-    cameras. ``visit`` (J,), if given, numbers the visit that each frame is of, from 0 and rising; there is
-    then one ``pose_sigma`` for all visits or one for each.
+    the receiver. ``lengths``, if given, are known distances between corners. ``visit`` (J,), if
+    given, numbers the visit that each frame is of, from 0 and rising; there is then one ``pose_sigma`` for
+    all visits or one for each.
 
     >>> problem = build_problem(port, result.detections)
     >>> problem.intrinsic.shape, problem.observations.pinhole_px.shape[1:]
@@ -219,7 +208,6 @@ class Problem:
     read_out_sigma_s: float = READ_OUT_SIGMA_S
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
-    camera_prior: CameraPrior | None = None
     visit: IntArray | None = None
 
     def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
@@ -234,7 +222,7 @@ class Problem:
         rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
         own = {name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None}
         seen = replace(observations, camera=camera, frame=frame)
-        own |= {"corners_start": None, "control": None, "lengths": None, "camera_prior": None}
+        own |= {"corners_start": None, "control": None, "lengths": None}
         count = int(observations.corner.max(initial=-1)) + 1
         return replace(self, observations=seen, corner_count=count, **own), cameras, frames
 

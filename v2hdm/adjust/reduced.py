@@ -219,7 +219,9 @@ class ReducedSystem:
         places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
         self.matrix.values.index_add_(0, places.flatten(), values.flatten())
 
-    def factorise(self, priors: PriorBlocks, jitter: float) -> tuple[TiledCholesky, float] | None:
+    def factorise(
+        self, priors: PriorBlocks, jitter: float, hold_cameras: bool
+    ) -> tuple[TiledCholesky, float] | None:
         """Put it together and factorise; the factor takes its place.
 
         ``jitter`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
@@ -230,7 +232,7 @@ class ReducedSystem:
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
             self.matrix.tiles[key].diagonal().add_(values, alpha=jitter)
-        factor = factorise_tiles(self.matrix)
+        factor = factorise_tiles(self.matrix, hold_cameras)
         if factor is None:
             return None
         return factor, float((factor.pivots() / (1 + jitter) / torch.cat(diagonal)).min())
@@ -240,7 +242,9 @@ class ReducedSystem:
         by_pair = self._own
         if self.arrays.camera_unknowns > 6:
             by_pair = self.spread.camera.mT @ by_pair @ self.spread.camera
-        tip = priors.camera + torch.block_diag(*by_pair.sum(1))  # type: ignore[no-untyped-call]
+        tip, each = priors.camera.clone(), self.arrays.camera_unknowns
+        for begin, own in zip(range(0, len(tip), each), by_pair.sum(1), strict=True):
+            tip[begin : begin + each, begin : begin + each] += own
         self.matrix.tiles[TIP, TIP].add_(tip)
         return torch.diagonal(tip)
 
@@ -267,9 +271,11 @@ class ReducedSystem:
 
 def reduced_coupling(plan: Plan, spread: Spread, run: Run, coupling: Tensor) -> Tensor:
     """W (D, 2 n) of a run's n corners by all reduced unknowns, from W' by observation (k, 2, 6)."""
+    by_camera = spread.by_camera(run, coupling).permute(2, 0, 1).flatten(1)
+    if not spread.arrays.states:
+        return by_camera
     by_state = spread.by_state(run, coupling)
     frame = spread.arrays.frame_of(run.pair)
     by_frame = coupling.new_zeros(spread.arrays.frame_count, by_state.shape[2], run.corner_count, 2)
     by_frame.permute(0, 2, 3, 1).index_put_((frame, run.corner), by_state, accumulate=True)
-    by_camera = spread.by_camera(run, coupling)
-    return torch.cat([to_tiles(plan, by_frame.flatten(2)), by_camera.permute(2, 0, 1).flatten(1)])
+    return torch.cat([to_tiles(plan, by_frame.flatten(2)), by_camera])

@@ -123,13 +123,12 @@ def _report(
     arrays = engine.arrays
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
-    cost_terms = {name: float(value) for name, value in terms.items()}
     residual_px, mahalanobis2, behind = engine.report(estimate, problem.intrinsic[:, :2])
     lines = problem.observations.on_line
     if lines.any():
         mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
     scale = noise_scale(mahalanobis2)
-    of_priors = 2 * sum(cost for name, cost in cost_terms.items() if name != "observations")
+    of_priors = 2 * sum(cost for name, cost in terms.items() if name != "observations")
     held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_root[:, ::2] > 0).sum())
     free = 2 * arrays.corner_count + 6 * arrays.camera_count - held - len(arrays.lengths.first)
     variance = variance_factors(mahalanobis2, of_priors, free, scale)
@@ -151,7 +150,7 @@ def _report(
         verdict=classify(problem.observations, mahalanobis2, behind, options.gate_probability, scale),
         clock_offset_s=clock_s if clock_s.size else np.zeros((len(clock_s), problem.visit_count)),
         read_out_s=read_out_s,
-        cost_terms=cost_terms,
+        cost_terms=terms,
         evaluations=descent.evaluations + spent,
         gap=descent.gap,
         chi2_per_dof=variance.all,

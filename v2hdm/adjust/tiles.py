@@ -145,13 +145,15 @@ class TiledCholesky:
         diagonal: lower factors of the diagonal tiles (G, size, size).
         panels: what stands below each, stacked, the tip's rows last.
         rows: which rows of the vector each panel acts on.
-        tip: lower factor of the tip.
+        tip: lower factor of the tip, the identity where that is held.
+        held: what is left of a tip that is held, the others eliminated.
     """
 
     diagonal: tuple[Tensor, ...]
     panels: tuple[Tensor, ...]
     rows: tuple[Tensor, ...]
     tip: Tensor
+    held: Tensor | None = None
 
     @property
     def size(self) -> int:
@@ -166,7 +168,7 @@ class TiledCholesky:
         """L^-1 b for b (size, n)."""
         out, begin = right.clone(), 0
         # Above the first row that is not zero there is nothing to solve for.
-        first = int(right.any(dim=1).to(torch.uint8).argmax())
+        first = int(right.any(dim=1).to(torch.uint8).argmax()) if self.diagonal else 0
         for tile, panel, rows in zip(self.diagonal, self.panels, self.rows, strict=True):
             if begin + len(tile) > first:
                 part = out[begin : begin + len(tile)]
@@ -188,8 +190,8 @@ class TiledCholesky:
         return out
 
 
-def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
-    """Factorise, overwriting the matrix; None where it is not positive definite.
+def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesky | None:
+    """Factorise, the tip too unless it is held, overwriting the matrix; None where it is not definite.
 
     Right-looking: each column, once factorised, is subtracted from those it couples to.
     """
@@ -212,9 +214,12 @@ def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
         panels.append(panel)
         tiles = [index[tile * size : (tile + 1) * size] for tile in below]
         rows.append(torch.cat([*tiles, index[-len(tip) :]]))
-    if not _factorise_tile(tip):
+    held = tip if hold_tip else None
+    if hold_tip:
+        tip = torch.eye(len(tip), dtype=tip.dtype, device=tip.device)
+    elif not _factorise_tile(tip):
         return None
-    return TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip)
+    return TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip, held)
 
 
 def _factorise_tile(tile: Tensor) -> bool:

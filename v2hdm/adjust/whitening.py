@@ -63,7 +63,7 @@ class Whitening:
     jitter: float
 
     @property
-    def terms(self) -> dict[str, Tensor]:
+    def terms(self) -> dict[str, float]:
         """The cost at the estimate, by name."""
         return self.linearised.terms
 
@@ -109,16 +109,21 @@ def whitened_gradient(
     plan: Plan, factor: TiledCholesky, gradient: Gradient, coupled: Coupled, corners: Tensor
 ) -> Tensor:
     """The gradient by y, of the part of the corners (N, 2) and ``coupled``, W V^-1 g_c."""
-    by_state = gradient.frame_state - coupled.frame_state
-    by_camera = torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera
-    rest = torch.cat([to_tiles(plan, by_state, corners[plan.kept]), by_camera.flatten()])
+    rest = (torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera).flatten()
+    if plan.tile_count:
+        by_state = gradient.frame_state - coupled.frame_state
+        rest = torch.cat([to_tiles(plan, by_state, corners[plan.kept]), rest])
     if len(plan.kept):
         corners = corners.index_fill(0, plan.kept, 0.0)
     return torch.cat([factor.solve(rest[:, None])[:, 0], corners.flatten()])
 
 
-def factorise(engine: Engine, plan: Plan, estimate: Estimate, robust: Loss) -> Whitening:
+def factorise(
+    engine: Engine, plan: Plan, estimate: Estimate, robust: Loss, hold_cameras: bool = False
+) -> Whitening:
     """Whitening at ``estimate``, under the weights that the loss gives there.
+
+    The cameras' unknowns, where they are held, stay as they are: the last of the whitened variables.
 
     Raises:
         AdjustError: the normal equations cannot be factorised.
@@ -127,7 +132,7 @@ def factorise(engine: Engine, plan: Plan, estimate: Estimate, robust: Loss) -> W
     for jitter in JITTER_STEPS:
         system = ReducedSystem(engine.arrays, plan, spread)
         linearised = engine.eliminate(system, estimate, robust)
-        factorised = system.factorise(priors, jitter)
+        factorised = system.factorise(priors, jitter, hold_cameras)
         if factorised is None:
             continue
         factor, smallest_pivot = factorised

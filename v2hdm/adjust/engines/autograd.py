@@ -118,16 +118,17 @@ class TorchEngine(Engine):
             fixed[run.corners] = some
         return corners, fixed
 
-    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
+    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
         """The cost, by name."""
         squared = self.residuals(self.poses(estimate), estimate.corners_map).square().sum(0)
         with torch.no_grad():
-            observations = model.robustified(robust, squared)[0].sum() / 2
-            return {"observations": observations, **model.prior_terms(self.arrays, estimate)}
+            priors = model.prior_terms(self.arrays, estimate)
+            observations = float(model.robustified(robust, squared)[0].sum()) / 2
+            return {"observations": observations, **{name: float(term) for name, term in priors.items()}}
 
     def cost_and_gradient(
         self, base: Estimate, step: Tensor, robust: Loss
-    ) -> tuple[Estimate, dict[str, Tensor], Gradient]:
+    ) -> tuple[Estimate, dict[str, float], Gradient]:
         """The cost where the cameras of ``base`` are moved by tangents (C, 6), and its gradient.
 
         Returns the estimate with the cameras moved, the cost by name, and the gradient by ``step``.
@@ -148,7 +149,7 @@ class TorchEngine(Engine):
         priors = model.prior_terms(arrays, estimate)
         ends = [torch.stack(list(priors.values())).sum(), poses, corners_map]
         gradient = torch.autograd.grad(ends, leaves, [None, pose.grad, corner.grad], materialize_grads=True)
-        terms = {"observations": observations, **{name: term.detach() for name, term in priors.items()}}
+        terms = {"observations": float(observations)} | {name: term.item() for name, term in priors.items()}
         moved = Estimate(estimate.cam_from_vehicle.detach(), base.frame_state, base.corners_map, base.clock_s)
         return moved, terms, Gradient(*gradient)
 
@@ -188,11 +189,6 @@ class TorchEngine(Engine):
         )
         (by_camera,) = jacobians(residual, [camera])
         cameras = torch.block_diag(*(by_camera.mT @ by_camera))  # type: ignore[no-untyped-call]
-        if arrays.camera_prior is not None:
-            off = model.camera_offset(arrays.camera_prior, moved, clock)
-            (chart,) = jacobians(off, [camera])
-            turned = torch.block_diag(*chart)  # type: ignore[no-untyped-call]
-            cameras = cameras + turned.mT @ arrays.camera_prior.information @ turned
         own, before = leaf(estimate.frame_state), leaf(estimate.frame_state)
         frame = own.new_zeros(arrays.frame_count, *2 * (len(arrays.states),))
         if not arrays.states:

@@ -137,7 +137,7 @@ class NumbaEngine(Engine):
         self.share(lambda b, e: observe.report(b, e, self._whole, table, corners, order, focal, out))
         return out
 
-    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
+    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
         """The cost, by name."""
         spread = self.spread(estimate)
         system = ReducedSystem(self.arrays, self.plan(), spread)
@@ -208,9 +208,7 @@ class NumbaEngine(Engine):
             self._keep(system, base)
         if states:
             self._subtract_frames(base, system)
-        terms, gradient = with_priors(
-            arrays, estimate, spread, torch.from_numpy(out.costs.sum(0)), self.pairs(out.wrench)
-        )
+        terms, gradient = with_priors(arrays, estimate, spread, out.costs.sum(0), self.pairs(out.wrench))
         return NumbaLinearised(
             terms,
             gradient,
@@ -326,7 +324,7 @@ class NumbaLinearised(Linearised):
             evaluate.evaluate(begin, end, layout, base, table, moved, by_camera, whitened, room, out)
 
         engine.share(work)
-        costs, wrench = torch.from_numpy(out.costs.sum(0)), engine.pairs(out.wrench)
+        costs, wrench = out.costs.sum(0), engine.pairs(out.wrench)
         terms, gradient = with_priors(arrays, at, engine.spread(at), costs, wrench)
         by_tangent = (torch.from_numpy(chart).mT @ gradient.extrinsic[..., None])[..., 0]
         at = replace(at, corners_map=torch.from_numpy(out.corners))
@@ -386,7 +384,7 @@ def _corner_factor(arrays: Arrays, base: Base) -> CornerFactor:
     if not len(base.joint):
         return CornerFactor(torch.from_numpy(base.lower), ())
     joint, begin = [], 0
-    values, units = torch.from_numpy(base.joint), arrays.unit_bounds[0]
+    values, units = torch.from_numpy(base.joint), arrays.units
     joined = torch.diff(units)
     for size in torch.unique(joined[joined > 1]).tolist():
         first = units[:-1][joined == size]

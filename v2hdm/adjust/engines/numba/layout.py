@@ -64,7 +64,7 @@ class Layout(NamedTuple):
 def make_layout(arrays: Arrays) -> Layout:
     """The layout of arrays that lie in the processor's memory."""
     begin = np.searchsorted(arrays.corner.numpy(), np.arange(arrays.corner_count + 1, dtype=np.int32))
-    unit = arrays.unit_bounds[0].numpy()
+    unit = arrays.units.numpy()
     chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
     pair = arrays.pair.numpy()
     touched = [_distinct(part, arrays.pair_count) for part in np.split(pair, begin[unit[chunk[1:-1]]])]

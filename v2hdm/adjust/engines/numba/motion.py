@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.compiled import inlined, kernel
+from v2hdm.compiled import exact_kernel, inlined, kernel
 from v2hdm.geometry.rigid import EXP_SERIES, LEFT_JACOBIAN_SERIES
 from v2hdm.records import FloatArray
 
@@ -20,6 +20,26 @@ def move(tangents: FloatArray, dst_from_src: FloatArray) -> tuple[FloatArray, Fl
     moved, jacobian = np.zeros((len(tangents), 4, 4)), np.empty((len(tangents), 6, 6))
     _move(tangents, dst_from_src, _EXP, _LEFT_JACOBIAN, np.empty((5, 6, 6)), moved, jacobian)
     return moved, jacobian
+
+
+def compose(cameras: FloatArray, vehicle_from_map: FloatArray) -> FloatArray:
+    """Products (C, M, 4, 4) of cameras (C, M or 1, 4, 4) with transforms (M, 4, 4)."""
+    out = np.empty((len(cameras), *vehicle_from_map.shape))
+    _compose(np.ascontiguousarray(cameras), np.ascontiguousarray(vehicle_from_map), out)
+    return out
+
+
+@exact_kernel
+def _compose(cameras: FloatArray, vehicle_from_map: FloatArray, out: FloatArray) -> None:
+    for c in range(len(cameras)):
+        for m in range(len(vehicle_from_map)):
+            left = cameras[c, m if cameras.shape[1] > 1 else 0]
+            for i in range(4):
+                for j in range(4):
+                    total = 0.0
+                    for k in range(4):
+                        total += left[i, k] * vehicle_from_map[m, k, j]
+                    out[c, m, i, j] = total
 
 
 @inlined

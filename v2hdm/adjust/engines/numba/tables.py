@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays, CameraQuadratic
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.engines.numba.motion import compose
 from v2hdm.adjust.model import (
     Estimate,
     Gradient,
-    centre_residual,
     clock_residual,
     frame_tangent,
     moved,
@@ -27,7 +27,7 @@ from v2hdm.adjust.model import (
 )
 from v2hdm.adjust.reduced import PriorBlocks, Spread
 from v2hdm.geometry import rigid
-from v2hdm.geometry.tensors import inverse
+from v2hdm.records import FloatArray
 
 
 def _exp(tangent: Tensor) -> Tensor:
@@ -51,11 +51,7 @@ def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
         vehicle_from_map = _exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
     vehicle_from_map = arrays.at_moments(vehicle_from_map)
     cameras = _cam_from_vehicle_then(arrays, estimate)
-    if cameras.shape[1] > 1:
-        return cameras @ vehicle_from_map
-    # One product of two matrices, instead of many of four rows each.
-    product = cameras.reshape(-1, 4) @ vehicle_from_map.transpose(0, 1).reshape(4, -1)
-    return product.view(len(cameras), 4, -1, 4).transpose(1, 2).contiguous()
+    return torch.from_numpy(compose(cameras.numpy(), vehicle_from_map.numpy()))
 
 
 def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
@@ -70,9 +66,14 @@ def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
     return Spread(arrays, state, clock)
 
 
+def _half_square(residual: Tensor) -> float:
+    flat = residual.flatten()
+    return float(flat @ flat) / 2 if len(flat) else 0.0
+
+
 def with_priors(
-    arrays: Arrays, estimate: Estimate, spread: Spread, costs: Tensor, wrench: Tensor
-) -> tuple[dict[str, Tensor], Gradient]:
+    arrays: Arrays, estimate: Estimate, spread: Spread, costs: FloatArray, wrench: Tensor
+) -> tuple[dict[str, float], Gradient]:
     """The cost by name and its gradient; by corners, where it is whitened already, (0, 2).
 
     Args:
@@ -82,62 +83,46 @@ def with_priors(
         costs: (3,) of the observations, the survey and the known lengths.
         wrench: (C, M, 6) the observations' gradient by the pairs' left tangents.
     """
-    centre = centre_residual(arrays, estimate.cam_from_vehicle)
+    cameras, centre_root = estimate.cam_from_vehicle.numpy(), arrays.centre_information_root.numpy()
+    centre = (rigid.camera_centre(cameras) - arrays.centre.numpy()) * centre_root
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
-    clock = clock_residual(arrays, estimate.clock_s)
+    clock = clock_residual(arrays, estimate.clock_s) if arrays.camera_unknowns > 6 else estimate.clock_s
     terms = {
-        "observations": costs[0],
-        "camera_centre": centre.square().sum() / 2,
-        "frame_states": state.square().sum() / 2,
-        "clock_offsets": clock.square().sum() / 2,
-        "control_points": costs[1],
-        "known_lengths": costs[2],
+        "observations": float(costs[0]),
+        "camera_centre": float(np.vdot(centre, centre)) / 2,
+        "frame_states": _half_square(state),
+        "clock_offsets": _half_square(clock),
+        "control_points": float(costs[1]),
+        "known_lengths": float(costs[2]),
     }
     gathered = spread.gather(wrench)
     by_corner = state.new_empty(0, 2)
     gradient = Gradient(gathered.camera[:, :6], gathered.frame_state, by_corner, gathered.camera[:, 6:])
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
-    rotation = estimate.cam_from_vehicle[:, :3, :3]
-    gradient.extrinsic[:, :3] -= (rotation @ (centre * arrays.centre_information_root)[..., None])[..., 0]
+    by_centre = (centre * centre_root)[..., None]
+    gradient.extrinsic.numpy()[:, :3] -= (cameras[:, :3, :3] @ by_centre)[..., 0]
     if arrays.states:
         innovation = state * arrays.state_information_root
         gradient.frame_state.add_(innovation)
         gradient.frame_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
     if clock.numel():
         gradient.clock_s.add_(clock * arrays.clock_information_root)
-    if arrays.camera_prior is not None:
-        terms["earlier_markings"], by_camera, _ = _earlier(arrays, estimate, arrays.camera_prior)
-        gradient.extrinsic.add_(by_camera[:, :6])
-        gradient.clock_s.add_(by_camera[:, 6:])
     return terms, gradient
 
 
 def prior_blocks_of(arrays: Arrays, estimate: Estimate) -> PriorBlocks:
     """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
-    rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
-    each = arrays.camera_unknowns
-    by_camera = rotation.new_zeros(arrays.camera_count, each, each)
-    by_camera[:, :3, :3] += rotation * root.square()[:, None] @ rotation.mT
-    by_camera.diagonal(dim1=1, dim2=2)[:, 6:] += arrays.clock_information_root**2
-    cameras = torch.block_diag(*by_camera)  # type: ignore[no-untyped-call]
-    if arrays.camera_prior is not None:
-        cameras = cameras + _earlier(arrays, estimate, arrays.camera_prior)[2]
+    count, each = arrays.camera_count, arrays.camera_unknowns
+    by_camera = np.zeros((count, each, count, each))
+    root, clock_root = arrays.centre_information_root.numpy(), arrays.clock_information_root.numpy()
+    for c, turn in enumerate(estimate.cam_from_vehicle.numpy()[:, :3, :3]):
+        by_camera[c, :3, c, :3] = turn * root[c] ** 2 @ turn.T
+        by_camera[c, 6:, c, 6:] = np.diag(clock_root**2)
+    cameras = torch.from_numpy(by_camera).view(count * each, -1)
+    if not arrays.states:
+        none = cameras.new_zeros(arrays.frame_count, 0, 0)
+        return PriorBlocks(cameras, none, none)
     carried = arrays.state_information_root[..., None] * arrays.state_transition
     frame = torch.diag_embed(arrays.state_information_root.square())
     frame[:-1] += (carried.mT @ carried)[1:]
     return PriorBlocks(cameras, frame, -arrays.state_information_root[..., None] * carried)
-
-
-def _earlier(arrays: Arrays, estimate: Estimate, prior: CameraQuadratic) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost of the prior by earlier markings, its gradient (C, 6 + Q) and Gauss-Newton Hessian."""
-    each, like = arrays.camera_unknowns, prior.mean
-    tangent = rigid.log((estimate.cam_from_vehicle @ inverse(prior.base)).numpy())
-    turned = np.eye(like.numel())
-    for camera, jacobian in enumerate(np.linalg.inv(rigid.left_jacobian(tangent))):
-        part = slice(each * camera, each * camera + 6)
-        turned[part, part] = jacobian
-    chart = torch.as_tensor(turned, dtype=like.dtype)
-    off = (torch.cat([torch.as_tensor(tangent, dtype=like.dtype), estimate.clock_s], dim=1) - like).flatten()
-    pulled = prior.information @ off
-    hessian = chart.mT @ prior.information @ chart
-    return off @ pulled / 2, (chart.mT @ pulled).view(-1, each), hessian
