@@ -180,15 +180,11 @@ class _Template:
     @property
     def spread(self) -> FloatArray:
         """Covariance (2N, 2N) of a symbol's vertices about the template's, but for its pose."""
-        rigid = np.column_stack([np.tile(np.eye(2), (len(self.vertices), 1)), self._turning])
-        basis = np.linalg.qr(rigid)[0]
+        turning = (self.vertices @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()
+        basis = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(self.vertices), 1)), turning]))[0]
         sized = self.stretch * self.sizes
         own = self.paint_m**2 * np.eye(len(basis)) + sized @ sized.T
         return np.asarray(own + _ANYWHERE_M**2 * len(self.vertices) * basis @ basis.T)
-
-    @property
-    def _turning(self) -> FloatArray:
-        return (self.vertices @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()
 
     def pose(self, vertices: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation (2, 2) and place (2,) that bring the template to vertices (N, 2)."""
@@ -207,14 +203,10 @@ class _Template:
     def laid_about(self, outline: FloatArray) -> list[FloatArray]:
         """The template on an outline (K, 2): along it, across it, and both turned around."""
         points = _evenly(outline)
-        own = _evenly(self.vertices)
         axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-        along = np.arctan2(axes[0, 1], axes[0, 0])
-        placed = []
-        for angle in along + np.pi / 2 * np.arange(4):
-            c, s = np.cos(angle), np.sin(angle)
-            placed.append((self.vertices - own.mean(axis=0)) @ [[c, s], [-s, c]] + points.mean(axis=0))
-        return placed
+        own = (self.vertices - _evenly(self.vertices).mean(axis=0)) @ [1, 1j] * (axes[0] @ [1, 1j])
+        turned = [own * turn for turn in (1, 1j, -1, -1j)]
+        return [np.column_stack([one.real, one.imag]) + points.mean(axis=0) for one in turned]
 
     def learnt(self, members: Sequence[Polygon]) -> tuple[_Template, list[_Template]]:
         """The template of all members, and for each that of the others."""

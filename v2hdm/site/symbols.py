@@ -1,8 +1,9 @@
 """Symbols of the map (arrows, chevrons, users' own): polygons whose vertices most of their sightings share.
 
 Once the cameras and poses are known, the outline of every sighting is laid on the ground. Outlines that cover
-each other are sightings of one symbol. About what a good part of the images cover that show a place, near ones
-weighing more, its vertices are fitted to the outlines in the images (:mod:`v2hdm.site.polygons`).
+each other are sightings of one symbol. What a good part of the images cover that show a place, near ones
+weighing more, is where its vertices start; they are fitted to the outlines in the images
+(:mod:`v2hdm.site.polygons`).
 """
 
 from __future__ import annotations
@@ -226,9 +227,8 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
     for mask, number in zip(masks, image, strict=True):
         painted[number] |= mask
     cells = first + cell_m * np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1)
-    weight = (
-        eyes.shows(cells.reshape(-1, 2)).reshape(painted.shape) / np.hypot(eyes.sigma_m(cells), cell_m) ** 2
-    )
+    shown = eyes.shows(cells.reshape(-1, 2)).reshape(painted.shape)
+    weight = shown / np.hypot(eyes.sigma_m(cells), cell_m) ** 2
     share = (weight * painted).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
     contours = find_contours(share, _PART)  # type: ignore[no-untyped-call]
     if not contours:
