@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.geometry.ipm import apply_in_front, homography_jacobian
-from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.records import FloatArray, IntArray
 from v2hdm.site.shapes import SHAPE_SIGMA_M
 
@@ -113,10 +113,10 @@ def find_polygons(
                     one = _fit(traces[k], start, template.prior)
                     best, home = (one, members) if one.evidence > best.evidence else (best, home)
         found[k] = best
-        if home is None:
-            classes.append((_Template.of(best), [k]))
-        else:
+        if home is not None:
             home.append(k)
+        elif is_simple(best.vertices):
+            classes.append((_Template.of(best), [k]))
     for template, members in classes:
         for _ in range(_ROUNDS if len(members) > 1 else 0):
             template, others = template.learnt([found[k] for k in members])

@@ -80,14 +80,12 @@ def map_symbols(
         ring, near = (outline - middle).astype(np.float32), np.linalg.norm(places - middle, axis=1) < size_m
         if any(cv2.pointPolygonTest(ring, one.tolist(), False) >= 0 for one in places[near] - middle):
             continue
-        weight = eyes.sigma_m(middle)[image.ravel()] ** -2
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
         # The border may cut one end in some images, and a shadow hide it: then the other tells.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
         objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
         if None in objections:
-            sigma_m = _sigma_m([shapes[n] for n in own], weight)
-            found.append(Symbol(kind, outline, len(camera), sigma_m))
+            found.append(Symbol(kind, outline, len(camera)))
             outlines_px = [symbols.outlines_pinhole_px[n] for n in rows[own]]
             seen.append(eyes.traces(outlines_px, image.ravel()))
         else:
@@ -100,10 +98,8 @@ def map_symbols(
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
     """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do.
 
-    It keeps the outline that its sightings share where no polygon explains them, but one that crosses itself.
+    One that crosses itself explains nothing: then the outline stays that its sightings share.
     """
-    if not is_simple(polygon.vertices):
-        return symbol
     covariance = polygon.covariance + EDGE_SIGMA_M**2 * np.eye(polygon.vertices.size)
     known = [one for one in markings if one.covariance_m2 is not None]
     if known:
@@ -112,6 +108,8 @@ def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]
         shared = np.asarray(nearest.covariance_m2).reshape(4, 2, 4, 2).mean(axis=(0, 2))
         covariance = covariance + np.tile(shared, 2 * (len(polygon.vertices),))
     sigma_m = float(np.sqrt(np.trace(covariance) / len(covariance)))
+    if not is_simple(polygon.vertices):
+        return replace(symbol, sigma_m=sigma_m)
     return replace(symbol, outline_map=polygon.vertices, covariance_m2=covariance, sigma_m=sigma_m)
 
 
@@ -239,21 +237,3 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
     if len(outline) < 3:
         return None
     return np.asarray(outline if signed_area(outline) > 0 else outline[::-1])
-
-
-def _sigma_m(shapes: Sequence[FloatArray], weight: FloatArray) -> float:
-    """Standard deviation a coordinate of the mean place, by how the sightings scatter about it."""
-    middle = np.array([_centroid(shape) for shape in shapes])
-    share = weight / weight.sum()
-    squared = ((middle - share @ middle) ** 2).mean(axis=1)
-    effective = 1 / (share**2).sum()
-    return float(np.sqrt((share @ squared) / max(effective - 1, 1)))
-
-
-def _centroid(shape: FloatArray) -> FloatArray:
-    """Centre (2,) of a polygon's area."""
-    x, y = (shape - shape[0]).T
-    cross = x * np.roll(y, -1) - y * np.roll(x, -1)
-    pairs = np.array([x + np.roll(x, -1), y + np.roll(y, -1)])
-    area = cross.sum() / 2
-    return np.asarray(shape[0] + (pairs @ cross) / (6 * area) if abs(area) > 1e-9 else shape.mean(axis=0))
