@@ -367,8 +367,10 @@ class Marking:
 class Symbol:
     """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
 
-    ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter; ``heights_m``
-    (N,), their sigmas and ``id`` are as a :class:`Marking` has them.
+    These are the vertices of a polygon, in the same order for all symbols of one template, with the joint
+    covariance ``covariance_m2`` (2N, 2N); None where sightings share an outline that no polygon explains.
+    ``sigma_m`` is the standard deviation a coordinate; ``heights_m`` (N,), their sigmas and ``id`` are as a
+    :class:`Marking` has them.
     """
 
     kind: str
@@ -378,6 +380,7 @@ class Symbol:
     heights_m: FloatArray | None = None
     id: int | None = None
     heights_sigma_m: FloatArray | None = None
+    covariance_m2: FloatArray | None = None
 
 
 @dataclass(frozen=True)

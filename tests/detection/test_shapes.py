@@ -20,7 +20,7 @@ from v2hdm.detection.classifier import CHANNELS, SIZE
 from v2hdm.detection.lattice import blurred_coverage, normal_pdf, normal_share
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.patch import ImageQuads, LensFrames
-from v2hdm.detection.propose import Blob, _outlines, find_blobs, outline_polygon
+from v2hdm.detection.propose import Blob, _outlines, find_blobs, on_edges, outline_polygon
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import Quad, order_corners, side_frames
 from v2hdm.records import DIAMOND, LANE_DASH
@@ -101,6 +101,26 @@ def test_paint_that_is_hardly_any_has_an_outline_too():
     polygon = outline_polygon(Blob({"arrow": 0.6}, level, np.array([10.0, 20.0]), 2, np.zeros((0, 2))))
     np.testing.assert_allclose(np.ptp(polygon, axis=0), [10.0, 2.0], atol=0.6)
     np.testing.assert_allclose((polygon.min(axis=0) + polygon.max(axis=0)) / 2, [18.0, 24.0], atol=0.3)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_an_outline_moves_to_the_edges_of_bright_paint_and_stays_where_there_are_none(turned):
+    true = np.array([[30.4, 20.3], [90.4, 20.3], [90.4, 50.3], [30.4, 50.3]])
+    columns, rows = (
+        np.clip(one, 0.0, 1.0)
+        for one in (
+            np.minimum(np.arange(120) + 0.5 - 30.4, 90.9 - np.arange(120)),
+            np.minimum(np.arange(80) + 0.5 - 20.3, 50.8 - np.arange(80)),
+        )
+    )
+    picture = np.repeat((70 + 110 * rows[:, None] * columns)[..., None], 3, axis=2).astype(np.uint8)
+    drawn = (true + np.array([[-2.0, 1.5], [1.5, -2.0], [2.0, 2.0], [1.0, -1.5]]))[::turned]
+    found = on_edges(drawn, picture)
+    middles = (true + np.roll(true, -1, axis=0)) / 2
+    off_px = [cv2.pointPolygonTest(found.astype(np.float32), one, True) for one in middles.tolist()]
+    np.testing.assert_allclose(off_px, 0.0, atol=0.4)
+    plain = on_edges(drawn, np.full_like(picture, 70))
+    assert abs(signed_area(plain) - signed_area(drawn)) < 0.02 * abs(signed_area(drawn))
 
 
 def test_a_diamond_that_touches_a_line_is_split_from_it():

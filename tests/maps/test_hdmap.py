@@ -66,7 +66,7 @@ def assert_same(got, expected):
 def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
     outline = np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]])
     symbols = (
-        Symbol("parking_t", outline, 5, 0.013, np.array([0.1, 0.2, 0.3])),
+        Symbol("parking_t", outline, 5, 0.1, np.array([0.1, 0.2, 0.3]), covariance_m2=0.01 * np.eye(6)),
         Symbol("arrow", 2 * outline, 3),
     )
     path = tmp_path / "map.geojson"
@@ -74,6 +74,7 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
     for got, expected in zip(read_geojson(path).symbols, symbols, strict=True):
         assert (got.kind, got.sightings, got.sigma_m) == (expected.kind, expected.sightings, expected.sigma_m)
         np.testing.assert_array_equal(got.outline_map, expected.outline_map)
+        np.testing.assert_array_equal(got.covariance_m2, expected.covariance_m2)
         np.testing.assert_array_equal(got.heights_m, expected.heights_m)
     feature = json.loads(path.read_text())["features"][-1]
     assert (feature["id"], feature["geometry"]["type"]) == (4, "Polygon")

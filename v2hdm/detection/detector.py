@@ -16,7 +16,7 @@ from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
 from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.propose import Proposals, find_blobs, outline_polygon, propose
+from v2hdm.detection.propose import Proposals, find_blobs, on_edges, outline_polygon, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
@@ -73,7 +73,7 @@ class Detector:
             readings = self.read(image_bgr, found)
         with lap("judge"):
             markings = find_markings(readings, found.camera, self.options)
-        return _likelier(markings, self._symbols(found)), lanes
+        return _likelier(markings, self._symbols(image_bgr, found)), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
         """Run the network on one image; what shows the vehicle itself is no paint.
@@ -138,7 +138,7 @@ class Detector:
             self._cameras[camera.info.name] = known, known.first_row_within(self.options.max_range_m)
         return known
 
-    def _symbols(self, found: Proposals) -> list[MarkingDetection]:
+    def _symbols(self, image_bgr: np.ndarray, found: Proposals) -> list[MarkingDetection]:
         """Markings within range with an outline but no four corners; of a piece and its parts only one."""
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
         names, symbols, parts_until = self.catalogue.of_family(SYMBOL), [], 0
@@ -149,7 +149,8 @@ class Detector:
             score, ground = piece.symbol_score(kind), piece.outline_vehicle
             within = found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
             if within and score >= self.options.min_score:
-                symbols.append(MarkingDetection(kind, score, *nothing, outline_polygon(piece.blob)))
+                outline_px = on_edges(outline_polygon(piece.blob), image_bgr)
+                symbols.append(MarkingDetection(kind, score, *nothing, outline_px))
                 parts_until = piece.index + 1 + piece.blob.parts
         return symbols
 

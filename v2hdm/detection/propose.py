@@ -17,7 +17,7 @@ import numpy as np
 from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput, as_probability
-from v2hdm.geometry.planar import rectangle_size
+from v2hdm.geometry.planar import rectangle_size, signed_area
 from v2hdm.geometry.quadrilateral import following, is_convex_px, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -36,6 +36,10 @@ _LEAST_SURE, _MOST_SURE = 0.2, 0.6
 
 _MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
 _OUTLINE_SCALE = 4
+_OUTLINE_SIGMA_PX, _REACH_PX, _STEP_PX = 2.0, 6.0, 0.5
+"""How far the network's outline is from an edge of paint; how far, and in what steps, that is looked for."""
+
+_BESIDE = 4  # points of an outline, px apart, to each side that its direction and its light are taken from
 
 _LEAST_CERTAINTY = 0.3  # least mean probability of paint of a piece; below it one in fifty is a marking
 _LEAST_CLASS_SHARE = 0.02  # least share of a class, by network and size, with which it is proposed
@@ -430,3 +434,34 @@ def outline_polygon(blob: Blob) -> FloatArray:
     polygon = cv2.approxPolyDP(longest, 0.2 * _OUTLINE_SCALE, closed=True).reshape(-1, 2)
     cells = (polygon + 0.5) / _OUTLINE_SCALE - 0.5
     return np.asarray(blob.origin_px + blob.stride * cells)
+
+
+def on_edges(outline_px: FloatArray, bgr: np.ndarray) -> FloatArray:
+    """An outline (N, 2), recorded px, of bright paint in (H, W, 3) uint8, moved to the paint's edges nearby.
+
+    There the light falls fastest from inside to outside. Places along the outline share their light, so that
+    dirt does not move one of them; where it falls nowhere, the outline stays.
+    """
+    ring = np.vstack([outline_px, outline_px[:1]])
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
+    wanted = np.linspace(0.0, at[-1], max(round(float(at[-1])), 3), endpoint=False)
+    points = np.column_stack([np.interp(wanted, at, axis) for axis in ring.T])
+    ahead = np.roll(points, -_BESIDE, axis=0) - np.roll(points, _BESIDE, axis=0)
+    outward = ahead @ [[0.0, -1.0], [1.0, 0.0]] * np.sign(signed_area(points))
+    outward /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    off_px = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX)
+    x, y = np.moveaxis((points[:, None] + off_px[:, None] * outward[:, None]).astype(np.float32), 2, 0)
+    light = cv2.remap(bgr, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).mean(axis=2)
+    light = _with_neighbours(light).mean(axis=0)
+    fall = np.maximum(-np.gradient(light, axis=1), 0.0)
+    best = (fall**2 * np.exp(-0.5 * (off_px / _OUTLINE_SIGMA_PX) ** 2)).argmax(axis=1)
+    fall = np.where(np.abs(off_px - off_px[best][:, None]) <= 2 * _STEP_PX, fall, 0.0)
+    moved_px = fall @ off_px / np.maximum(fall.sum(axis=1), 1e-6)
+    moved = points + np.median(_with_neighbours(moved_px), axis=0)[:, None] * outward
+    fewer = cv2.approxPolyDP(moved.astype(np.float32), _STEP_PX / 2, closed=True)
+    return np.asarray(fewer[:, 0], dtype=np.float64)
+
+
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """Values (N, ...) along a closed outline, and those beside them, (K, N, ...)."""
+    return np.stack([np.roll(values, k, axis=0) for k in range(1 - _BESIDE, _BESIDE)])

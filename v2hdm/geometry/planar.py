@@ -41,6 +41,17 @@ def winding(polygon: FloatArray) -> int:
     return 1 if winding_rad > 0 else -1
 
 
+def is_simple(polygon: FloatArray) -> bool:
+    """Whether no two sides of a polygon (N, 2) cross each other."""
+    ends = np.roll(polygon, -1, axis=0)
+    side, apart = ends - polygon, polygon[:, None] - polygon
+    beyond = ends[:, None] - polygon
+    # Where side i begins and ends, (N, N), beside side j: on different sides where it crosses j's line.
+    begin, end = (one[..., 0] * side[:, 1] - one[..., 1] * side[:, 0] for one in (apart, beyond))
+    crosses = begin * end < 0
+    return not (crosses & crosses.T).any()
+
+
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
     """A polygon (N, 2) cut to a convex window (M, 2) of either turning (Sutherland and Hodgman, CACM 1974).
 

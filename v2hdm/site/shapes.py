@@ -231,7 +231,7 @@ _FREEDOM_BOUNDS = (1.0, 30.0)
 _SIGMA_BOUNDS_M = (1e-4, 0.05)
 """Scale of a paint error, m: from the rounding of a survey to the width of a line."""
 
-_EDGE_SIGMA_M = 0.004
+EDGE_SIGMA_M = 0.004
 """How far all images may misplace a painted edge alike, m: a ragged edge of a sprayed line is about so wide.
 
 A class whose typical marking scatters by more was painted so: that scatter is no error of the map."""
@@ -255,7 +255,7 @@ class PaintError:
         count = len(deviation)
         beyond = max(float(deviation @ deviation) - float(np.trace(formal)), 0.0)
         posterior_m2 = (self.freedom * self.sigma_m**2 + beyond) / (self.freedom + count)
-        painted_m2 = max(self.sigma_m**2 - _EDGE_SIGMA_M**2, 0.0)
+        painted_m2 = max(self.sigma_m**2 - EDGE_SIGMA_M**2, 0.0)
         return max(posterior_m2 - painted_m2, 0.0)
 
 

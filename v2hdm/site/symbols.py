@@ -1,16 +1,16 @@
-"""Symbols of the map (arrows, chevrons, users' own): the outline that most of their sightings share.
+"""Symbols of the map (arrows, chevrons, users' own): polygons whose vertices most of their sightings share.
 
-A symbol has no corners to adjust. Once the cameras and poses are known, the outline of every sighting is laid
-on the ground. Outlines that cover each other are sightings of one symbol. Its outline encloses what at least
-half of the images cover that show a place, near ones weighing more. What the border cuts off, or a shadow, an
-image does not deny.
+Once the cameras and poses are known, the outline of every sighting is laid on the ground. Outlines that cover
+each other are sightings of one symbol. What a good part of the images cover that show a place, near ones
+weighing more, is where its vertices start; they are fitted to the outlines in the images
+(:mod:`v2hdm.site.polygons`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -25,21 +25,22 @@ from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Symbols
-from v2hdm.geometry.ipm import project_ground
-from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.ipm import pinhole_px_from_ground, project_ground
+from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.site.polygons import Polygon, Traces, find_polygons
+from v2hdm.site.shapes import EDGE_SIGMA_M
 
-_CELL_M = 0.01
+_CELL_M = 0.02
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
 
 _MOST_CELLS = 500  # cells along the longer side of the average, beyond which they grow
-_PART = 0.25
-"""Share of the images' weight from which paint that the others lack is a part that they have missed."""
+_PART = 0.3
+"""Share of the weight of the images that show a place from which it is painted: some miss a part."""
 
-_MISSED_SIGMAS = 2.0  # paint is missed, not just elsewhere, this many sigmas beside what an image has
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
 
@@ -65,7 +66,7 @@ def map_symbols(
     if not shapes:
         return (), ()
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    found, left_out = [], []
+    found, left_out, seen = [], [], []
     for own in _groups(shapes):
         at = np.stack([symbols.camera[rows[own]], symbols.frame[rows[own]]])
         (camera, frame), image = np.unique(at, axis=1, return_inverse=True)
@@ -79,17 +80,37 @@ def map_symbols(
         ring, near = (outline - middle).astype(np.float32), np.linalg.norm(places - middle, axis=1) < size_m
         if any(cv2.pointPolygonTest(ring, one.tolist(), False) >= 0 for one in places[near] - middle):
             continue
-        weight = eyes.sigma_m(middle)[image.ravel()] ** -2
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
         # The border may cut one end in some images, and a shadow hide it: then the other tells.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
         objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
         if None in objections:
-            sigma_m = _sigma_m([shapes[n] for n in own], weight)
-            found.append(Symbol(kind, outline, len(camera), sigma_m))
+            found.append(Symbol(kind, outline, len(camera)))
+            outlines_px = [symbols.outlines_pinhole_px[n] for n in rows[own]]
+            seen.append(eyes.traces(outlines_px, image.ravel()))
         else:
             left_out.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
+    polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
+    found = [_with_vertices(*pair, markings) for pair in zip(found, polygons, strict=True)]
     return tuple(found), tuple(left_out)
+
+
+def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
+    """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do.
+
+    One that crosses itself explains nothing: then the outline stays that its sightings share.
+    """
+    covariance = polygon.covariance + EDGE_SIGMA_M**2 * np.eye(polygon.vertices.size)
+    known = [one for one in markings if one.covariance_m2 is not None]
+    if known:
+        middle = polygon.vertices.mean(axis=0)
+        nearest = min(known, key=lambda one: float(np.linalg.norm(one.corners_map.mean(axis=0) - middle)))
+        shared = np.asarray(nearest.covariance_m2).reshape(4, 2, 4, 2).mean(axis=(0, 2))
+        covariance = covariance + np.tile(shared, 2 * (len(polygon.vertices),))
+    sigma_m = float(np.sqrt(np.trace(covariance) / len(covariance)))
+    if not is_simple(polygon.vertices):
+        return replace(symbol, sigma_m=sigma_m)
+    return replace(symbol, outline_map=polygon.vertices, covariance_m2=covariance, sigma_m=sigma_m)
 
 
 @dataclass(frozen=True)
@@ -115,6 +136,15 @@ class _Eyes:
         height_m = self.rig.height_m[self.camera][many]
         direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
         return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
+
+    def traces(self, outlines_px: Sequence[FloatArray], image: IntArray) -> Traces:
+        """Outlines, each of an ``image`` (S,), as they are beside polygons on the ground."""
+        intrinsic, cam_from_map = (
+            self.rig.intrinsic[self.camera],
+            self.rig.cam_from_map(self.camera, self.frame),
+        )
+        px_from_map = pinhole_px_from_ground(intrinsic, cam_from_map)
+        return Traces.of(outlines_px, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
 
     def shows(self, points_map: FloatArray) -> BoolArray:
         """Which points (N, 2) lie inside which images (I, N), away from the border."""
@@ -185,8 +215,7 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
     """The outline (N, 2), counter-clockwise, of what the images take for paint; None if that is nothing.
 
     Each of I images, ``image`` (S,) of the shapes, speaks of the ground that it shows, and weighs what it
-    knows of it. It may have missed a part of the symbol: where it has no paint near, but others agree on
-    some, it says nothing.
+    knows of it.
     """
     extent_m = float(np.ptp(np.concatenate(shapes), axis=0).max())
     cell_m = max(_CELL_M, extent_m / _MOST_CELLS)
@@ -196,16 +225,10 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
     for mask, number in zip(masks, image, strict=True):
         painted[number] |= mask
     cells = first + cell_m * np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1)
-    sigma_m = np.hypot(eyes.sigma_m(cells), cell_m)
-    weight = eyes.shows(cells.reshape(-1, 2)).reshape(painted.shape) / sigma_m**2
-    agreed = _share(painted, weight) > _PART
-    for own, sigma, mask in zip(weight, sigma_m, painted, strict=True):
-        away_m = cell_m * cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3)
-        lacking = agreed & ~mask
-        part = cv2.connectedComponents(lacking.view(np.uint8))[1]
-        missed = np.unique(part[lacking & (away_m > _MISSED_SIGMAS * sigma)])
-        own[lacking & np.isin(part, missed)] = 0.0
-    contours = find_contours(_share(painted, weight), 0.5)  # type: ignore[no-untyped-call]
+    shown = eyes.shows(cells.reshape(-1, 2)).reshape(painted.shape)
+    weight = shown / np.hypot(eyes.sigma_m(cells), cell_m) ** 2
+    share = (weight * painted).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+    contours = find_contours(share, _PART)  # type: ignore[no-untyped-call]
     if not contours:
         return None
     largest = max(contours, key=lambda contour: abs(float(signed_area(contour))))
@@ -214,26 +237,3 @@ def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -
     if len(outline) < 3:
         return None
     return np.asarray(outline if signed_area(outline) > 0 else outline[::-1])
-
-
-def _share(painted: BoolArray, weight: FloatArray) -> FloatArray:
-    """The share (h, w) of the weight of images (I, h, w) that has paint; 0 where none sees anything."""
-    return np.asarray((weight * painted).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12))
-
-
-def _sigma_m(shapes: Sequence[FloatArray], weight: FloatArray) -> float:
-    """Standard deviation a coordinate of the mean place, by how the sightings scatter about it."""
-    middle = np.array([_centroid(shape) for shape in shapes])
-    share = weight / weight.sum()
-    squared = ((middle - share @ middle) ** 2).mean(axis=1)
-    effective = 1 / (share**2).sum()
-    return float(np.sqrt((share @ squared) / max(effective - 1, 1)))
-
-
-def _centroid(shape: FloatArray) -> FloatArray:
-    """Centre (2,) of a polygon's area."""
-    x, y = (shape - shape[0]).T
-    cross = x * np.roll(y, -1) - y * np.roll(x, -1)
-    pairs = np.array([x + np.roll(x, -1), y + np.roll(y, -1)])
-    area = cross.sum() / 2
-    return np.asarray(shape[0] + (pairs @ cross) / (6 * area) if abs(area) > 1e-9 else shape.mean(axis=0))

@@ -31,7 +31,7 @@ class Feature:
     """A marking, a symbol or a lane as file formats see it.
 
     ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one. A closed
-    one is a marking of four corners unless it is a ``symbol``, of which ``place_sigma_m`` may be known.
+    one is a marking of four corners unless it is a ``symbol``, of which only ``place_sigma_m`` may be known.
     ``heights_m`` (N,) are those of the ground there in the map frame, None where it is the plane z = 0.
     ``covariance_m2`` (2N, 2N) is that of the stacked points, ``vertex_sigma_m`` (N,) how well a lane's
     vertices are known across it, ``heights_sigma_m`` (N,) the heights; None where that is not known.
@@ -102,6 +102,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
     for one, number in zip(everything, ids, strict=True):
         if isinstance(one, Symbol):
             points, more = one.outline_map, dict[str, Any](symbol=True, place_sigma_m=one.sigma_m)
+            more["covariance_m2"] = one.covariance_m2
         elif isinstance(one, Lane):
             points, more = one.points_map, {"vertex_sigma_m": one.sigma_m}
         else:
@@ -121,7 +122,8 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
     for one, number in zip(features, ids, strict=True):
         own = (one.kind, one.points_map, one.sightings)
         if one.symbol:
-            symbols.append(Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m))
+            symbol = Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m)
+            symbols.append(replace(symbol, covariance_m2=one.covariance_m2))
         elif one.closed:
             marking = Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number)
             markings.append(replace(marking, paint=one.paint, heights_sigma_m=one.heights_sigma_m))
