@@ -51,7 +51,7 @@ from v2hdm.verdict.inputs.drive import causes, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
-from v2hdm.verdict.results.solution import check_solution, over_surface
+from v2hdm.verdict.results.solution import check_solution, over_ground
 from v2hdm.workers import share_out
 
 CLEAN = "nothing"
@@ -151,7 +151,8 @@ def map_one(job: Job) -> Row:
     try:
         options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
         methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
-        before = over_surface(findings_of_inputs(drive), list(methods.values())[-1][BEST])
+        best = list(methods.values())[-1][BEST]
+        before = over_ground(findings_of_inputs(drive), best, job.ground == AUTO)
         findings = [*before, *check_solution(drive, methods)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
@@ -161,7 +162,6 @@ def map_one(job: Job) -> Row:
         return Row(**about, status=_CRASHED, findings=[crash], seconds=time.process_time() - begin_s)
     seconds = time.process_time() - begin_s
     verdict = Verdict.of(findings)
-    best = list(methods.values())[-1][BEST]
     expected = driven_past(drive, truth, tuple(drive.cameras))
     figures = marking_metrics(best.hd_map, truth, expected)
     errors = squared_errors(best, truth) if figures.markings > figures.false_markings else {}

@@ -29,9 +29,6 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
         "rear": {**naive, "Opt": shifted(opt_m, 4), "Opt, paper": shifted(0.03, 4)},
         "both": {**naive, "Opt": shifted(opt_m), "Opt, paper": shifted(0.03)},
     }
-    errors = {"rotation_error_deg": 0.02, "translation_error_m": 0.01}
-    far = {"rotation_error_deg": 2.0, "translation_error_m": 0.3}
-    found = {"both": {"front": {"CNI": errors, "ENI": far, "Opt": errors}}}
     return {
         "port": port,
         "seed": seed,
@@ -42,7 +39,6 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
         "expected": {name: [True] * 5 for name in maps},
         "maps": maps,
         "lanes": {"Opt": [[[0.0, 1.01], [20.0, 1.01]]]},
-        "extrinsics": {"ours": found, "paper": found},
         "failures": [],
     }
 

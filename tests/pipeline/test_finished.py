@@ -1,14 +1,12 @@
 """Runs from and to object stores are those of folders: finished ones are kept, none is half there."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.drive.example import make_drive
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.errors import ConfigError
 from v2hdm.io.drive import read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
@@ -16,7 +14,6 @@ from v2hdm.pipeline.keys import Contents, result_key
 from v2hdm.pipeline.run import RunResult, note_finished, take_or_make
 from v2hdm.store import remote
 from v2hdm.store.cache import code_key, key_of
-from v2hdm.store.remote import RemoteFolder, download
 from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
 
@@ -124,63 +121,3 @@ def test_what_is_not_ours_is_reported_before_any_work(config, memory):
 def test_a_cache_at_a_store_is_refused(config, memory):
     with pytest.raises(ConfigError, match=r"cache=memory.*: is a URL; give a folder"):
         take_or_make(replace(config, cache=f"{memory}/cache"), Work(), True, quiet)
-
-
-def uploaded(folder, place):
-    for path in folder.rglob("*"):
-        if path.is_file():
-            place.write(path.relative_to(folder).as_posix(), path)
-    return place
-
-
-def test_a_drive_at_a_store_is_copied_once_for_each_content(config, memory, tmp_path):
-    place = uploaded(tmp_path / "drive", memory.below("drives/monday"))
-    told: list[tuple[int, int]] = []
-    copy = download(place, tmp_path / "cache", lambda *at: told.append(at))
-    files = sum(path.is_file() for path in (tmp_path / "drive").rglob("*"))
-    assert told[-1] == (files, files)
-    assert copy.name == "monday"
-    for path in (tmp_path / "drive").rglob("*"):
-        if path.is_file():
-            assert (copy / path.relative_to(tmp_path / "drive")).read_bytes() == path.read_bytes()
-    told.clear()
-    assert download(place, tmp_path / "cache", lambda *at: told.append(at)) == copy
-    assert not told
-    place.write("poses.tum", (tmp_path / "drive" / "poses.tum").read_bytes() + b"# more\n")
-    assert download(place, tmp_path / "cache", quiet) != copy
-
-    work = Work()
-    made, _ = take_or_make(replace(config, drive=DriveConfig(path=str(place))), work, True, quiet)
-    assert made.place == f"{memory}/results/monday"
-    assert work.done[0].drive.paths[0].is_relative_to(tmp_path / "local")
-
-
-@pytest.mark.parametrize(
-    ("names", "says"),
-    [
-        ([], "no such drive"),
-        (["../../escape"], "is none of a file in a folder"),
-        (["a//b"], "is none of a file in a folder"),
-        (["..\\escape"], "is none of a file in a folder"),
-    ],
-)
-def test_a_drive_that_leads_out_of_its_folder_is_refused(names, says, memory, tmp_path, monkeypatch):
-    listed: Callable[..., Any] = RemoteFolder.listed
-    memory.write("drive/x", b"x")
-    thing = listed(memory)["drive/x"]
-    monkeypatch.setattr(RemoteFolder, "listed", lambda self: dict.fromkeys(names, thing))
-    with pytest.raises(DriveError, match=says):
-        download(memory.below("drive"), tmp_path / "cache", quiet)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_copy_that_failed_leaves_nothing(memory, tmp_path, monkeypatch):
-    memory.write("drive/x", b"x")
-
-    def gone(*_):
-        raise ConfigError("no network")
-
-    monkeypatch.setattr(RemoteFolder, "fetch", gone)
-    with pytest.raises(ConfigError, match="no network"):
-        download(memory.below("drive"), tmp_path / "cache", quiet)
-    assert not list((tmp_path / "cache").iterdir())

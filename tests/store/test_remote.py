@@ -21,8 +21,6 @@ def test_what_was_put_is_read_listed_and_removed(memory, tmp_path):
     memory.remove("a")
     memory.remove("a")
     assert memory.read("a") is None
-    memory.fetch({"c/b": tmp_path / "deep" / "copy"})
-    assert (tmp_path / "deep" / "copy").read_bytes() == b"12345"
 
 
 def test_an_object_is_created_once(memory):

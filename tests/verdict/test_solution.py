@@ -13,11 +13,11 @@ from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
 from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
-from v2hdm.records import Calibration, HdMap
+from v2hdm.records import Calibration, GroundStrip, HdMap
 from v2hdm.site.candidates import Exclusion
-from v2hdm.verdict import Status, Verdict
+from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
-from v2hdm.verdict.results.solution import check_inputs, check_solution
+from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground
 from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
@@ -164,6 +164,22 @@ def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
     told = raised(result(replace(FINE, score_tests=(replace(focal, gain=0.2),))), drive)
     assert [one.status for one in told.values()] == [Status.WARN] * is_told
     assert not is_told or "2.4 % shorter" in told["focal length"].says
+    sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
+    (accuracy, *_) = check_goal(result(replace(FINE, score_tests=(focal,)), sure), 0.05, "poses")
+    assert ("unless the focal length is off" in accuracy.says) is is_told
+
+
+@pytest.mark.parametrize("recorded", [Status.WARN, Status.FAIL])
+@pytest.mark.parametrize(("is_curved", "is_tried"), [(True, True), (False, True), (False, False)])
+def test_a_bend_of_the_recorded_heights_matters_as_the_map_s_ground_says(recorded, is_curved, is_tried):
+    grid = np.zeros((2, 2))
+    strip = GroundStrip(grid, grid, 0.5, np.zeros(2), grid, grid)
+    mapped = replace(result(), hd_map=HdMap((), ground=(strip,) * is_curved))
+    bends = Finding("road", recorded, 2.0, 1.0, "deg", "the ground bends by 0.2 m", "poses")
+    (answer,) = over_ground([bends], mapped, is_tried)
+    is_fine = is_curved or (is_tried and recorded is Status.WARN)
+    assert (answer.status is Status.PASS) is is_fine
+    assert (answer == bends) is not is_fine
 
 
 def test_a_small_contradiction_is_none_however_sure_it_is():

@@ -34,15 +34,12 @@ def run(arguments: Sequence[str]) -> int:
     from v2hdm.fleet.plan import exit_code
     from v2hdm.fleet.run import FleetOptions, fleet_on_terminal
     from v2hdm.settings import check_workers
-    from v2hdm.store.remote import is_url
 
     check_workers(parsed.workers)
     overrides = [one for one in parsed.drives if "=" in one and not Path(one).exists()]
     files = [Path(one) for one in dict.fromkeys(parsed.drives) if one not in overrides]
     if not files:
         raise ConfigError("no drive is named: give run files, as in v2hdm fleet drives/*.yaml")
-    if any(is_url(one) for one in parsed.drives if one not in overrides):
-        raise ConfigError("run files lie on this machine; their drive.path may be a URL (docs/fleet.md)")
     table, share = parsed.table, (1, 1)
     if parsed.share is not None:
         share = _share(parsed.share)

@@ -7,14 +7,12 @@ that tables, figures and text need of a finished one is there in seconds.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, Job
-from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS
 from v2hdm.mapping.results import MethodResult
@@ -26,7 +24,7 @@ from v2hdm.pipeline.map_drive import read_all
 from v2hdm.pipeline.survey import take_survey
 from v2hdm.progress import Progress
 from v2hdm.records import Drive, Marking, Truth
-from v2hdm.report.metrics import driven_past, extrinsic_metrics
+from v2hdm.report.metrics import driven_past
 from v2hdm.simulate import rendered_drive
 from v2hdm.store.cache import StageCache
 
@@ -55,7 +53,7 @@ def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, An
             except (MappingError, AdjustError) as failure:
                 record["failures"].append([recipe, "all cameras", str(failure)])
             else:
-                _add(record, recipe, drive, {name: one.methods for name, one in found.items()}, truth)
+                _add(record, recipe, {name: one.methods for name, one in found.items()})
     progress("finished", 1, 1)
     return record
 
@@ -72,24 +70,17 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
         "route": drive.route_map,
         "expected": {name: driven_past(drive, truth, members) for name, members in sets.items()},
         "maps": {name: {} for name in sets},
-        "lanes": {}, "extrinsics": {}, "failures": [],
+        "lanes": {}, "failures": [],
     }  # fmt: skip
 
 
-def _add(
-    record: dict[str, Any],
-    recipe: str,
-    drive: Drive,
-    sets: Mapping[str, Mapping[str, MethodResult]],
-    truth: Truth,
-) -> None:
-    """Add maps and extrinsics under a recipe; others than ours give the naive maps again."""
+def _add(record: dict[str, Any], recipe: str, sets: Mapping[str, Mapping[str, MethodResult]]) -> None:
+    """Add maps under a recipe; others than ours give the naive maps again."""
     for name, methods in sets.items():
         for method, result in methods.items():
             if recipe == OURS or method not in NAIVE_IPMS:
                 row = method if recipe == OURS else f"{method}, {recipe}"
                 record["maps"][name][row] = _plain_map(result.hd_map.markings)
-    record["extrinsics"][recipe] = {name: _extrinsics(drive, one, truth) for name, one in sets.items()}
     if recipe == OURS:
         record["lanes"] = {"Opt": [lane.points_map for lane in list(sets.values())[-1]["Opt"].hd_map.lanes]}
 
@@ -100,16 +91,3 @@ def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
         "corners": [marking.corners_map for marking in markings],
         "sightings": [marking.sightings for marking in markings],
     }
-
-
-def _extrinsics(drive: Drive, methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:
-    """By camera and method, how far the extrinsic is from the truth: deg and m."""
-    out: dict[str, Any] = {}
-    for name, found in methods["Opt"].calibrations.items():
-        camera, true = drive.cameras[name], truth.cam_from_vehicle[name]
-        poses = {"Opt": found.cam_from_vehicle}
-        for method, ipm in NAIVE_IPMS.items():
-            if ipm in camera.ipm:
-                poses[method] = extrinsic_from_ipm(camera.info, camera.ipm[ipm])
-        out[name] = {method: asdict(extrinsic_metrics(pose, true)) for method, pose in poses.items()}
-    return out

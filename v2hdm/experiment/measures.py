@@ -59,7 +59,6 @@ class Measured:
     started_from: str
     rows: Mapping[str, Mapping[str, Row]]
     matched: Mapping[str, Mapping[str, Matched]]
-    extrinsics: Mapping[str, Any]
     failures: tuple[tuple[str, str, str], ...]
 
     @property
@@ -100,7 +99,7 @@ def measure(record: Mapping[str, Any]) -> Measured:
         matched[cameras] = found
     failures = tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"])
     port, seed, started_from = (record[name] for name in ("port", "seed", "started_from"))
-    return Measured(port, seed, started_from, rows, matched, record["extrinsics"], failures)
+    return Measured(port, seed, started_from, rows, matched, failures)
 
 
 def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from v2hdm import __version__
 from v2hdm.experiment.measures import ROWS, Measured, Row
-from v2hdm.experiment.plan import OURS, PAPER, RECIPES, ExperimentConfig
+from v2hdm.experiment.plan import RECIPES, ExperimentConfig
 from v2hdm.store.files import replace_csv, replace_text
 
 _CM = 100.0
@@ -30,30 +30,20 @@ COLUMNS: Mapping[str, tuple[Callable[[Row], float], int]] = {
 }
 """The figure of each column, and the digits behind the point."""
 
-_EXTRINSICS = ("rotation (deg)", "centre (cm)")
-_WORDS = ("port", "method", "cameras", "camera", "extrinsic of", "claim", "where")  # columns of words
+_WORDS = ("port", "method", "cameras", "claim", "where")  # columns of words
 _ESCAPED = str.maketrans({one: f"\\{one}" for one in "&%$#_{}"} | {"\\": r"\textbackslash{}"})
 
 
 def write_tables(folder: Path, measured: Sequence[Measured]) -> None:
-    """Write ``results`` and ``calibrations`` as .csv (a line per seed) and .tex into a folder."""
+    """Write ``results`` as .csv (a line per seed) and .tex into a folder."""
     results = [
         [one.port, one.seed, cameras, method, *(f"{take(row):.6g}" for take, _ in COLUMNS.values())]
         for one in measured
         for cameras, rows in one.rows.items()
         for method, row in rows.items()
     ]
-    calibrations = [
-        [one.port, one.seed, camera, origin, *(f"{error:.6g}" for error in errors)]
-        for one in measured
-        for camera, origin, errors in _extrinsics(one)
-    ]
-    for name, keys, table, rows in (
-        ("results", ("cameras", "method", *COLUMNS), results_table, results),
-        ("calibrations", ("camera", "extrinsic of", *_EXTRINSICS), calibrations_table, calibrations),
-    ):
-        replace_csv(folder / f"{name}.csv", [["port", "seed", *keys], *rows])
-        replace_text(folder / f"{name}.tex", latex(*table(measured)))
+    replace_csv(folder / "results.csv", [["port", "seed", "cameras", "method", *COLUMNS], *results])
+    replace_text(folder / "results.tex", latex(*results_table(measured)))
 
 
 def results_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
@@ -67,20 +57,6 @@ def results_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[st
                     cells = [_mean([take(row) for row in rows], digits) for take, digits in COLUMNS.values()]
                     lines.append([port, method, cameras, *cells])
     return ["port", "method", "cameras", *COLUMNS], lines
-
-
-def calibrations_table(measured: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
-    """Heads and lines: how far the extrinsics are from the true ones, by port, camera and origin."""
-    found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-    for port, drives in by_port(measured).items():
-        for one in drives:
-            for camera, origin, errors in _extrinsics(one):
-                found.setdefault((port, camera, origin), []).append(errors)
-    lines = []
-    for key, pairs in found.items():
-        degrees, centres = zip(*pairs, strict=True)
-        lines.append([*key, _mean(degrees, 3), _mean(centres, 1)])
-    return ["port", "camera", "extrinsic of", *_EXTRINSICS], lines
 
 
 def by_port(measured: Sequence[Measured]) -> dict[str, list[Measured]]:
@@ -108,21 +84,6 @@ def latex(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     columns = "".join("l" if head in _WORDS else "r" for head in heads)
     head = f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{' & '.join(heads)} \\\\\n"
     return f"{head}{''.join(body)}\\bottomrule\n\\end{{tabular}}\n"
-
-
-def _extrinsics(one: Measured) -> list[tuple[str, str, tuple[float, float]]]:
-    """Camera, origin and errors (deg, cm) of a drive's extrinsics, those found with all cameras together."""
-    out = []
-    for recipe, origins in ((OURS, ("CNI", "ENI", "Opt")), (PAPER, ("Opt",))):
-        sets = one.extrinsics.get(recipe, {})
-        for camera, methods in (list(sets.values())[-1] if sets else {}).items():
-            for origin in origins:
-                if origin in methods:
-                    errors = methods[origin]
-                    title = origin if recipe == OURS else f"{origin}, {recipe}"
-                    figures = errors["rotation_error_deg"], _CM * errors["translation_error_m"]
-                    out.append((camera, title, figures))
-    return sorted(out, key=lambda found: found[0])
 
 
 def _mean(values: Sequence[float], digits: int) -> str:
@@ -239,7 +200,6 @@ def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
         claims_table=markdown(["claim", "where", "asked", "measured", "on shared markings", "holds"], lines),
         failures=[(one.title, *failure) for one in measured for failure in one.failures],
         results_table=markdown(*results_table(measured)),
-        calibrations_table=markdown(*calibrations_table(measured)),
     )
 
 

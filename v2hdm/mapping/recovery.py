@@ -39,8 +39,8 @@ CLEAR_SIGMAS = 4.0
 """What is off by so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
 
 
-_PRIOR_ODDS = 1 / 800
-"""That an input is wrong: one drive in twenty of a new vehicle, say, has a wrong one of forty."""
+_PRIOR_ODDS = 1 / 400
+"""That an input is wrong: one drive in ten of a new vehicle, say, has a wrong one of forty."""
 
 _DOUBT = 0.05
 """Probability of a wrong input that a PASS leaves, which speaks of 95 %."""

@@ -49,7 +49,7 @@ def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
 
 
 def made_of_drives(paths: Sequence[str]) -> str:
-    """Name the maker of a result of the drives at these paths or URLs."""
+    """Name the maker of a result of the drives at these paths."""
     return f"v2hdm map of {', '.join(paths)}"
 
 

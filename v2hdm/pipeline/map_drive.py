@@ -17,7 +17,7 @@ from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import AUTO, MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
 from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, check_choice
@@ -35,7 +35,7 @@ from v2hdm.site.wear import with_wear
 from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
-from v2hdm.verdict.results.solution import check_result, over_surface
+from v2hdm.verdict.results.solution import check_result, over_ground
 from v2hdm.verdict.results.survey import check_corrections, check_known_sizes
 
 _log = logging.getLogger(__name__)
@@ -216,7 +216,7 @@ def _judge(
         unfit += check_corrections(survey.mapping.acceptance.corrections, best)
         reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.points else "poses")
         surveyed = check_survey(survey, best, compared)
-        before = over_surface(checked.findings, best)
+        before = over_ground(checked.findings, best, survey.mapping.ground == AUTO)
         verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
         judgement = evaluate(result.drive, methods)

@@ -1,9 +1,8 @@
 """A run as it is configured: :func:`v2hdm.map_drive` with a cache, and its result in a folder or at a URL.
 
 It needs no terminal and knows nothing of Hydra. What a run is made of is looked at first: where a finished
-result of just that lies in its place, nothing else is loaded or done. Runs whose drive or results are at an
-object store work in the cache: a drive is copied there first; a result is written to a folder there, whole,
-and then uploaded.
+result of just that lies in its place, nothing else is loaded or done. A result
+for an object store is written to a folder in the cache, whole, and then uploaded.
 """
 
 from __future__ import annotations
@@ -84,13 +83,11 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     output = place_of(config.output, "output=")
     if is_url(config.cache):
         raise ConfigError(f"cache={config.cache}: is a URL; give a folder, on a disk that machines may share")
+    stages = StageCache(Path(config.cache), config.resume)
     if isinstance(output, RemoteFolder):
-        output.below(run_name(config)).listed()  # what is wrong there is told before any work
-    local, stages = _local(config, progress), StageCache(Path(config.cache), config.resume)
-    if isinstance(output, RemoteFolder):
-        return _take_or_upload(local, output, stages, work, take, progress)
-    there = finished(local, stages) if take else None
-    return (work(local, stages), False) if there is None else (there, True)
+        return _take_or_upload(config, output, stages, work, take, progress)
+    there = finished(config, stages) if take else None
+    return (work(config, stages), False) if there is None else (there, True)
 
 
 def note_finished(result: RunResult, key: str, cache: StageCache) -> None:
@@ -136,21 +133,6 @@ def _is_of(config: RunConfig, key: str) -> bool:
         note_use(paths[0])
     drives = [read_drive(path, config.drive) for path in paths]
     return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
-
-
-def _local(config: RunConfig, progress: Progress) -> RunConfig:
-    """The settings with folders of this machine for the drives."""
-    drive = config.drive
-    given = drive.path if isinstance(drive.path, list) else [drive.path]
-    paths = [place_of(one, "drive.path=") if isinstance(one, str) and is_url(one) else one for one in given]
-    if any(isinstance(one, RemoteFolder) for one in paths):
-        config = replace(config, name=run_name(config))  # as before anything was copied
-    copy = partial(remote.download, cache=Path(config.cache), report=partial(progress, "copy"))
-    paths = [copy(one) if isinstance(one, RemoteFolder) else one for one in paths]
-    if paths != given:
-        local = [str(one) for one in paths]
-        drive = replace(drive, path=local if isinstance(drive.path, list) else local[0])
-    return replace(config, drive=drive)
 
 
 def _take_or_upload(
@@ -222,9 +204,7 @@ def made_of(config: RunConfig) -> str:
     if config.simulate is not None:
         return f"v2hdm map of the rendered {config.simulate.name}"
     given = config.drive.path if isinstance(config.drive.path, list) else [config.drive.path]
-    return made_of_drives(
-        [str(one) if is_url(str(one)) else str(Path(one).resolve()) for one in given if one]
-    )
+    return made_of_drives([str(Path(one).resolve()) for one in given if one])
 
 
 def map_and_save(

@@ -1,4 +1,4 @@
-"""Folders at object stores, by URL: a drive is downloaded once, a finished result uploaded, its list last.
+"""Folders at object stores, by URL: a finished result is uploaded, its list last.
 
 A put replaces an object at once or not at all, and an object can be created once; nothing else is asked of a
 store. Whatever fails there is one line.
@@ -19,10 +19,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.errors import ConfigError
 from v2hdm.extras import need
 from v2hdm.store.files import file_digest
-from v2hdm.store.folders import is_whole, new_entry, note_use
 from v2hdm.store.inputs import LIST
 
 Report = Callable[[int, int], None]  # called as report(done, total) with numbers of objects
@@ -37,7 +36,6 @@ _PACKAGES = {
 }  # fmt: skip
 """Protocols of stores that replace an object at once, and the package that speaks each."""
 
-_AT_ONCE = 32  # objects of one call, downloaded side by side
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
 _MESSAGE_LETTERS = 200
 
@@ -114,17 +112,6 @@ class RemoteFolder:
             return data
         return None
 
-    def fetch(self, places: Mapping[str, Path]) -> None:
-        """Copy objects, by name, to files; raises ConfigError where one is not there."""
-        for path in places.values():
-            path.parent.mkdir(parents=True, exist_ok=True)
-        names = [f"{self._root}/{name}" for name in places]
-        try:
-            with self._asked():
-                self._files.get(names, [str(path) for path in places.values()])
-        except FileNotFoundError as failure:
-            raise ConfigError(f"{self.url}: {_first_line(failure)} went while copied; start again") from None
-
     def write(self, name: str, content: bytes | Path) -> None:
         """Put an object, given as bytes or as a file, in whatever one of that name has been."""
         self._put(name, content, "overwrite")
@@ -185,37 +172,6 @@ class RemoteFolder:
 
 def _first_line(failure: Exception) -> str:
     return " ".join(str(failure).split())[:_MESSAGE_LETTERS] or type(failure).__name__
-
-
-def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
-    """The folder in ``cache`` that holds what is below a URL now, copied once for each content it has had.
-
-    Raises DriveError where there is no drive, a name of it leads out of its folder, or it cannot be copied.
-    """
-    there = {name: one for name, one in drive.listed().items() if not name.endswith("/")}
-    if not there:
-        raise DriveError(f"{drive}: no such drive; give the URL of a drive's folder")
-    wrong = next((name for name in there if {"", ".", ".."} & set(name.split("/")) or "\\" in name), None)
-    if wrong is not None:
-        raise DriveError(f"{drive}: the name {wrong!r} is none of a file in a folder; rename the object")
-    called, names = drive.url.rsplit("/", 1)[-1], sorted(there)
-    versions = [(name, there[name].size, there[name].token) for name in names]
-    digest = hashlib.sha256(json.dumps([drive.url, versions]).encode()).hexdigest()
-    entry = cache / f"{called}-{digest[:12]}"
-    if is_whole(entry):
-        note_use(entry)
-        return entry / called
-    size_mb = sum(one.size for one in there.values()) / 1e6
-    _log.info("%s: copying %d objects of %.1f MB to %s", drive, len(there), size_mb, entry)
-    with new_entry(entry) as partial:
-        for begin in range(0, len(names), _AT_ONCE):
-            some = names[begin : begin + _AT_ONCE]
-            drive.fetch({name: partial / called / name for name in some})
-            for name in some:
-                if (partial / called / name).stat().st_size != there[name].size:
-                    raise DriveError(f"{drive}/{name}: changes while it is copied; start again")
-            report(begin + len(some), len(names))
-    return entry / called
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,9 @@ def test_key_figures_and_tables_state_what_the_files_do(page):
     assert mounting["centre forward"][2] == "+100 mm"
     assert mounting["pitch, down"][:2] == ["14.324°", "0.006°"]
     assert mounting["clock, images later"][:2] == ["1.0 ms", "0.5 ms"]
-    assert page.summary == "4 markings, 1 lane line and 1 symbol, mapped along 3\u00a0m with 1 camera (front)."
+    assert (
+        page.summary == "4 markings, 1 lane line and 1 symbol, mapped along 3\u00a0m with 1 camera (front)."
+    )
     assert len(page.residuals) == 4
 
 

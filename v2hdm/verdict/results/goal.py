@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import Calibration, FloatArray, Marking
 from v2hdm.site.markings import LACKS_A_CORNER, TOO_UNCERTAIN
-from v2hdm.verdict.results.solution import relied_on
+from v2hdm.verdict.results.solution import doubted, name_of_input, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status
 
 _AHEAD_M = 10.0  # within which a vehicle uses what it sees on the ground
@@ -35,9 +35,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         reached_m = _radius_of_all_m(radius_m.ravel())
         corners = f"95 % of the corners of {len(markings)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
-        relied = [] if best.evidence is None else relied_on(best.evidence)
-        if relied:
-            says += f", if {' and '.join(relied)} are right, which this drive does not show"
+        says += "" if best.evidence is None else _conditions(best.evidence)
         relative_m = [_CIRCLE_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
         if relative_m:
             says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"
@@ -57,6 +55,14 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         left_m, helps = ground_ahead(one)
         says = f"its mounting leaves the ground ahead known to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
+
+
+def _conditions(evidence: SolveEvidence) -> str:
+    """What absolute accuracy rests on: inputs that may well be wrong, or that the drive does not show."""
+    doubtful, relied = doubted(evidence), relied_on(evidence)
+    if doubtful is not None:
+        return f", unless the {name_of_input(doubtful)} is off, as it may be"
+    return f", if {' and '.join(relied)} are right, which this drive does not show" if relied else ""
 
 
 def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -> Finding:

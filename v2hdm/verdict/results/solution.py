@@ -135,13 +135,21 @@ def check_result(
     return findings
 
 
-def over_surface(findings: Iterable[Finding], best: MethodResult) -> list[Finding]:
-    """The findings on the inputs, without those that ground bends which is mapped as a surface."""
-    if not best.hd_map.ground:
-        return list(findings)
-    fine = "the ground bends, and is mapped as a surface"
+def over_ground(findings: Iterable[Finding], best: MethodResult, is_tried: bool) -> list[Finding]:
+    """The findings on the inputs as the map answers them, of which the ground is a surface or a plane.
+
+    Where it is a surface no bend matters. A small one in the recorded heights is their noise if a surface was
+    tried (``is_tried``, as ``mapping.ground=auto`` has it) and explained the markings no better.
+    """
+    if best.hd_map.ground:
+        fine, answered = "the ground bends, and is mapped as a surface", tuple(Status)
+    else:
+        fine = "the recorded heights bend, but what the markings show is a plane"
+        answered = (Status.WARN,) if is_tried else ()
     return [
-        replace(one, status=Status.PASS, says=fine, limit=None) if one.check == "road" else one
+        replace(one, status=Status.PASS, says=fine, limit=None)
+        if one.check == "road" and one.status in answered
+        else one
         for one in findings
     ]
 
@@ -185,8 +193,8 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
     least = max(causes.values(), default=0.0) - _RIVAL_LOG_ODDS
     named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
-    doubtful = sorted(filter(is_doubtful, evidence.score_tests), key=doubt, reverse=True)
-    named = named or [_doubtful(one) for one in doubtful[:1]]
+    doubtful = doubted(evidence)
+    named = named or ([_doubtful(doubtful)] if doubtful is not None else [])
     findings += named if foreign in causes else [*named, foreign]
     findings += [stamps] if stamps.status is Status.WARN else []
     raised |= {one.check for one in named}
@@ -288,11 +296,22 @@ def _least_shown(one: Contradiction) -> str:
     return f"{CLEAR_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
 
 
+def doubted(evidence: SolveEvidence) -> Contradiction | None:
+    """The input that is likeliest to be off, of those that may well be and do not surely fail the map."""
+    doubtful = [one for one in evidence.score_tests if is_doubtful(one) and not is_contradicted(one)]
+    return max(doubtful, key=doubt, default=None)
+
+
 def relied_on(evidence: SolveEvidence) -> list[str]:
     """The inputs that would move the whole map if they erred in all cameras alike, unseen by this drive."""
     loose = {"the clocks": _loosest_clock_s(evidence) > CLOCK_OBSERVABLE_S}
     loose["the surveyed centres"] = bool(_loose_levers(evidence))
     return [name for name, is_loose in loose.items() if is_loose]
+
+
+def name_of_input(one: Contradiction) -> str:
+    """What the check of an input is called."""
+    return _CHECKS[one.fault][0]
 
 
 def _loosest_clock_s(evidence: SolveEvidence) -> float:
