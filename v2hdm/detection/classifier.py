@@ -168,15 +168,14 @@ def rectified_views(
         for plane in (log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2])
     )
     odds, shares = output.odds_at(points), output.shares_at(points)
-    lines = shares[output.classes.index(LANE_LINE)]
     names = catalogue.of_family(SYMBOL, OTHER)
-    symbols = shares[[k for k, name in enumerate(output.classes) if name in names]].sum(axis=0)
+    symbols = [k for k, name in enumerate(output.classes) if name in names]
     shared = {
         "log_grey": np.float32(_GREY_GAIN) * grey,
         "blueness": np.float32(_COLOUR_GAIN) * blueness,
         "paint_odds": np.float32(_ODDS_GAIN) * odds,
-        "line_share": lines,
-        "symbol_share": symbols,
+        "line_share": shares[output.classes.index(LANE_LINE)],
+        "symbol_share": shares[symbols].sum(axis=0),
         "outside": patches.outside(points),
     }
     views = np.empty((len(readings), len(CHANNELS), SIZE, SIZE), dtype=np.float32)

@@ -292,8 +292,7 @@ _LEAST_EXPONENT = -40.0
 def normal_pdf(x: np.ndarray) -> np.ndarray:
     """Density of the standard normal, float32; at least 1e-18, as denormal numbers are slow."""
     flat = x.reshape(-1, x.shape[-1])
-    exponent = np.asarray(cv2.multiply(flat, flat, scale=-0.5))
-    np.subtract(exponent, np.float32(_LOG_SQRT_2PI), out=exponent)
+    exponent = np.asarray(cv2.multiply(flat, flat, scale=-0.5)) - np.float32(_LOG_SQRT_2PI)
     np.maximum(exponent, np.float32(_LEAST_EXPONENT), out=exponent)
     # OpenCV's exponential takes a quarter of the time of numpy's.
     return np.asarray(cv2.exp(exponent, dst=exponent)).reshape(x.shape)

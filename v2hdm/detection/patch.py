@@ -28,11 +28,6 @@ Edges fitted to coded values lie outwards of those of a bright marking by about 
 _BOW_PX = 0.25  # a lens that bows the sides of a quadrilateral by less is as good as none
 
 
-def linear_bgr(coded: np.ndarray, linear_response: bool) -> np.ndarray:
-    """Pixels (..., 3) uint8 in [0, 1], proportional to radiance; float32."""
-    return _look_up(coded, _light_tables(linear_response)[0])
-
-
 @cache
 def _light_tables(linear_response: bool) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of each code and its :func:`log_light` (256,), float32."""
@@ -97,7 +92,8 @@ class Patches:
         """Radiance (..., 3), BGR, at points (..., 2), interpolated."""
         u, v = np.moveaxis(points_px, -1, 0).astype(np.float32).reshape(2, len(points_px), -1)
         coded = cv2.remap(self._image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return linear_bgr(coded, self._linear_response).reshape(*points_px.shape[:-1], 3)
+        radiance = _look_up(coded, _light_tables(self._linear_response)[0])
+        return radiance.reshape(*points_px.shape[:-1], 3)
 
     def outside(self, points_px: FloatArray) -> BoolArray:
         """Which points (..., 2) are outside the image."""
