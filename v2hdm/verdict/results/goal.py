@@ -61,8 +61,8 @@ def _conditions(evidence: SolveEvidence) -> str:
     """What absolute accuracy rests on: inputs that may well be wrong, or that the drive does not show."""
     doubtful, relied = doubted(evidence), relied_on(evidence)
     if doubtful is not None:
-        return f", unless the {name_of_input(doubtful)} is off, as it may be"
-    return f", if {' and '.join(relied)} are right, which this drive does not show" if relied else ""
+        return f" (unless the {name_of_input(doubtful)} is off, as it may be)"
+    return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
 
 
 def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -> Finding:
