@@ -143,7 +143,7 @@ class BagDescription:
             self.missing[f"cameras.{name}.mounting"] = MOUNTING
             return entry | {"mounting": "?"}
         angles_deg = np.degrees(mounting_angles(inverse(vehicle_from_cam)))
-        xyz_m, rpy_deg = np.round(vehicle_from_cam[:3, 3], 6).tolist(), np.round(angles_deg, 6).tolist()
+        xyz_m, rpy_deg = np.round(vehicle_from_cam[:3, 3], 9).tolist(), np.round(angles_deg, 9).tolist()
         return entry | {"mounting": {"xyz_m": xyz_m, "rpy_deg": rpy_deg}}
 
     def _vehicle_from(self, sensor: str) -> FloatArray | None:
