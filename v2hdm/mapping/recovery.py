@@ -181,7 +181,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
-        foreign, left = _foreign(inputs, settled, worst, progress), None
+        foreign, left = _foreign(inputs, settled, found, progress), None
         if worst is not None and log_odds(worst) > foreign[2] and len(corrected) < _MOST_CORRECTIONS:
             left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
         if worst is None or left is None:
@@ -218,28 +218,29 @@ def _settled(
 
 
 def _foreign(
-    inputs: Inputs, settled: Bundle, worst: ScoreTest | None, progress: Callable[[str], None]
+    inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest], progress: Callable[[str], None]
 ) -> tuple[float, float, float]:
-    """The likeliest stretch of foreign images, s, and its log odds as the cause of all that is contradicted.
+    """The likeliest stretch of foreign images, s, and its log odds as the cause of all that is doubtful.
 
     The tests look at corners, the stretch at which markings are found at all. What it explains of the corners
-    is what a solve without its images leaves less contradicted, as if that had as many of them.
+    is what a solve without its images leaves less doubtful, as if that had as many of them.
     """
     drive, names = inputs.drive, inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
     begin_s, end_s, gain = foreign_stretch(settled, inputs.sightings, views_of(drive, names), cameras)
-    if worst is None or gain <= 0:
+    suspect = next(filter(is_doubtful, found), None)
+    if suspect is None or gain <= 0:
         return begin_s, end_s, gain
     stamp_s = np.array([drive.images[one.image].stamp_s for one in inputs.detections])
     beyond = ((stamp_s < begin_s) | (stamp_s > end_s)).tolist()
     rest = replace(inputs, detections=list(compress(inputs.detections, beyond)))
     try:
-        without, found, _ = _settled(rest, progress)
+        without, tests, _ = _settled(rest, progress)
     except (AdjustError, MappingError) as failure:
         _log.warning("whether images from %.1f to %.1f s are foreign: %s", begin_s, end_s, failure)
         return begin_s, end_s, gain
-    left = max([0.0, *map(log_odds, found)]) * len(settled.row) / len(without.row)
-    gain += max(log_odds(worst) - left, 0.0)
+    left = max([0.0, *map(log_odds, tests)]) * len(settled.row) / len(without.row)
+    gain += max(log_odds(suspect) - left, 0.0)
     return begin_s, end_s, gain
 
 
