@@ -87,7 +87,7 @@ def test_a_marking_that_something_hides_in_one_image_is_no_label_there(
     before = {(each["image_id"], each["marking"]): each["iscrowd"] for each in of_markings(content)}
     assert there.get(key, 1) == 1
     others = [pair for pair in before if pair[0] != key[0]]
-    assert np.mean([there.get(pair) == before[pair] for pair in others]) > 0.97
+    assert np.mean([there.get(pair) == before[pair] for pair in others]) > 0.95
 
 
 def test_the_training_reads_them_and_takes_nothing_unsure_for_a_marking(labelled, small_drive):
