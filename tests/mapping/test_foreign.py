@@ -59,7 +59,9 @@ def test_worn_markings_and_missed_ones_are_no_other_drive(monkeypatch):
 
 def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     """Log odds of images from 3 to 6 s beside a fault that has ``left`` odds in a solve without them."""
-    fault = ScoreTest(Fault.FOCAL, -1, 0, -1, 0.0, gain=worst)
+    # A focal length that is surely longer, by a fifth of what is usual.
+    numbers = {"value": 0.004, "sigma": 4e-4, "model_sigma": 4e-4, "p_value": 1e-20}
+    fault = ScoreTest(Fault.FOCAL, -1, 0, -1, **numbers, gain=worst + float(np.log1p(0.2**2)))
     solved = []
 
     def settled(inputs, _):
@@ -79,7 +81,7 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     detections = [SimpleNamespace(image=n) for n in range(10)]
     inputs = recovery.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
     whole = SimpleNamespace(row=np.arange(1200))
-    told = recovery._foreign(inputs, whole, fault if worst else None, lambda _: None)  # type: ignore[arg-type]
+    told = recovery._foreign(inputs, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
     return told[2], solved
 
 
