@@ -15,6 +15,7 @@ from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, GroundStrip, HdMap
 from v2hdm.site.candidates import Exclusion
+from v2hdm.site.markings import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground
@@ -221,8 +222,9 @@ def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubl
     assert "(6.5, 0.5)" in found["double markings"].says
     other = replace(square_at(0.4, 0.0), kind="stop_line")
     assert raised(result(FINE, square_at(0.0, 0.0), square_at(1.0, 0.0), other), drive) == {}
-    left_out = tuple(Exclusion("diamond", np.zeros(2), 3, "odd shape") for _ in range(12))
-    assert set(raised(result(excluded=left_out), drive)) == {"excluded"}
+    for reason, is_told in (("odd shape", True), (LACKS_A_CORNER, False)):
+        left_out = tuple(Exclusion("diamond", np.zeros(2), 3, reason) for _ in range(12))
+        assert set(raised(result(excluded=left_out), drive)) == ({"excluded"} if is_told else set())
 
 
 def calibrated(yaw_deg):

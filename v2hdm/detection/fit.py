@@ -83,7 +83,7 @@ aperture."""
 _SEARCH_STEPS, _STEPS = 4, 8
 _MAX_STEP = 2.0  # longest step of a side, in blurs
 _SETTLED_PX, _FOUND_PX = 0.05, 0.3  # steps of fit and of search that are shorter than this are the last, px
-_INSIGNIFICANT = 0.1  # and so are those by which chi-square was to fall by no more than this
+_INSIGNIFICANT = 0.01  # and so are those by which chi-square was to fall by no more than this
 _BLUR, _K = 8, 9
 _LIGHT = 10
 _SLOPE = _LIGHT + KNOTS

@@ -31,7 +31,7 @@ from v2hdm.mapping.recovery import (
 )
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
-from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.markings import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results.agreement import (
     check_against_ground,
@@ -430,7 +430,7 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
 
 def _excluded(best: MethodResult) -> Finding:
     # What was too far off, too briefly in view, or no paint contradicts nothing.
-    innocent = (TOO_UNCERTAIN, NOT_OBSERVED, NOT_ON_GROUND)
+    innocent = (TOO_UNCERTAIN, LACKS_A_CORNER, NOT_OBSERVED, NOT_ON_GROUND)
     left_out = sum(one.reason not in innocent for one in best.excluded)
     count = left_out + len(best.hd_map.markings)
     share = left_out / max(count, 1)
