@@ -150,7 +150,16 @@ def test_a_surface_read_back_shows_from_any_pose_what_the_plane_would(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage", [{"knots": [0.0, 6.0, 9]}, {"points_map": "far"}, {"parameters": [np.nan]}, {"ahead": None}]
+    "damage",
+    [
+        {"knots": [0.0, 6.0, 9]},
+        {"knots": ["0", None]},
+        {"knots": [0.0, 0.0, 13]},
+        {"points_map": "far"},
+        {"parameters": [np.nan]},
+        {"ahead": None},
+        {"visit_ends": [[0.0, 1.0]]},
+    ],
 )
 def test_a_damaged_ground_is_named(damage):
     stored = Surface.level(way(arc())).stored() | damage

@@ -258,7 +258,7 @@ class IncrementalMap:
     def _linearised(
         self, earlier: _Quadratic, marking: int, sighted: Sighted
     ) -> tuple[_Quadratic, _Own, _Settled]:
-        """What ``earlier`` and a marking say of the cameras together, its share, and itself where they agree.
+        """The information of ``earlier`` and a marking on cameras, its share, and itself where they agree.
 
         Gauss-Newton steps: frames and corners are eliminated, and what is left of the cameras is added up.
         """

@@ -327,7 +327,7 @@ class Surface:
         return points_map + off * np.where(known, height_m / (centre[2] - height_m), 0.0)[:, None]
 
     def stored(self) -> dict[str, Any]:
-        """What :meth:`from_stored` makes it from, for a file; without the covariance."""
+        """The content of a file for :meth:`from_stored`, without the covariance."""
         arrays = {name: getattr(self.paths, name).tolist() for name in _STORED}
         parameters = {"parameters": self.parameters.tolist(), "knots": self.knots, "datum_m": self.datum_m}
         return arrays | parameters
@@ -339,15 +339,17 @@ class Surface:
             points, ahead, sense, station, ends, parameters = (
                 np.array(content[name], dtype=np.float64) for name in (*_STORED, "parameters")
             )
-            begin_m, step_m, along = content["knots"]
-            datum_m = float(content["datum_m"])
-        except (KeyError, TypeError, ValueError):
+            begin_m, step_m, datum_m = (float(one) for one in (*content["knots"][:2], content["datum_m"]))
+            along = int(content["knots"][2])
+        except (IndexError, KeyError, OverflowError, TypeError, ValueError):
             raise ValueError("not a ground: numbers are missing") from None
         places, none = len(station), np.zeros((0, 2))
         shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
         expected = ((places, 2), (places, 2), (places,), (2,), (_HINGES + along * _ACROSS,))
-        finite = (np.isfinite(one).all() for one in (points, ahead, sense, station, ends, parameters))
-        if shapes != expected or not places or not all(finite):
+        numbers = np.array([begin_m, step_m, datum_m])
+        arrays = (numbers, points, ahead, sense, station, ends, parameters)
+        is_sound = shapes == expected and places and all(np.isfinite(one).all() for one in arrays)
+        if not is_sound or step_m <= 0 or (np.diff(station) <= 0).any() or station[-1] > ends[-1, 1]:
             raise ValueError("not a ground: its numbers do not belong together")
         paths = Paths(np.zeros(0, np.int64), points, ahead, sense, station, none, none, none, ends)
         unknown = np.zeros((len(parameters), len(parameters)))

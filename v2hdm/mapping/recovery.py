@@ -36,7 +36,7 @@ from v2hdm.site.options import JOINT
 _log = logging.getLogger(__name__)
 
 CLEAR_SIGMAS = 4.0
-"""What is off by so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
+"""An error of so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
 
 
 _PRIOR_ODDS = 1 / 400

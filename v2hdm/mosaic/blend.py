@@ -402,7 +402,7 @@ class _Sums:
     ) -> Tensor:
         """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet.
 
-        Within a tile, about a metre, ground is as good as flat.
+        A tile of 2 cm a pixel is 1.3 m wide, over which ground bends by less than a millimetre.
         """
         corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
         sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)

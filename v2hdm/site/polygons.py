@@ -65,7 +65,7 @@ class Traces:
     def of(
         cls, outlines_px: Sequence[FloatArray], image: IntArray, px_from_map: FloatArray, shift_px: FloatArray
     ) -> Traces:
-        """Those of outlines (K, 2), each of an ``image`` (S,)."""
+        """The pieces of outlines (K, 2), each of an ``image`` (S,)."""
         pieces = []
         for outline, number in zip(outlines_px, image, strict=True):
             ring = outline if signed_area(outline) < 0 else outline[::-1]

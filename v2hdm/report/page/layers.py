@@ -82,7 +82,7 @@ _TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{
 
 
 def _source(path: Path) -> dict[str, Any]:
-    """What rasterio is to open: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
+    """The source that rasterio opens: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
     levels = sorted(int(one.name) for one in path.glob("*") if one.name.isdecimal())
     tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
     if tile is None:

@@ -58,7 +58,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
 
 
 def _conditions(evidence: SolveEvidence) -> str:
-    """What absolute accuracy rests on: inputs that may well be wrong, or that the drive does not show."""
+    """The inputs that absolute accuracy rests on: one that may be wrong, or those that no image shows."""
     doubtful, relied = doubted(evidence), relied_on(evidence)
     if doubtful is not None:
         return f" (unless the {name_of_input(doubtful)} is off, as it may be)"

@@ -310,7 +310,7 @@ def relied_on(evidence: SolveEvidence) -> list[str]:
 
 
 def name_of_input(one: Contradiction) -> str:
-    """What the check of an input is called."""
+    """The name of the check of an input."""
     return _CHECKS[one.fault][0]
 
 
