@@ -460,3 +460,50 @@ def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(
     route = graph.getRoute(before, begun)
     assert [one.id for one in route.shortestPath()] == [before.id, beside.id, begun.id]
     assert before.leftBound[-1].id == beside.leftBound[0].id
+
+
+def _destinations(tmp_path, lines):
+    """Where the lanes end that a route leads to from the first lane, for lines through points (x, y)."""
+    lanes = []
+    for corners in lines:
+        x_ends, y_ends = np.array(corners, dtype=float).T
+        x = np.linspace(*x_ends[[0, -1]], int(abs(np.ptp(x_ends)) * 2) + 1)
+        y = np.interp(x, x_ends, y_ends) if x[-1] > x[0] else np.interp(x, x_ends[::-1], y_ends[::-1])
+        lanes.append(Lane("lane_line", np.column_stack([x, y]), 3))
+    loaded = load(exported(tmp_path, "lanelet2", HdMap((), tuple(lanes), ORIGIN)), ORIGIN)
+    _, graph = routing(loaded)
+    firsts = [one for one in loaded.laneletLayer if not graph.previous(one)]
+    routes = {}
+    for first in firsts:
+        begin = points_of(first.centerline)[0, :2].round().astype(int)
+        ends = [
+            last
+            for last in loaded.laneletLayer
+            if not graph.following(last) and graph.getRoute(first, last) is not None
+        ]
+        reached = {tuple(points_of(last.centerline)[-1, :2].round().astype(int).tolist()) for last in ends}
+        routes[tuple(begin.tolist())] = reached
+    return routes
+
+
+WIDENING = [[(0, 8), (90, 8)], [(0, 4), (40, 0), (90, 0)], [(30, 4), (90, 4)]]
+"""A lane of 4 m whose right line bends away, until another begins in the middle between both."""
+
+
+def test_a_lane_that_splits_leads_to_both_of_its_branches(tmp_path):
+    assert _destinations(tmp_path, WIDENING) == {(0, 6): {(90, 2), (90, 6)}}
+
+
+def test_lanes_that_merge_lead_to_the_same_one(tmp_path):
+    merging = [[(90 - x, y) for x, y in reversed(line)] for line in WIDENING]
+    assert _destinations(tmp_path, merging) == {(0, 2): {(90, 6)}, (0, 6): {(90, 6)}}
+
+
+def test_a_lane_goes_on_where_one_of_its_lines_is_interrupted(tmp_path):
+    lines = [[(0, 3.5), (40, 3.5)], [(55, 3.5), (90, 3.5)], [(0, 0), (90, 0)]]
+    assert _destinations(tmp_path, lines) == {(0, 2): {(90, 2)}}
+
+
+def test_no_way_is_made_up_where_both_lines_of_a_lane_end(tmp_path):
+    lines = [[(begin, y), (begin + 30, y)] for y in (0, 3.5) for begin in (0, 45)]
+    assert _destinations(tmp_path, lines) == {(0, 2): {(30, 2)}, (45, 2): {(75, 2)}}

@@ -1,4 +1,4 @@
-"""Lanes between lane lines that run beside each other."""
+"""Lanes between lane lines that run beside each other, and how one goes over into the next."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ LANE_WIDTH_M = (2.55, 5.1)
 """Lines that are closer have no room for a truck, 2.55 m wide (Directive 96/53/EC, annex I, 1.1), and those
 farther apart have room for two."""
 
+_LONGEST_CONNECTION_M = 40.0
+"""Ways from lane to lane that are longer are no longer evident from the line that bounds both: the taper of a
+lane that begins at 50 km/h is 30 to 40 m long (RASt 06, 6.1.4)."""
+
 _AT_ONCE = 64  # neighbouring vertices that are compared with the segments around them together
 
 
@@ -27,6 +31,81 @@ class ClosedLane:
 
     left: tuple[int, IntArray]
     right: tuple[int, IntArray]
+
+
+@dataclass(frozen=True)
+class Connection:
+    """The way from the end of the lane ``before`` to the start of the lane ``after``, both by number.
+
+    ``left`` and ``right`` are bounds as those of a lane, or None on a side on which no one line bounds both
+    lanes: where lanes split, merge, or paint is interrupted.
+    """
+
+    before: int
+    after: int
+    left: tuple[int, IntArray] | None
+    right: tuple[int, IntArray] | None
+
+
+def connections(lanes: Sequence[ClosedLane], lines_map: Sequence[FloatArray]) -> list[Connection]:
+    """How lanes that do not touch continue, split and merge: along a line that bounds one and then the other.
+
+    Lanes that end where no line of theirs goes on, as at a crossing, are left unconnected: nothing that is
+    painted says how they continue.
+    """
+    found = {}
+    for side in ("left", "right"):
+        following = _next_along(lanes, side)
+        for before, after in following.items():
+            bounds = {one: _bound_between(lanes[before], lanes[after], one) for one in ("left", "right")}
+            if _is_way(lanes[before], lanes[after], bounds[side], lines_map):
+                found[before, after] = Connection(before, after, **bounds)
+    return [found[key] for key in sorted(found)]
+
+
+def _next_along(lanes: Sequence[ClosedLane], side: str) -> dict[int, int]:
+    """For each lane that has one, the next lane along the line on one ``side`` of both."""
+    starts: dict[tuple[int, bool], list[tuple[int, int]]] = {}
+    for number, lane in enumerate(lanes):
+        line, order = getattr(lane, side)
+        ahead = bool(order[-1] > order[0])
+        starts.setdefault((line, ahead), []).append((int(order[0]) if ahead else -int(order[0]), number))
+    after = {}
+    for number, lane in enumerate(lanes):
+        line, order = getattr(lane, side)
+        ahead = bool(order[-1] > order[0])
+        end = int(order[-1]) if ahead else -int(order[-1])
+        beyond = [start for start in starts[line, ahead] if start[0] >= end]
+        if beyond:
+            after[number] = min(beyond)[1]
+    return after
+
+
+def _bound_between(before: ClosedLane, after: ClosedLane, side: str) -> tuple[int, IntArray] | None:
+    (line, end), (other, start) = getattr(before, side), getattr(after, side)
+    turn = 1 if end[-1] > end[0] else -1
+    if line != other or (start[0] - end[-1]) * turn <= 0:
+        return None
+    return line, np.arange(end[-1], start[0] + turn, turn)
+
+
+def _is_way(
+    before: ClosedLane,
+    after: ClosedLane,
+    shared: tuple[int, IntArray] | None,
+    lines_map: Sequence[FloatArray],
+) -> bool:
+    """Whether the stretch of line that two lanes share is a lane's way, with both sides in its direction."""
+    if shared is None:  # the lanes touch, or part where they touch
+        return False
+    line, order = shared
+    stretch = lines_map[line][order]
+    way = stretch[-1] - stretch[0]
+    gaps = [
+        lines_map[start[0]][start[1][0]] - lines_map[end[0]][end[1][-1]]
+        for end, start in ((before.left, after.left), (before.right, after.right))
+    ]
+    return bool(length_along(stretch)[-1] <= _LONGEST_CONNECTION_M and all(gap @ way > 0 for gap in gaps))
 
 
 def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:

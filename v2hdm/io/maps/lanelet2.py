@@ -2,7 +2,8 @@
 
 Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation; a
 stop line is a line string as well, with the regulatory element that Autoware's map validator asks for. Lane
-lines are line strings; where two of them bound a lane there is a lanelet.
+lines are line strings; where two of them bound a lane there is a lanelet, and another where a lane goes on,
+splits or merges along a line that bounds both: its other bound is ``virtual`` where no paint shows it.
 
 Lanelet2 has no word for paint without a sign: a stop line's element is a ``traffic_sign``, whose sign is a
 line beside the paint, tagged ``virtual``. The id of a marking or lane line is that of the map; the other ids
@@ -24,7 +25,7 @@ import numpy as np
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.extras import need
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
-from v2hdm.io.maps.closed_lanes import closed_lanes
+from v2hdm.io.maps.closed_lanes import closed_lanes, connections
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
 from v2hdm.store.files import dump_yaml, replace_text
@@ -128,6 +129,8 @@ class _Lanes:
         self.vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
         self.rules: list[list[int]] = [[] for _ in self._lanes]
         self._bounds: dict[tuple[int, int, int], int] = {}
+        self._counts: Counter[int] = Counter()
+        self._virtuals: Counter[int] = Counter()
 
     def of(self, place_map: FloatArray) -> int | None:
         """The lane in which a place (2,) of the map lies."""
@@ -146,16 +149,39 @@ class _Lanes:
         return np.asarray(np.gradient(left, axis=0)[nearest])
 
     def write(self) -> None:
-        """Write a lanelet of each lane, with those lines of its own that it needs as bounds."""
-        counts: Counter[int] = Counter()
+        """Write a lanelet of each lane and of each connection, with the lines that they need as bounds."""
         for lane, rules in zip(self._lanes, self.rules, strict=True):
-            owner = self._lines[lane.left[0]]
-            counts[owner.id] += 1
-            lanelet_id = _part(owner, _MOST_VERTICES + _PARTS // 4 + counts[owner.id])
-            members = [("way", self._bound(*lane.left), "left"), ("way", self._bound(*lane.right), "right")]
-            members += [("relation", rule, "regulatory_element") for rule in rules]
-            tags = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
-            self._document.relation(lanelet_id, members, tags | {"participant:vehicle": "yes"})
+            self._lanelet(self._lines[lane.left[0]], self._bound(*lane.left), self._bound(*lane.right), rules)
+        for one in connections(self._lanes, [line.points_map for line in self._lines]):
+            before, after = self._lanes[one.before], self._lanes[one.after]
+            left, right = (
+                self._virtual(end, start) if bound is None else self._bound(*bound)
+                for bound, end, start in (
+                    (one.left, before.left, after.left),
+                    (one.right, before.right, after.right),
+                )
+            )
+            self._lanelet(self._lines[before.left[0]], left, right, ())
+
+    def _lanelet(self, owner: Feature, left: int, right: int, rules: Sequence[int]) -> None:
+        self._counts[owner.id] += 1
+        lanelet_id = _part(owner, _MOST_VERTICES + _PARTS // 4 + self._counts[owner.id])
+        members = [("way", left, "left"), ("way", right, "right")]
+        members += [("relation", rule, "regulatory_element") for rule in rules]
+        tags = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
+        self._document.relation(lanelet_id, members, tags | {"participant:vehicle": "yes"})
+
+    def _virtual(self, end: tuple[int, IntArray], start: tuple[int, IntArray]) -> int:
+        """A bound that no paint shows, from where one lane's ends to where another's starts."""
+        owner = self._lines[end[0]]
+        self._virtuals[owner.id] += 1
+        number = _part(owner, _MOST_VERTICES + 3 * _PARTS // 8 + self._virtuals[owner.id])
+        nodes = [
+            self.vertices[self._lines[line].id][at]
+            for line, at in ((end[0], end[1][-1]), (start[0], start[1][0]))
+        ]
+        self._document.way(number, nodes, {"type": "virtual"})
+        return number
 
     def _bound(self, line: int, order: IntArray) -> int:
         """The line string of a bound: the line itself where that is all of it, else a piece of its nodes."""
