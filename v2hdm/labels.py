@@ -22,7 +22,7 @@ from scipy.stats import norm
 
 from v2hdm.association.sightings import row_shares
 from v2hdm.association.surface import Surface
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.batch import read_grey
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, has_distortion
@@ -206,7 +206,7 @@ def write_labels(
     for number, image in enumerate(drive.images):
         if image.camera in facts.cameras:
             eye = _Eye.of(image, facts.cameras[image.camera], facts)
-            grey = read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32)
+            grey = read_grey(image, drive.cameras[image.camera])
             found = seen.get(drive.name_of(image.path), set())
             views += _views(eye, grey, outlines, len(images), found, range_m)
             silent += [(len(images), one) for one in _silent(eye, facts, range_m)]

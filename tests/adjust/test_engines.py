@@ -135,7 +135,8 @@ def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, length
     corners = estimate.corners_map[3:12]
     assert_same(one.coupling(run, corners), other.coupling(run, corners))
     by_residual = torch.as_tensor(rng.normal(0, 1, numba.arrays.measured.shape))
-    assert_same(numba.pull(estimate, by_residual), by_torch.pull(estimate, by_residual))
+    pulled = [each.pull(estimate, each.spread(estimate), by_residual) for each in (numba, by_torch)]
+    assert_same(*pulled)
     by_corner = torch.as_tensor(rng.normal(0, 1, estimate.corners_map.shape))
     for mine, theirs in zip(one.carry(by_corner), other.carry(by_corner), strict=True):
         assert_same(mine, theirs)

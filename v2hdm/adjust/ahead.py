@@ -55,8 +55,8 @@ def use_kernels() -> None:
         solution = solve(problem, SolveOptions(pose_states=states, coarse=not states))
         descent = solution.covariance.descent
         corner_gain(descent.whitening)
-        pulled = descent.engine.pull(descent.estimate, torch.zeros(2, len(problem.observations.corner)))
-        descent.whitening.whiten(pulled)
+        whitening = descent.whitening
+        whitening.whiten([whitening.pull(torch.zeros(2, len(problem.observations.corner)))])
 
 
 def _small_problem() -> Problem:

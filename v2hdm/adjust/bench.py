@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
@@ -22,7 +23,7 @@ from v2hdm.adjust.model import (
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 _STEP = 1e-3
 """Step of the priors' central differences, in the unit of the fault (s or rad): millimetres of motion."""
@@ -32,6 +33,8 @@ STRETCHES = 24
 
 _DRAWS = 16
 """Draws of the model's own noise: what the stretches would disagree by is known to a tenth."""
+
+_AT_ONCE = 64  # columns whose gradients are in memory together
 
 Rows = dict[str, Tensor]
 """Whitened residuals, or their derivatives by one number, by kind: ``observations`` (2, K), and the priors'
@@ -72,10 +75,10 @@ class Bench:
         return self.whitening.engine.arrays
 
     @cached_property
-    def noise(self) -> list[Rows]:
-        """Residuals that noise as the model has it would leave, drawn."""
+    def noise(self) -> FloatArray:
+        """Residuals (R, D) that noise as the model has it would leave, drawn."""
         generator = torch.Generator().manual_seed(0)
-        return [
+        drawn = [
             self.efficient(
                 {
                     name: torch.randn(row.shape, generator=generator, dtype=row.dtype).to(row.device)
@@ -84,6 +87,7 @@ class Bench:
             )
             for _ in range(_DRAWS)
         ]
+        return np.stack([self.flat(one) for one in drawn], axis=1)
 
     @property
     def camera(self) -> Tensor:
@@ -170,26 +174,34 @@ class Bench:
             ends, by = [priors[name] for name in of_priors], [column[name] for name in of_priors]
             gradient = Gradient(*torch.autograd.grad(ends, leaves, by, materialize_grads=True))
         if "observations" in column:
-            seen = engine.pull(estimate, column["observations"] * self.root)
+            seen = self.whitening.pull(column["observations"] * self.root)
             pairs = zip(vars(gradient).values(), vars(seen).values(), strict=True)
             gradient = Gradient(*(one + other for one, other in pairs))
-        whitened: Tensor = self.whitening.whiten(gradient)
-        return whitened
+        return self.whitening.whiten([gradient])[0]
 
-    def by_stretch(self, one: Rows, other: Rows) -> FloatArray:
-        """The product of two columns, (G + 1,): by stretch, and of the priors that belong to none."""
+    def flat(self, rows: Rows) -> FloatArray:
+        """All residuals, or derivatives, one after another, (R,)."""
+        return np.concatenate([rows[name].flatten().cpu().numpy() for name in self.residuals])
+
+    @cached_property
+    def _stretch_of(self) -> tuple[IntArray, IntArray]:
+        """The numbers of all residuals, stretch by stretch, and where each stretch begins among them."""
         count = int(self.stretch.max()) + 1
-        out = one["observations"].new_zeros(count + 1)
-        for name, row in one.items():
-            product = row * other[name]
-            if name == "observations":
-                frame = self.arrays.frame_of(self.arrays.pair).long()
-                out.index_add_(0, self.stretch[frame], product.sum(0))
-            elif name == "frame_states":
-                out.index_add_(0, self.stretch, product.sum(1))
-            else:
-                out[-1] += product.sum()
-        return np.asarray(out.cpu().numpy())
+        by_kind = {name: torch.full_like(row, count) for name, row in self.residuals.items()}
+        by_kind["observations"][:] = self.stretch[self.arrays.frame_of(self.arrays.pair).long()]
+        by_kind["frame_states"][:] = self.stretch[:, None]
+        stretch = self.flat(by_kind)
+        order = np.argsort(stretch, kind="stable")
+        return order, np.searchsorted(stretch[order], np.arange(count + 2))
+
+    def by_stretch(self, one: FloatArray, others: FloatArray) -> FloatArray:
+        """The products (G + 1, ...) of a column (R,) and others (R, ...).
+
+        They are summed by stretch, and last over the priors that belong to none.
+        """
+        order, begin = self._stretch_of
+        shape = len(begin) - 1, len(one)
+        return np.asarray(csr_array((one[order], order, begin), shape=shape) @ others)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
@@ -235,11 +247,12 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     squared = unit.square().sum(0).cpu().numpy()
     information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
     seen = np.flatnonzero(information.diagonal() > 0)
-    coupled = bench.root.new_zeros(len(seen), bench.whitening.size)
     by_column = columns[:, seen].tocsc()
-    for k, row in enumerate(coupled):
-        lifted = torch.as_tensor(by_column[:, [k]].toarray()[:, 0]).to(unit)
-        row[:] = bench._coupling({"observations": unit * lifted})
+    coupled, weighted = bench.root.new_zeros(len(seen), bench.whitening.size), unit * bench.root
+    for begin in range(0, len(seen), _AT_ONCE):
+        lifted = torch.as_tensor(by_column[:, begin : begin + _AT_ONCE].toarray().T).to(unit)
+        pulled = [bench.whitening.pull(weighted * one) for one in lifted]
+        coupled[begin : begin + _AT_ONCE] = bench.whitening.whiten(pulled)
     information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
     gradient = columns.T @ (unit * bench.residuals["observations"]).sum(0).cpu().numpy()
     gradient[seen] -= (coupled @ bench.whitening.gradient).cpu().numpy()

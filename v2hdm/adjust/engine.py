@@ -110,8 +110,11 @@ class Engine(ABC):
         """The cost, by name."""
 
     @abstractmethod
-    def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
-        """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
+    def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
+        """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K).
+
+        ``spread`` is that of :meth:`spread` at the estimate.
+        """
 
     @abstractmethod
     def spread(self, estimate: Estimate) -> Spread:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -146,7 +147,8 @@ class _Evaluations:
         for known, cost, gradient in self._known:
             if torch.equal(known, point):
                 return cost, gradient
-        cost, gradient = self._objective(point)
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too far may overflow
+            cost, gradient = self._objective(point)
         self._known.append((point.clone(), cost, gradient))
         return cost, gradient
 

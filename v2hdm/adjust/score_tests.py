@@ -178,14 +178,14 @@ class _Answer:
     def to(cls, hypothesis: _Hypothesis, bench: Bench) -> _Answer:
         """The answer at a solution."""
         column = hypothesis.column(bench)
-        efficient = bench.efficient(column)
+        efficient = bench.flat(bench.efficient(column))
         information = bench.by_stretch(efficient, efficient)
         own = sum(float(row.square().sum()) for row in column.values())
         return cls(
             hypothesis,
-            -bench.by_stretch(efficient, bench.residuals),
+            -bench.by_stretch(efficient, bench.flat(bench.residuals)),
             information,
-            np.array([bench.by_stretch(efficient, noise) for noise in bench.noise]),
+            bench.by_stretch(efficient, bench.noise).T,
             own,
         )
 

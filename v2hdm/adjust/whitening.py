@@ -17,6 +17,7 @@ are then unknowns of r, and variables that are always zero stand where they woul
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -77,10 +78,20 @@ class Whitening:
         """Number of whitened variables: the reduced ones, then 2 N."""
         return self.reduced_factor.size + 2 * self.engine.arrays.corner_count
 
-    def whiten(self, gradient: Gradient) -> Tensor:
-        """A gradient by x as one by y, under the factors of this Hessian."""
-        corners, coupled = self.linearised.carry(gradient.corners_map)
-        return whitened_gradient(self.plan, self.reduced_factor, gradient, coupled, corners)
+    def pull(self, by_residual: Tensor) -> Gradient:
+        """The gradient by x of a scalar, from that by the whitened residuals (2, K)."""
+        return self.engine.pull(self.estimate, self.spread, by_residual)
+
+    def whiten(self, gradients: Sequence[Gradient]) -> Tensor:
+        """Gradients by x as those (n, size) by y, under the factors of this Hessian."""
+        carried = [self.linearised.carry(one.corners_map) for one in gradients]
+        rest = [
+            _less_corners(self.plan, one, coupled, corners)
+            for one, (corners, coupled) in zip(gradients, carried, strict=True)
+        ]
+        reduced = self.reduced_factor.solve(torch.stack(rest, dim=1))
+        own = torch.stack([_less_kept(self.plan, corners) for corners, _ in carried])
+        return torch.cat([reduced.mT, own.flatten(1)], dim=1)
 
     def step(self, whitened: Tensor) -> tuple[Gradient, Tensor, Tensor]:
         """The step x that whitened variables stand for, but for its corners.
@@ -109,13 +120,21 @@ def whitened_gradient(
     plan: Plan, factor: TiledCholesky, gradient: Gradient, coupled: Coupled, corners: Tensor
 ) -> Tensor:
     """The gradient by y, of the part of the corners (N, 2) and ``coupled``, W V^-1 g_c."""
+    rest = _less_corners(plan, gradient, coupled, corners)
+    return torch.cat([factor.solve(rest[:, None])[:, 0], _less_kept(plan, corners).flatten()])
+
+
+def _less_corners(plan: Plan, gradient: Gradient, coupled: Coupled, corners: Tensor) -> Tensor:
+    """The gradient by the reduced unknowns, g_r - W V^-1 g_c."""
     rest = (torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera).flatten()
     if plan.tile_count:
         by_state = gradient.frame_state - coupled.frame_state
         rest = torch.cat([to_tiles(plan, by_state, corners[plan.kept]), rest])
-    if len(plan.kept):
-        corners = corners.index_fill(0, plan.kept, 0.0)
-    return torch.cat([factor.solve(rest[:, None])[:, 0], corners.flatten()])
+    return rest
+
+
+def _less_kept(plan: Plan, corners: Tensor) -> Tensor:
+    return corners.index_fill(0, plan.kept, 0.0) if len(plan.kept) else corners
 
 
 def factorise(

@@ -81,6 +81,13 @@ def read_image(image: Image, camera: Camera) -> np.ndarray:
     return pixels
 
 
+def read_grey(image: Image, camera: Camera) -> np.ndarray:
+    """The grey values (H, W) float32 of an image file of a drive; raises as :func:`read_image`."""
+    bgr = read_image(image, camera).astype(np.float32)
+    # Numpy takes five times as long for a mean over three channels.
+    return np.asarray(cv2.transform(bgr, np.ones((1, 3), dtype=np.float32)) / np.float32(3))
+
+
 def detect_all(
     drive: Drive,
     options: DetectorOptions | None = None,

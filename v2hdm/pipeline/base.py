@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.batch import read_grey
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
 from v2hdm.io.maps.evidence import read_exclusions
@@ -74,7 +74,7 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
     """Reads the grey values of a drive's images."""
 
     def grey(image: Image) -> NDArray[np.float32]:
-        return np.asarray(read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32))
+        return read_grey(image, drive.cameras[image.camera])
 
     return grey
 

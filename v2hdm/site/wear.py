@@ -217,7 +217,7 @@ def _seen(
             some = order[start : start + 8 * threads]
             for index, pixels in zip(some, readers.map(lambda one: grey(images[one]), some), strict=True):
                 own = calibrations[images[index].camera]
-                light = _LIGHT[np.clip(pixels, 0, 255).astype(np.uint8)]
+                light = cv2.LUT(pixels.astype(np.uint8), _LIGHT)
                 for number in wanted[index]:
                     places = cells[number].places_map
                     px = distort_points(own.info, pinhole_px(index, places.reshape(-1, 2))[0])

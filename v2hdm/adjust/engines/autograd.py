@@ -153,7 +153,7 @@ class TorchEngine(Engine):
         moved = Estimate(estimate.cam_from_vehicle.detach(), base.frame_state, base.corners_map, base.clock_s)
         return moved, terms, Gradient(*gradient)
 
-    def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
+    def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
         """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
         arrays = self.arrays
         tangent = estimate.cam_from_vehicle.new_zeros(arrays.camera_count, 6)

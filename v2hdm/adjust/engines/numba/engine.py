@@ -143,14 +143,12 @@ class NumbaEngine(Engine):
         system = ReducedSystem(self.arrays, self.plan(), spread)
         return self.eliminate(system, estimate, robust).terms
 
-    def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
+    def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
         """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         wrench, by_corner = np.zeros((len(table), 6)), np.zeros_like(corners)
         observe.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
-        gathered = self.spread(estimate).gather(
-            torch.from_numpy(wrench).view(self.arrays.camera_count, -1, 6)
-        )
+        gathered = spread.gather(torch.from_numpy(wrench).view(self.arrays.camera_count, -1, 6))
         camera = gathered.camera
         return Gradient(camera[:, :6], gathered.frame_state, torch.from_numpy(by_corner), camera[:, 6:])
 
