@@ -8,7 +8,7 @@
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
-ARGS ?= +run=port2 mosaic=true
+ARGS ?= +run=port2
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt

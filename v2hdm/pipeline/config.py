@@ -90,7 +90,7 @@ class RunConfig:
         mode: the value that it passes on as ``mapping.mode``, ``batch`` or ``incremental``.
         accuracy_goal_cm: the radius, cm, within which 95 % of the corners, and the calibrations, have to be
             known at 95 %, else the verdict is WARN (docs/verdict.md).
-        mosaic: whether the ground is shown from above, too (docs/report.md).
+        mosaic: whether the ground of a single drive is shown from above, too (docs/report.md).
         export: formats of the map: ``geojson``, ``gpkg``, ``lanelet2``, ...; of the ground: ``geotiff``,
             ``opencrg`` (docs/exports.md).
         crs: the system of their coordinates, such as ``EPSG:25832``, or ``local``; ``map.geojson`` keeps its
@@ -113,7 +113,7 @@ class RunConfig:
     mode: str = "batch"
     accuracy_goal_cm: float = ACCURACY_GOAL_CM
     all_maps: bool = False
-    mosaic: bool = False
+    mosaic: bool = True
     export: list[str] = field(default_factory=lambda: ["geojson"])
     crs: str | None = None
 
@@ -198,8 +198,6 @@ def admit(config: RunConfig) -> str:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():
             raise ConfigError(f"report.background: no file or folder {config.report.background}")
-    if config.mosaic and len(config.drive.paths) > 1:
-        raise ConfigError("mosaic=true shows the ground of one drive; map the drives one by one for it")
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name

@@ -15,7 +15,7 @@ import numpy as np
 from v2hdm import __version__
 from v2hdm.association.surface import FILE as GROUND
 from v2hdm.detection.batch import read_image
-from v2hdm.errors import MapFileError, MappingError
+from v2hdm.errors import ConfigError, DriveError, MapFileError, MappingError
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import inverse
@@ -174,7 +174,7 @@ class Result:
         folder: Path | str,
         formats: Sequence[str] = ("geojson",),
         all_maps: bool = False,
-        mosaic: bool = False,
+        mosaic: bool = True,
         crs: str | None = None,
     ) -> Path:
         """Write all that ``v2hdm map`` writes into ``folder``, whole or not at all; returns the folder.
@@ -183,7 +183,7 @@ class Result:
             folder: is made, or has an earlier result, which is replaced; nobody else's file is.
             formats: of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``, ...
             all_maps: whether the map of every method and camera set is written, into ``maps/``.
-            mosaic: whether the ground is shown from above, too.
+            mosaic: whether the ground of a single drive is shown from above, too.
             crs: the system of coordinates of the formats but ``geojson``, as ``EPSG:25832`` or ``local``.
 
         Raises:
@@ -214,9 +214,12 @@ class Result:
                     path = folder / "maps" / f"{name}_{method}.geojson"
                     write_geojson(with_heights(made.hd_map, self.drive.road), path)
         write_json(folder / "metrics.json", self.metrics)
-        if mosaic and self.methods:
+        if mosaic and self.methods and not self.drive.joined:
             with context.timed("mosaic"):
-                write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
+                try:
+                    write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
+                except (ConfigError, DriveError) as failure:  # a picture is no reason to lose a map
+                    _log.warning("no mosaic is made: %s", failure)
         if "qgis" in formats and self.methods:  # it opens the mosaic, too
             grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
             write_qgis(self.map, folder / "map.qgs", grid=grid)
