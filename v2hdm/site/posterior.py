@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.stats import f, norm, t
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
 from v2hdm.site.shapes import (
+    MEMBER_M,
     SHAPE_SIGMA_M,
     Laid,
     PaintError,
@@ -56,6 +57,16 @@ sound end agree, a worn one ends elsewhere in each (229 sound ends and 10 worn o
 _UNCLEAR_SHARE, _CLEAR_SHARE = 0.05, 0.1
 """Share of the sound ends that are as uncertain as worn ones, being far off, and of the worn ones that all
 images show alike (5 of 229 and 1 of 11 ends there)."""
+
+_SERIES_TURN_RAD, _SERIES_BESIDE_M = 1.0, 0.5
+"""Most that a line turns by from one dash to the next, a bend of 6 m radius where they are 6 m apart, and how
+far at most they lie beside an arc between them: lines are farther apart."""
+
+_SERIES_UNEVEN = (
+    0.2  # share by which the distances to the dash before and to the next differ where none lacks
+)
+_SERIES_STRETCH = 1.5  # most by which a bend stretches or shrinks a line: 4 m beside a middle of 12 m radius
+_SERIES_LEAST = 3  # dashes of their class's length that others follow: enough for a median
 
 _MISPLACED_M = 0.3
 """Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
@@ -379,9 +390,19 @@ def _add_shape(
     candidates, share = space.candidates, space.share
     laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
     scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
-    space.add(OF_CLASS, part / 2, laid, scatter)
-    space.add(OF_CLASS, part / 2, otherwise, scatter)
     ends = _inwards(laid.corners_map, shape.is_elongated)
+    shorter, ways = (ends[0][0] + ends[1][0]) / 2, [(part, laid, scatter)]
+    if shape.is_elongated and (series := _in_series(candidates, laid, shorter, shape.sigma_m, weight)):
+        longer_m, sigma_m, often = series
+        stretched = laid.corners_map - (longer_m[:, None] * shorter).reshape(-1, 4, 2)
+        about = scatter + sigma_m[:, None, None] ** 2 * _outer(shorter)
+        ways = [
+            (part * (1 - often), laid, scatter),
+            (part * often, replace(laid, corners_map=stretched), about),
+        ]
+    for each, one, about in ways:
+        space.add(OF_CLASS, each / 2, one, about)
+    space.add(OF_CLASS, part / 2, otherwise, scatter)
     for moved in _CORNERS_MOVED:
         block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
         space.add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
@@ -396,13 +417,13 @@ def _add_shape(
             _worn_evidence(candidates, [end for end, _ in ends], weight), ends, strict=True
         )
     ]
-    shorter = (ends[0][0] + ends[1][0]) / 2
     spread_m, again = _other_lengths(candidates, laid, shorter, shape.sigma_m, other_length)
     longer = scatter + spread_m**2 * _outer(shorter)
     space.add(OTHER_LENGTH, part, laid, longer, beside=again)
     other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
     angles = [[_NOTHING, _slanted(laid.corners_map, end)] for end, _ in ends]
-    _add_wrong_ends(space, part, laid, [(1 - other, scatter), (other, longer)], ends, angles, worn)
+    for each, one, about in ways:
+        _add_wrong_ends(space, each, one, [(1 - other, about), (other, longer)], ends, angles, worn)
     # Of what is no marking any end is as likely ragged as not.
     return np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
 
@@ -469,6 +490,55 @@ def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
     rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
     sound = _rates(vague, found, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
     return np.asarray(np.logaddexp(_rates(vague, found, 1.0, 1.0) - sound, 0.0) - np.log(2))
+
+
+def _in_series(
+    candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """How much longer (N,), m, dashes are for standing farther apart than others; its sigma (N,); how often.
+
+    The outer side of a bend is longer than its inner one, paint and gaps alike. 0 where no other follows in a
+    dash's line; None where too few do. Arguments are those of :func:`_other_lengths`.
+    """
+    sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
+    length_m, rows = np.linalg.norm(sides, axis=2).max(axis=1), np.arange(len(sides))
+    axis = sides[rows, np.linalg.norm(sides, axis=2).argmax(axis=1)] / length_m[:, None]
+    centre = candidates.corners_map.mean(axis=1)
+    to = centre - centre[:, None]
+    along = np.einsum("ijk,ik->ij", to, axis)
+    across = to[..., 1] * axis[:, None, 0] - to[..., 0] * axis[:, None, 1]
+    alike = axis @ axis.T
+    turn = np.arccos(np.clip(np.abs(alike), 0.0, 1.0))
+    # The chord between two points of a circle makes equal angles with the tangents there.
+    beside_m = np.abs(across - np.sign(alike) * across.T) / 2
+    follows = (weight > 0.5) & (np.abs(along) > length_m[:, None])
+    follows &= (turn < _SERIES_TURN_RAD) & (beside_m < _SERIES_BESIDE_M)
+    arc_m = np.linalg.norm(to, axis=2) / np.sinc(turn / 2 / np.pi)
+    ahead, behind = (np.where(follows & (sign * along > 0), arc_m, np.inf).min(axis=1) for sign in (1, -1))
+    apart_m = np.minimum(ahead, behind)  # where one lacks, there is a longer way on its side
+    with np.errstate(invalid="ignore"):
+        apart_m += np.where(
+            np.abs(ahead - behind) < _SERIES_UNEVEN * apart_m, np.abs(ahead - behind) / 2, 0.0
+        )
+    own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
+    variance = _along(candidates.covariance_m2, shorter, shorter) + sigma_m**2
+    usual = np.isfinite(apart_m) & (weight > 0.5) & (own_m**2 < 9 * variance)
+    if usual.sum() < _SERIES_LEAST:
+        return None
+    stretch = apart_m / np.median(apart_m[usual])
+    in_line = np.abs(np.log(stretch)) < np.log(_SERIES_STRETCH)
+    longer_m, known = length_m * np.where(in_line, stretch - 1, 0.0), in_line & (weight > 0.5)
+    if known.sum() < _SERIES_LEAST:
+        return None
+    own_m, variance, stretched_m = own_m[known], variance[known], longer_m[known]
+    spread_m, often = float(np.median(np.abs(own_m - stretched_m)) / norm.ppf(0.75)), 0.5
+    spread_m = min(spread_m, MEMBER_M)  # what scatters more is in no series
+    fixed = norm.pdf(own_m, 0.0, np.sqrt(variance))
+    series = norm.pdf(own_m, stretched_m, np.sqrt(variance + spread_m**2))
+    for _ in range(_PASSES):
+        both = often * series + (1 - often) * fixed
+        often = float((1 + np.sum(often * series / np.maximum(both, 1e-300))) / (2 + len(own_m)))
+    return longer_m, np.where(in_line, spread_m, 0.0), often
 
 
 def _other_lengths(

@@ -37,7 +37,7 @@ _STENCIL_M = 0.03
 """Sigma of a corner's coordinate about a shape, m, up to which markings agree so: a brush's width."""
 
 _LEAST_SHARE = 0.1  # share of a class's markings from which their shape is one of the class
-_MEMBER_M = 0.05  # a marking of which no corner misses a shape by more, m, is of that shape
+MEMBER_M = 0.05  # a marking of which no corner misses a shape by more, m, is of that shape
 _MEMBER_SHARE = 0.08  # the same as a share of the longer diagonal: large paint is laid out less exactly
 
 SHAPE_SIGMA_M = 0.01
@@ -194,13 +194,13 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
     diagonals = np.linalg.norm(corners_map[:, 2:] - corners_map[:, :2], axis=2)
     pairs = 0.5 * (side[:, :2] + side[:, 2:]), diagonals
     lengths = np.concatenate([np.sort(pair, axis=1) for pair in pairs], axis=1)
-    limit_m = np.maximum(_MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
+    limit_m = np.maximum(MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
     apart = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
     typical = int(np.argmax((apart <= limit_m[:, None]).sum(axis=1) - apart.mean(axis=1) / limit_m))
     shape = parallelograms(candidates.corners_map[typical])
     members = np.zeros(len(candidates), dtype=bool)
     for _ in range(2):
-        laid = lay(shape, _MEMBER_M, candidates)[0]
+        laid = lay(shape, MEMBER_M, candidates)[0]
         missed = np.linalg.norm(candidates.corners_map - laid.corners_map, axis=2).max(axis=1)
         members = np.asarray(missed <= limit_m[typical])
         if not members.any():
