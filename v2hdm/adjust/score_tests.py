@@ -31,8 +31,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.bench import Bench, Rows, raised, stretches
 from v2hdm.adjust.problem import Problem
+from v2hdm.adjust.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray
 
@@ -151,7 +151,7 @@ class _Hypothesis:
     """One fault, and how to get its column."""
 
     fault: Fault
-    column: Callable[[Bench], Rows]
+    column: Callable[[Sensitivity], Rows]
     camera: int = -1
     axis: int = 0
     item: int = -1
@@ -175,17 +175,17 @@ class _Answer:
     own: float
 
     @classmethod
-    def to(cls, hypothesis: _Hypothesis, bench: Bench) -> _Answer:
+    def to(cls, hypothesis: _Hypothesis, solved: Sensitivity) -> _Answer:
         """The answer at a solution."""
-        column = hypothesis.column(bench)
-        efficient = bench.efficient(column)
-        information = bench.by_stretch(efficient, efficient)
+        column = hypothesis.column(solved)
+        efficient = solved.efficient(column)
+        information = solved.by_stretch(efficient, efficient)
         own = sum(float(row.square().sum()) for row in column.values())
         return cls(
             hypothesis,
-            -bench.by_stretch(efficient, bench.residuals),
+            -solved.by_stretch(efficient, solved.residuals),
             information,
-            np.array([bench.by_stretch(efficient, noise) for noise in bench.noise]),
+            np.array([solved.by_stretch(efficient, noise) for noise in solved.noise]),
             own,
         )
 
@@ -243,8 +243,8 @@ class _Answer:
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Every fault that ``problem`` can have, each tested at its ``solution``; largest gain first."""
-    bench = Bench.at(solution.covariance.whitening)
-    answers = [_Answer.to(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
+    solved = Sensitivity.at(solution.covariance.whitening)
+    answers = [_Answer.to(hypothesis, solved) for hypothesis in _hypotheses(problem, solved.arrays)]
     said = [one.disagreement for one in answers if one.is_observable]
     usual = float(np.median(said)) if said else 1.0
     found = _likeliest_changes([(one, one.test(usual)) for one in answers])
@@ -342,39 +342,39 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, sigma, p_value, squared / 2)
 
 
-def _lens(camera: int, power: int, bench: Bench) -> Rows:
+def _lens(camera: int, power: int, solved: Sensitivity) -> Rows:
     """Points seen farther out by the share p, times the squared radius to the ``power``, than they are.
 
     A focal length longer than stated by the share p, or a first radial coefficient larger by p.
     """
     # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
-    projected, mine = bench.projected, (bench.camera == camera) | (camera < 0)
-    return {"observations": bench.whiten(projected * projected.square().sum(0) ** power * mine)}
+    projected, mine = solved.projected, (solved.camera == camera) | (camera < 0)
+    return {"observations": solved.whiten(projected * projected.square().sum(0) ** power * mine)}
 
 
-def _principal(problem: Problem, camera: int, axis: int, bench: Bench) -> Rows:
+def _principal(problem: Problem, camera: int, axis: int, solved: Sensitivity) -> Rows:
     """A principal point that lies farther right, or down, by one pixel."""
-    seen_by, focal_px = bench.camera, torch.as_tensor(problem.intrinsic[:, axis])
+    seen_by, focal_px = solved.camera, torch.as_tensor(problem.intrinsic[:, axis])
     off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
     none = torch.zeros_like(off)
-    return {"observations": bench.whiten(torch.stack([off, none] if axis == 0 else [none, off]))}
+    return {"observations": solved.whiten(torch.stack([off, none] if axis == 0 else [none, off]))}
 
 
-def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Bench], Rows]:
+def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Sensitivity], Rows]:
     """The column of a motion (C, J, 6) of the vehicle in its own frame.
 
     ``motion`` is given what it is ``about``, the problem's arrays and a motion of zeros to write into.
     """
 
-    def column(bench: Bench) -> Rows:
-        extrinsic, arrays = bench.whitening.estimate.cam_from_vehicle[:, None], bench.arrays
+    def column(solved: Sensitivity) -> Rows:
+        extrinsic, arrays = solved.whitening.estimate.cam_from_vehicle[:, None], solved.arrays
         still = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
         tangent = arrays.at_moments(motion(*about, arrays, still), axis=1)
         shift, turn = (
             (extrinsic[..., :3, :3] @ one[..., None])[..., 0] for one in (tangent[..., :3], tangent[..., 3:])
         )
         shift = shift + torch.linalg.cross(extrinsic[..., :3, 3].expand_as(turn), turn)
-        return {"observations": bench.seen(bench.turned(-torch.cat([shift, turn], dim=-1)))}
+        return {"observations": solved.seen(solved.turned(-torch.cat([shift, turn], dim=-1)))}
 
     return column
 
@@ -431,15 +431,15 @@ def _since(arrays: Arrays, frame: int) -> Tensor:
     return (later & (arrays.visit == arrays.visit[frame])).to(arrays.centre.dtype)[:, None]
 
 
-def _crown(axis: int, bench: Bench) -> Rows:
+def _crown(axis: int, solved: Sensitivity) -> Rows:
     """Corners that lie lower by the value times their distance from the route, all or on one side alone."""
-    arrays, estimate = bench.arrays, bench.whitening.estimate
+    arrays, estimate = solved.arrays, solved.whitening.estimate
     frames = arrays.vehicle_from_map.inverse()
     route = KDTree(frames[:, :2, 3].cpu().numpy())
     nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
     left = ((estimate.corners_map - frames[nearest, :2, 3]) * frames[nearest, :2, 1]).sum(1)
     lower = (left.abs(), left.clamp(min=0), -left.clamp(max=0))[axis]
-    return raised(bench, -lower[arrays.corner.long()])
+    return raised(solved, -lower[arrays.corner.long()])
 
 
 def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:
@@ -449,17 +449,17 @@ def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:
     return out
 
 
-def _survey(camera: int, axis: int, bench: Bench) -> Rows:
-    out, which = torch.zeros_like(bench.arrays.centre), slice(None) if camera < 0 else camera
-    out[which, axis] = -bench.arrays.centre_information_root[which, axis]
+def _survey(camera: int, axis: int, solved: Sensitivity) -> Rows:
+    out, which = torch.zeros_like(solved.arrays.centre), slice(None) if camera < 0 else camera
+    out[which, axis] = -solved.arrays.centre_information_root[which, axis]
     return {"camera_centre": out}
 
 
-def _datum(axis: int, bench: Bench) -> Rows:
-    out = torch.zeros_like(bench.arrays.control)
-    out[:, axis:] = -bench.arrays.control_root[:, 2 * axis : 2 + axis]
+def _datum(axis: int, solved: Sensitivity) -> Rows:
+    out = torch.zeros_like(solved.arrays.control)
+    out[:, axis:] = -solved.arrays.control_root[:, 2 * axis : 2 + axis]
     return {"control_points": out}
 
 
-def _size(which: Tensor, bench: Bench) -> Rows:
-    return {"known_lengths": -bench.arrays.lengths.information_root * which}
+def _size(which: Tensor, solved: Sensitivity) -> Rows:
+    return {"known_lengths": -solved.arrays.lengths.information_root * which}

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.adjust import Fault
-from v2hdm.adjust.bench import STRETCHES
+from v2hdm.adjust.sensitivity import STRETCHES
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.recovery import (
     CLEAR_SIGMAS,

@@ -1,4 +1,4 @@
-"""A solution made ready for score tests: residuals, and their derivatives less all that is estimated."""
+"""How the residuals of a solution answer to what it has not estimated, all that it has moving along."""
 
 from __future__ import annotations
 
@@ -11,14 +11,7 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.model import (
-    Estimate,
-    Gradient,
-    points_in_camera,
-    prior_residuals,
-    rigid,
-    robustified,
-)
+from v2hdm.adjust.model import Estimate, Gradient, points_in_camera, prior_residuals, rigid, robustified
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
@@ -39,8 +32,8 @@ of :func:`v2hdm.adjust.model.prior_residuals`; kinds that a fault does not touch
 
 
 @dataclass(frozen=True)
-class Bench:
-    """A solution made ready for tests: with the roots of weights, least squares remain.
+class Sensitivity:
+    """A solution as weighted least squares, whose residuals can be derived by further parameters.
 
     Attributes:
         whitening: the solution's Hessian.
@@ -57,8 +50,8 @@ class Bench:
     stretch: Tensor
 
     @classmethod
-    def at(cls, whitening: Whitening) -> Bench:
-        """The bench of a solution's Hessian."""
+    def at(cls, whitening: Whitening) -> Sensitivity:
+        """That of a solution, by its Hessian."""
         engine, estimate = whitening.engine, whitening.estimate
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
@@ -214,9 +207,9 @@ def stretches(arrays: Arrays) -> Tensor:
     return stretch
 
 
-def raised(bench: Bench, height: Tensor) -> Rows:
+def raised(solved: Sensitivity, height: Tensor) -> Rows:
     """Corners that each observation (K,) sees so much higher, m, a unit of the value."""
-    return {"observations": bench.seen(height[:, None] * bench.poses[:, :3, 2])}
+    return {"observations": solved.seen(height[:, None] * solved.poses[:, :3, 2])}
 
 
 def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
@@ -229,18 +222,18 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     Returns:
         The information (B, B) on them, and the gradient (B,) of the cost.
     """
-    bench = Bench.at(solution.covariance.whitening)
-    unit = raised(bench, torch.ones_like(bench.root))["observations"]
-    columns = heights[bench.arrays.order.cpu().numpy()]
+    solved = Sensitivity.at(solution.covariance.whitening)
+    unit = raised(solved, torch.ones_like(solved.root))["observations"]
+    columns = heights[solved.arrays.order.cpu().numpy()]
     squared = unit.square().sum(0).cpu().numpy()
     information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
     seen = np.flatnonzero(information.diagonal() > 0)
-    coupled = bench.root.new_zeros(len(seen), bench.whitening.size)
+    coupled = solved.root.new_zeros(len(seen), solved.whitening.size)
     by_column = columns[:, seen].tocsc()
     for k, row in enumerate(coupled):
         lifted = torch.as_tensor(by_column[:, [k]].toarray()[:, 0]).to(unit)
-        row[:] = bench._coupling({"observations": unit * lifted})
+        row[:] = solved._coupling({"observations": unit * lifted})
     information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
-    gradient = columns.T @ (unit * bench.residuals["observations"]).sum(0).cpu().numpy()
-    gradient[seen] -= (coupled @ bench.whitening.gradient).cpu().numpy()
+    gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()
+    gradient[seen] -= (coupled @ solved.whitening.gradient).cpu().numpy()
     return information, gradient
