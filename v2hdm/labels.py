@@ -31,8 +31,8 @@ from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
-from v2hdm.report.outputs import write_json
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
+from v2hdm.store.files import write_json
 
 FILE = "instances.json"
 RANGE_M = 16.0  # how far from a camera markings are labelled: farther ones need not be in the map

@@ -494,6 +494,17 @@ class HdMap:
         return frame.set_geometry(geometry, crs="EPSG:4326")
 
 
+@dataclass(frozen=True)
+class Exclusion:
+    """A candidate that the map of the set ``cameras`` left out: what, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+    cameras: str = ""
+
+
 class Fate(Enum):
     """The fate of a marking between an earlier map and a new drive."""
 

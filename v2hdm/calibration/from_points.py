@@ -26,9 +26,8 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
-from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_points
-from v2hdm.store.files import dump_yaml, replace_csv
+from v2hdm.store.files import dump_yaml, replace_csv, write_json
 from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"

@@ -12,9 +12,8 @@ from typing import Any
 from rich.console import Console
 
 from v2hdm.errors import ConfigError, WorkerError
-from v2hdm.experiment.drive import drive_record
+from v2hdm.experiment.drive import Measured, drive_record, measure
 from v2hdm.experiment.figures import save_figures
-from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.summary import claims, write_tables, write_words
 from v2hdm.progress import patient

@@ -12,7 +12,7 @@ import jinja2
 import numpy as np
 
 from v2hdm import __version__
-from v2hdm.experiment.measures import ROWS, Measured, Row
+from v2hdm.experiment.drive import ROWS, Measured, Row
 from v2hdm.experiment.plan import RECIPES, ExperimentConfig
 from v2hdm.store.files import replace_csv, replace_text
 

@@ -29,7 +29,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.report import style
-from v2hdm.report.outputs import write_json
+from v2hdm.store.files import write_json
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
 _START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))

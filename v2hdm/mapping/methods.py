@@ -31,8 +31,7 @@ from v2hdm.mapping.optimise import Optimised, silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
-from v2hdm.site.candidates import Exclusion
+from v2hdm.records import Drive, Exclusion, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.changes import Base, update_map
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig

@@ -57,6 +57,7 @@ from v2hdm.records import (
     BoolArray,
     Calibration,
     Camera,
+    Exclusion,
     FloatArray,
     IntArray,
     Marking,
@@ -64,7 +65,7 @@ from v2hdm.records import (
     Road,
     largest_noise,
 )
-from v2hdm.site.candidates import Candidates, Counts, Exclusion, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
 from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
 from v2hdm.site.parallax import PointViews, measure_parallax
 

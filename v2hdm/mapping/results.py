@@ -11,8 +11,17 @@ import numpy as np
 from v2hdm.adjust import ScoreTest
 from v2hdm.association.surface import Surface
 from v2hdm.io.maps.evidence import Residuals
-from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, JointCovariance
-from v2hdm.site.candidates import Exclusion
+from v2hdm.records import (
+    BoolArray,
+    Calibration,
+    Changes,
+    Exclusion,
+    FloatArray,
+    HdMap,
+    Image,
+    IntArray,
+    JointCovariance,
+)
 from v2hdm.site.markings import Suspicion
 
 

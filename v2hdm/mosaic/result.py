@@ -34,9 +34,8 @@ from v2hdm.mosaic.blend import (
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.report import style
-from v2hdm.report.outputs import write_json
 from v2hdm.report.page.facts import read_cameras, read_surface
-from v2hdm.store.files import whole_file
+from v2hdm.store.files import whole_file, write_json
 
 AHEAD_M, ACROSS_M = 12.0, 8.0  # length and width of the ground that is compared
 _CELL_M = 0.01

@@ -96,16 +96,6 @@ class Counts:
         return Counts(*(values[rows] for values in vars(self).values()))
 
 
-@dataclass(frozen=True)
-class Exclusion:
-    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
-
-    kind: str
-    position_map: FloatArray
-    sightings: int
-    reason: str
-
-
 def with_dissent(
     candidates: Candidates,
     fused: FusedGroups,

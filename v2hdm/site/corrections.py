@@ -9,8 +9,8 @@ import numpy as np
 
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
-from v2hdm.records import FloatArray, HdMap, IntArray
-from v2hdm.site.candidates import Candidates, Exclusion
+from v2hdm.records import Exclusion, FloatArray, HdMap, IntArray
+from v2hdm.site.candidates import Candidates
 
 _SAME_M = 0.4  # how far the middle of a candidate may be from that which a person saw, m
 MAX_OVERLAP = 0.2

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import beta, f
 
 from v2hdm.errors import MappingError
-from v2hdm.records import FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Candidates, Counts, Exclusion, variance_prior
+from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
+from v2hdm.site.candidates import Candidates, Counts, variance_prior
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,11 +17,11 @@ _MOST_CELLS = 4e6  # of the rectangle about a map; beyond, cells are larger
 _NOTHING = -9999.0
 
 
-def write_ground_geotiff(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+def write_ground_geotiff(hd_map: HdMap, path: Path) -> None:
     """Write the ground as a GeoTIFF of two bands, heights above the map's origin and their sigmas, m.
 
-    Cells that no strip covers hold no data; of two strips, the surer one counts. A GeoTIFF has no place for
-    the ``verdict``. Raises ConfigError when ``rasterio`` is not installed.
+    Cells that no strip covers hold no data; of two strips, the surer one counts. Raises ConfigError when
+    ``rasterio`` is not installed.
     """
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
     edges = np.concatenate(
@@ -74,11 +72,10 @@ def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
     return out
 
 
-def write_opencrg(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
+def write_opencrg(hd_map: HdMap, path: Path) -> None:
     """Write the ground as OpenCRG, a file for each session: heights (m) on a grid along the driven path.
 
-    OpenCRG has no place for sigmas and the ``verdict``. Raises ConfigError when ``pyopencrg`` is not
-    installed.
+    OpenCRG has no place for sigmas. Raises ConfigError when ``pyopencrg`` is not installed.
     """
     crg = need("pyopencrg", "gis", "the format opencrg", ConfigError)
     for number, strip in enumerate(hd_map.ground, start=1):

@@ -27,7 +27,7 @@ from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
-from v2hdm.store.files import dump_yaml, replace_text
+from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
@@ -43,14 +43,12 @@ _MOST_VERTICES = _PARTS // 2
 _NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
 
 
-def write_lanelet2(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, projector: str | None = None
-) -> None:
+def write_lanelet2(hd_map: HdMap, path: Path, projector: str | None = None) -> None:
     """Write ``hd_map`` to ``path`` and ``map_projector_info.yaml`` beside it, each atomically.
 
-    Autoware looks for ``lanelet2_map.osm``, which has no place for the ``verdict``. Without a ``projector``
-    of :data:`PROJECTORS` it is ``LocalCartesian`` for a map with an origin, else ``Local``. Raises
-    ConfigError when the projector does not suit the map, MapFileError when a line has too many vertices.
+    Without a ``projector`` of :data:`PROJECTORS` it is ``LocalCartesian`` for a map with an origin, else
+    ``Local``. Raises ConfigError when the projector does not suit the map, MapFileError when a line has too
+    many vertices.
     """
     projector = projector or (LOCAL if hd_map.origin is None else LOCAL_CARTESIAN)
     if projector not in PROJECTORS:
@@ -246,8 +244,7 @@ class _Document:
 
     def text(self) -> str:
         self._root.extend(sorted(self._elements, key=lambda one: one.tag != "way"))
-        ET.indent(self._root, " ")
-        return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(self._root, encoding="unicode")}\n'
+        return xml_text(self._root)
 
 
 def _part(owner: Feature, number: int) -> int:

@@ -11,11 +11,10 @@ them.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, FloatArray, HdMap
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_text, xml_text
 
 _LEAST_STEP_M = 1e-3  # between vertices of a reference line: shorter geometries are refused by readers
 
@@ -56,11 +55,8 @@ class _Road:
         return float(away[segment]), segment, float(along[segment])
 
 
-def write_opendrive(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
-    """Write ``hd_map`` as OpenDRIVE, atomically, in metres of the map frame, whose projection it states.
-
-    An OpenDRIVE file has no place for the ``verdict``.
-    """
+def write_opendrive(hd_map: HdMap, path: Path) -> None:
+    """Write ``hd_map`` as OpenDRIVE, atomically, in metres of the map frame, whose projection it states."""
     features = features_of(hd_map)
     roads = _roads(features)
     root = ET.Element("OpenDRIVE")
@@ -81,8 +77,7 @@ def write_opendrive(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None
             found = [road.nearest(centre) for road in roads]
             k = min(range(len(roads)), key=lambda number: found[number][0])
             _write_object(objects[k], one, roads[k], *found[k][1:])
-    ET.indent(root, " ")
-    replace_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n')
+    replace_text(path, xml_text(root))
 
 
 def _roads(features: Sequence[Feature]) -> list[_Road]:

@@ -21,11 +21,11 @@ from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
-from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
+from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
+from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HdMap, IntArray, Truth
 from v2hdm.store.files import load_json, load_yaml, read_text, take_number
 
 BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
@@ -76,7 +76,7 @@ class Facts:
     metrics: Mapping[str, Any]
     config: str
     hd_map: HdMap | None
-    excluded: tuple[ExcludedMarking, ...]
+    excluded: tuple[Exclusion, ...]
     cameras: Mapping[str, CameraFacts]
     route: Route | None
     surface: Surface | None
