@@ -113,11 +113,7 @@ class Catalogue:
         return tuple(name for name, one in self.classes.items() if one.family in families)
 
     def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
-        """This catalogue and a user's classes after it, by name as ``catalogue.yaml`` has them.
-
-        Raises ConfigError, which says ``where`` they come from, where an entry is wrong, or its name is
-        taken.
-        """
+        """This catalogue and a user's classes after it; ConfigError, from ``where``, if one is wrong."""
         taken = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
         for name in entries:
             if not (isinstance(name, str) and _NAME.fullmatch(name)):

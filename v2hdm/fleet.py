@@ -133,8 +133,8 @@ class Plan:
 def plan(files: Sequence[Path], overrides: Sequence[str], share: tuple[int, int] = (1, 1)) -> Plan:
     """The drives of run files, each by itself; ``overrides`` are ``key=value`` for all of them.
 
-    Of ``share`` = (k, n) only every n-th file, beginning with the k-th, is planned; results of all must go to
-    different places nevertheless.
+    Of ``share`` = (k, n) every n-th file, from the k-th on, is planned; results of all must go to different
+    places.
     """
     jobs: list[Job] = []
     refused: list[Row] = []
@@ -201,10 +201,7 @@ def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: 
 def run_fleet(
     files: Sequence[Path], overrides: Sequence[str], options: FleetOptions, progress: DriveProgress
 ) -> list[Row]:
-    """Map the drives of run files: a row for each file, in their order.
-
-    The table is written anew whenever a drive is done. Raises V2hdmError where it cannot.
-    """
+    """Map the drives of run files: a row for each, in order; the table is written after each drive."""
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings, options.share)
     with growing_folder(options.folder, "--table", "v2hdm fleet") as write:

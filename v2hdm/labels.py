@@ -61,10 +61,7 @@ _CLEAR_M = 1.0  # radius about a candidate that was left out of which nothing is
 
 @dataclass(frozen=True)
 class _Outline:
-    """One marking or symbol, counter-clockwise, and where paint and ground beside its sides are sampled.
-
-    ``side`` numbers each sample's side, 0 to 3; an outline of more edges has four runs of them.
-    """
+    """One marking or symbol, counter-clockwise, and the samples beside its four sides or runs of edges."""
 
     id: int
     kind: str
@@ -92,10 +89,7 @@ class _Outline:
 
 @dataclass(frozen=True)
 class _View:
-    """One outline in one image: its polygon (N, 2), recorded px, the contrast of each side, nan if unseen.
-
-    ``px_per_m`` is the size of the image of a metre there.
-    """
+    """One outline in one image: its polygon (N, 2), recorded px, and the contrast of each side, or nan."""
 
     outline: int
     image: int
@@ -301,10 +295,7 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
 
 
 def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray, count: int) -> FloatArray:
-    """The contrast of the sides of each outline (count, 4), by the images that it was detected in.
-
-    One that was detected in fewer than three, such as a symbol, takes the median of all images.
-    """
+    """The contrast of sides (count, 4) by the images that an outline was detected in, if three, else all."""
     out = np.full((count, 4), np.nan)
     for number in range(count):
         own = outline == number
@@ -320,10 +311,7 @@ def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray,
 def _expected(
     contrast: FloatArray, own: FloatArray, size: FloatArray, detected: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image.
-
-    Detected sides say it: a far one is blurred. Of too few nothing is known: the sigma is that of anything.
-    """
+    """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image."""
     used = np.isfinite(contrast) & np.isfinite(own) & detected[:, None]
     if used.sum() < _LEAST_PAIRS:
         return own, np.full_like(own, _HIDDEN_SIGMA)

@@ -211,10 +211,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Visit:
-    """One of the drives that a :class:`Drive` was joined of: what is its own, as :class:`Drive` has it.
-
-    ``cameras`` says what the joined drive calls each of its own cameras.
-    """
+    """One of the drives that a :class:`Drive` was joined of; ``cameras`` are by its own names."""
 
     name: str
     root: Path
@@ -321,10 +318,7 @@ class ImageDetections:
 
 @dataclass(frozen=True)
 class PaintLeft:
-    """The ``share`` of a marking's paint that is left, 0 to 1, with its ``sigma``.
-
-    ``change`` and ``change_sigma`` compare it to the earlier map's, None where there was none.
-    """
+    """The ``share`` of a marking's paint that is left, 0 to 1; its change since an earlier map, if any."""
 
     share: float
     sigma: float
@@ -543,10 +537,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Changes:
-    """An earlier map against a new drive: the ``changes``, and how many markings are the ``same``.
-
-    ``shift_m`` (2,) is how far the drive's own map lay from the earlier one, as a mean.
-    """
+    """An earlier map against a new drive: the ``changes``, how many are the ``same``, its mean shift (2,)."""
 
     changes: tuple[Change, ...]
     same: int

@@ -84,15 +84,9 @@ class CornerFactor:
 
 
 def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, Tensor]) -> CornerFactor:
-    """Factorise V.
+    """Factorise V of (N, 2, 2) J'J by corner, and derivatives (M, 2) of the lengths by both their corners.
 
-    Args:
-        arrays: the problem.
-        blocks: (N, 2, 2) J'J of the observations and the survey by corner.
-        by_length: derivatives (M, 2) of the lengths' residuals by their first and their second corners.
-
-    Raises:
-        AdjustError: corners that lengths join cannot be solved for together.
+    Raises AdjustError where corners that lengths join cannot be solved for together.
     """
     xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
     lower = cholesky_2x2(xx + CORNER_FLOOR, yx, yy + CORNER_FLOOR)

@@ -131,10 +131,7 @@ def _at_once(whitening: Whitening) -> int:
 
 
 def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
-    """Groups (M, n) of corners, and all that known lengths join to them (M, m).
-
-    Shorter rows are filled up with their last corner.
-    """
+    """Groups (M, n) of corners, and all that lengths join to them (M, m); the last fills up shorter rows."""
     if not bool(arrays.joined.any()):
         return chosen
     unit = (~arrays.joined).cumsum(0)

@@ -104,10 +104,7 @@ class Objective:
 
 
 def narrowed(engine: Engine, estimate: Estimate, robust: Loss, last: Loss | None = None) -> Loss:
-    """The loss with most residuals in its convex part, and a third as wide as the ``last`` at most.
-
-    While the fit is poor, all look like outliers.
-    """
+    """The loss with most residuals in its convex part, and a third as wide as the ``last`` at most."""
     if robust.name == "none":
         return robust
     squared = engine.residuals(engine.poses(estimate), estimate.corners_map).square().sum(0)
@@ -126,10 +123,7 @@ def descend(
     max_evaluations: int,
     opening: Whitening | None = None,
 ) -> Descent:
-    """Minimise the cost from ``estimate``, narrowing the robust loss on the way.
-
-    ``opening`` is what :func:`open_descent` makes of ``estimate``, if that was needed before.
-    """
+    """Minimise the cost, narrowing the loss; ``opening`` is what :func:`open_descent` made of the start."""
     whitening = opening or open_descent(engine, estimate, robust)
     del opening
     plan, renewal = whitening.plan, RENEWAL_WITH_STATES if engine.arrays.states else RENEWAL

@@ -60,10 +60,8 @@ class Linearised(ABC):
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, with which the corners move.
 
-        Args:
-            step: of the reduced unknowns; its corners are not looked at.
-            tangents: (C, M, 6) left tangents of the pairs under the step.
-            own: (N, 2) whitened variables of the corners.
+        ``tangents`` (C, M, 6) are those of the pairs under the step, ``own`` (N, 2) whitened variables of
+        corners.
         """
 
     @abstractmethod
@@ -123,8 +121,4 @@ class Engine(ABC):
 
     @abstractmethod
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> Linearised:
-        """Linearise, and subtract the eliminated corners from the reduced system.
-
-        Raises:
-            AdjustError: corners that lengths join cannot be solved for together.
-        """
+        """Linearise and eliminate the corners; raises AdjustError where joined ones cannot be solved for."""

@@ -27,10 +27,7 @@ _NEAR_M = 10_000.0
 
 
 def nearby_origin(problem: Problem) -> FloatArray:
-    """A point (2,) of the map by the recorded poses: its origin, or their middle where that is far from it.
-
-    It is in whole metres, so that shifts are exact.
-    """
+    """A point (2,) in whole metres near the recorded poses: the origin, or their middle if that is far."""
     position = problem.map_from_vehicle[:, :2, 3]
     middle = np.round((position.min(0) + position.max(0)) / 2)
     return np.asarray(middle if np.abs(middle).max() > _NEAR_M else np.zeros(2))
@@ -109,9 +106,8 @@ def make_arrays(
 ) -> Arrays:
     """Lay a checked problem out for the solver.
 
-    Raises:
-        AdjustError: two observations are the same corner in the same image, or known lengths join too
-            many corners.
+    Raises AdjustError where an image has two observations of a corner, or known lengths join too many
+    corners.
     """
 
     def real(values: FloatArray) -> Tensor:
@@ -175,10 +171,7 @@ def make_arrays(
 
 
 def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
-    """Corners (N,) by the frame that first saw them, and which (N,) are joined to the one before.
-
-    Corners that known lengths join come side by side, where the first of them belongs.
-    """
+    """Corners (N,) by the frame that first saw them, joined ones side by side, and which follow such (N,)."""
     count, lengths = problem.corner_count, problem.lengths
     seen, frames = problem.observations, len(problem.map_from_vehicle)
     first_frame = np.full(count, frames)

@@ -25,10 +25,7 @@ _NO_PROGRESS = 1e-15
 
 
 def predicted_gap(cost: float, gradient: Tensor) -> float:
-    """|g|^2 as a fraction of the cost: twice what a unit Newton step on whitened variables gains.
-
-    A cost below 1 is a fit better than one standard deviation in all; the gap is then absolute.
-    """
+    """|g|^2, twice what a unit Newton step gains, as a share of the cost where that is above 1."""
     return float(gradient @ gradient) / max(cost, 1.0)
 
 
@@ -153,11 +150,7 @@ class _Evaluations:
 
 @cache
 def _leave_compiler_out() -> None:
-    """Keep torch from importing its compiler, for 1 to 2.5 s, when the first optimiser is made.
-
-    It does so to keep the compiler away from an optimiser's methods, all of which this marks as kept from it
-    already. The mark is torch's own affair: where it has another, the compiler is imported as ever.
-    """
+    """Keep torch from importing its compiler, which takes 1 to 2.5 s, for the first optimiser's methods."""
     if "torch._dynamo" in sys.modules:
         return
     for name in dir(torch.optim.Optimizer):

@@ -54,11 +54,7 @@ class _Scales:
 def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...]:
     """The sigmas of each visit's poses that the drive shows; as stated where nothing is estimated.
 
-    All visits' sigmas of a kind are scaled alike.
-
-    Args:
-        problem: the drive, with the stated sigmas.
-        solution: of it, under sigmas that are not far off.
+    The solution is under sigmas that are not far off. All visits' sigmas of a kind are scaled alike.
     """
     descent = solution.covariance.descent
     arrays, stated = descent.engine.arrays, problem.pose_sigmas

@@ -143,12 +143,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class PriorBlocks:
-    """The priors' part of the Hessian.
+    """The priors' part of the Hessian, of cameras (C (6 + Q), C (6 + Q)) and of frames' states (J, S, S).
 
-    Attributes:
-        camera: (C (6 + Q), C (6 + Q)) of the cameras' unknowns.
-        frame: (J, S, S) of each frame's states.
-        across: (J, S, S) between each frame's states and those of the frame before.
+    ``across`` (J, S, S) stands between each frame's states and those of the frame before.
     """
 
     camera: Tensor
@@ -175,13 +172,10 @@ class ReducedSystem:
         self.matrix.tiles[TIP, TIP].sub_(cameras)
 
     def add_kept(self, run: Run, coupling: Tensor, index: Tensor, blocks: Tensor) -> None:
-        """Add what is known of the kept corners.
+        """Add what is known of the kept corners, whose observations are ``run``.
 
-        Args:
-            run: their observations; its corners are the kept ones.
-            coupling: (k, 2, 6) W' of these.
-            index: (2, m) numbers of kept corners, of which the first is not the lower.
-            blocks: (m, 2, 2) their part of V.
+        ``coupling`` (k, 2, 6) is W' of these, ``blocks`` (m, 2, 2) the part of V at ``index`` (2, m), the
+        first not the lower.
         """
         plan, axes = self.plan, torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
@@ -222,10 +216,9 @@ class ReducedSystem:
     def factorise(
         self, priors: PriorBlocks, jitter: float, hold_cameras: bool
     ) -> tuple[TiledCholesky, float] | None:
-        """Put it together and factorise; the factor takes its place.
+        """Factorise in place; the factor and its least pivot as a share of U's diagonal, None where it fails.
 
-        ``jitter`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
-        share of U's diagonal; None where S cannot be factorised.
+        ``jitter`` is added to U's diagonal, relative to it.
         """
         self._add_frames(priors)
         diagonal = [*self._diagonal.view(self.plan.tile_count, self.plan.size), self._add_cameras(priors)]

@@ -308,10 +308,9 @@ def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest
 
 
 def _chances(changes: list[tuple[_Answer, ScoreTest]]) -> float:
-    """How many independent changes are as many chances as these: neighbours hang together by their noise.
+    """How many independent changes are as many chances as these, whose noise hangs together.
 
-    The squared trace of the correlation over that of its square (Galwey, Genetic Epidemiology 33, 2009, has
-    this among others).
+    The squared trace of the correlation over that of its square (Galwey, Genetic Epidemiology 33, 2009).
     """
     drawn = np.array([answer.drawn.ravel() for answer, one in changes if np.isfinite(one.sigma)])
     if not len(drawn):
@@ -343,10 +342,7 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
 
 
 def _lens(camera: int, power: int, solved: Sensitivity) -> Rows:
-    """Points seen farther out by the share p, times the squared radius to the ``power``, than they are.
-
-    A focal length longer than stated by the share p, or a first radial coefficient larger by p.
-    """
+    """A focal length longer by the share p or, with ``power`` 1, a first radial coefficient larger by p."""
     # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
     projected, mine = solved.projected, (solved.camera == camera) | (camera < 0)
     return {"observations": solved.whiten(projected * projected.square().sum(0) ** power * mine)}
@@ -361,10 +357,7 @@ def _principal(problem: Problem, camera: int, axis: int, solved: Sensitivity) ->
 
 
 def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Sensitivity], Rows]:
-    """The column of a motion (C, J, 6) of the vehicle in its own frame.
-
-    ``motion`` is given what it is ``about``, the problem's arrays and a motion of zeros to write into.
-    """
+    """The column of a ``motion`` (C, J, 6) of the vehicle in its own frame, which is written into zeros."""
 
     def column(solved: Sensitivity) -> Rows:
         extrinsic, arrays = solved.whitening.estimate.cam_from_vehicle[:, None], solved.arrays

@@ -213,14 +213,10 @@ def raised(solved: Sensitivity, height: Tensor) -> Rows:
 
 
 def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
-    """The information of a drive on parameters that raise the ground, all else being estimated with them.
+    """The information (B, B) on parameters that raise the ground, and the gradient (B,) of the cost by them.
 
-    Args:
-        solution: at the parameters' present values.
-        heights: (K, B) sparse, m by which a unit of each raises what each observation of the problem shows.
-
-    Returns:
-        The information (B, B) on them, and the gradient (B,) of the cost.
+    ``heights`` (K, B), sparse, are m by which a unit of each raises what each observation of the problem
+    shows.
     """
     solved = Sensitivity.at(solution.covariance.whitening)
     unit = raised(solved, torch.ones_like(solved.root))["observations"]

@@ -99,10 +99,7 @@ class Solution:
         return self.covariance.extrinsic()
 
     def corner_covariance(self, indices: IntArray) -> FloatArray:
-        """Joint covariance (2n, 2n), m^2, of the corners ``indices`` (n,), stacked x0, y0, x1, ...
-
-        For groups (M, n), such as the corners of all markings, one each: (M, 2n, 2n).
-        """
+        """Joint covariance (2n, 2n), m^2, x0, y0, x1, ..., of corners (n,); of groups (M, n), one each."""
         groups = np.atleast_2d(indices)
         covariance = self.covariance.corners(groups)
         return covariance if np.ndim(indices) == 2 else covariance[0]

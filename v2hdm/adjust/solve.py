@@ -74,10 +74,8 @@ def _start(
 ) -> tuple[Estimate, Whitening | None, int]:
     """Where the descent starts, its first whitening if that is known, and the evaluations spent.
 
-    A coarse stage comes before it where the start is far from the optimum, or the problem large.
-
-    Raises:
-        AdjustError: none of a corner's rays fixes it.
+    A coarse stage comes first where the start is far off, or the problem large. Raises AdjustError where none
+    of a corner's rays fixes it.
     """
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
     if options.coarse and not is_worth_a_look(engine.arrays):

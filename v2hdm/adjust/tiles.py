@@ -46,10 +46,7 @@ class Pattern:
 
 
 def find_pattern(tile_count: int, cliques: Iterable[Sequence[int]], least_degree: bool = False) -> Pattern:
-    """The pattern of a factor whose matrix couples all tiles of each clique with one another.
-
-    The order is reverse Cuthill-McKee, or ``least_degree``: next comes the tile that couples to the fewest.
-    """
+    """The pattern of a factor whose matrix couples all tiles of each clique with one another."""
     edges = {pair for clique in cliques for pair in combinations(sorted(clique), 2)}
     position = np.arange(tile_count)
     if edges:
@@ -191,10 +188,7 @@ class TiledCholesky:
 
 
 def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesky | None:
-    """Factorise, the tip too unless it is held, overwriting the matrix; None where it is not definite.
-
-    Right-looking: each column, once factorised, is subtracted from those it couples to.
-    """
+    """Factorise in place, right-looking, the tip too unless it is held; None where it is not definite."""
     diagonal, panels, rows = [], [], []
     tip = matrix.tip
     size = matrix.columns[0].shape[1] if matrix.columns else 0

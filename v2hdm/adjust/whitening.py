@@ -83,10 +83,9 @@ class Whitening:
         return whitened_gradient(self.plan, self.reduced_factor, gradient, coupled, corners)
 
     def step(self, whitened: Tensor) -> tuple[Gradient, Tensor, Tensor]:
-        """The step x that whitened variables stand for, but for its corners.
+        """The step x of whitened variables but for its corners, the pairs' left tangents (C, M, 6) under it.
 
-        Returns it, the pairs' left tangents (C, M, 6) under it, and the whitened variables (N, 2) of the
-        corners, of kept ones the step itself.
+        The third are the corners' whitened variables (N, 2), of kept ones the step itself.
         """
         arrays = self.engine.arrays
         tip = len(self.reduced_factor.tip)
@@ -121,12 +120,9 @@ def whitened_gradient(
 def factorise(
     engine: Engine, plan: Plan, estimate: Estimate, robust: Loss, hold_cameras: bool = False
 ) -> Whitening:
-    """Whitening at ``estimate``, under the weights that the loss gives there.
+    """Whitening at ``estimate``, under the weights that the loss gives there; held cameras' unknowns stay.
 
-    The cameras' unknowns, where they are held, stay as they are: the last of the whitened variables.
-
-    Raises:
-        AdjustError: the normal equations cannot be factorised.
+    Raises AdjustError where the normal equations cannot be factorised.
     """
     spread, priors = engine.spread(estimate), engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:

@@ -77,10 +77,7 @@ def ground_points_with_jacobian(
 def _on_ground(
     rig: Rig, camera: IntArray, frame: IntArray, pinhole_px: FloatArray, row_share: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`ground_points_with_jacobian` of pixels (N, K, 2) of cameras (N,) at frames (N,).
-
-    Where shutters roll, each by the pose at which its row (N, K) was read.
-    """
+    """:func:`ground_points_with_jacobian` of pixels (N, K, 2), each by the pose at which its row was read."""
     if rig.read_out_s is None:
         ipms = ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
         return ground_points_with_jacobian(ipms, pinhole_px)
@@ -114,11 +111,10 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
 
 
 def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
-    """In how many images a symbol lies along each of the quadrilaterals (G, 4, 2); nan ones have none.
+    """In how many images a symbol mostly covers the middle line of each quadrilateral (G, 4, 2).
 
-    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; other images
-    show the whole arrow there. A symbol lies along a quadrilateral whose middle line it mostly covers: an
-    arrow that crosses a stop line does not.
+    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; others show
+    it whole.
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
     known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
@@ -140,10 +136,7 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
-    """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length.
-
-    The place is known in the image up to :data:`OUTLINE_SIGMA_PX`; towards the horizon that is any length.
-    """
+    """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length."""
     if not len(symbols.camera):
         return []
     length = [len(outline) for outline in symbols.outlines_pinhole_px]

@@ -95,9 +95,8 @@ class FusedGroups:
 def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
     """Corners (S, 4) that a sighting knows only across their side, and others of its group as points.
 
-    Where other paint, a shadow or the image's border cuts a marking, its corner is somewhere on the line of
-    the side, no nearer than the cut. Images that are cut alike are wrong alike: as soon as another image
-    shows the corner, only the line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
+    Images that other paint, a shadow or the border cut alike are wrong alike: as soon as another image shows
+    the corner, only its line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
     """
     grouped = (association.group >= 0)[:, None]
     number = 4 * association.group[:, None] + np.arange(4)
@@ -156,10 +155,10 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
 def in_view(
     association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float
 ) -> BoolArray:
-    """Which corners (S, 4) the adjustment may use: points, and those on lines that the camera can see.
+    """Which corners (S, 4) the adjustment may use: points, and those on lines in front of the camera.
 
-    A dash that passes under the vehicle is cut by the image's border; its side is a line of the image, but
-    where its corner lies behind the camera the line cannot be had by projecting the corner.
+    A dash that passes under the vehicle is cut by the image's border, and its corner behind the camera has no
+    projection.
     """
     fused = fuse_groups(association, located, jitter_rad)
     cam_from_map = rig.cam_from_map(sightings.camera, sightings.frame)
@@ -265,8 +264,8 @@ def attach(
 ) -> Association:
     """Give each sighting without a group to the one that alone fits it; an image shows a group once.
 
-    ``located`` is under ``rig``; of the groups only those of four known corners in ``fused`` are looked at;
-    ``jitter_rad`` is how far the recorded attitude is off.
+    Of the groups only those of four known corners in ``fused`` are looked at; the recorded attitude is off by
+    ``jitter_rad``.
     """
     rows = np.flatnonzero((association.group < 0) & (located.informs.sum(axis=1) >= 2))
     whole = np.flatnonzero(fused.valid.all(axis=1))

@@ -55,10 +55,7 @@ def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Symbols:
-    """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes.
-
-    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them.
-    """
+    """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines and their row shares, classes."""
 
     camera: IntArray
     frame: IntArray
@@ -168,8 +165,7 @@ def collect_sightings(
 ) -> Sightings:
     """Put the quadrilateral detections of ``cameras`` into one table, lens distortion removed.
 
-    Raises:
-        MappingError: the drive has no such camera, or its images hold no usable marking.
+    Raises MappingError where the drive has no such camera, or its images hold no usable marking.
     """
     infos = [camera_of(drive, name).info for name in cameras]
     camera_index, frames = {name: c for c, name in enumerate(cameras)}, frames_of(drive)
@@ -223,11 +219,7 @@ def collect_sightings(
 
 
 def camera_of(drive: Drive, name: str) -> Camera:
-    """The camera ``name`` of ``drive``.
-
-    Raises:
-        MappingError: the drive has no such camera.
-    """
+    """The camera ``name`` of ``drive``; raises MappingError where there is none."""
     if name not in drive.cameras:
         known = ", ".join(drive.cameras)
         raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")

@@ -388,14 +388,10 @@ class Surface:
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded
     ) -> tuple[Surface, float]:
-        """The surface that a drive makes likeliest, and its gain: how far the images' cost falls.
+        """The surface that a drive makes likeliest, and its gain: how far the cost falls, less noise's share.
 
-        Args:
-            information: (B, B) on the parameters, all else being estimated with them.
-            score: (B,) the gradient of the cost by them, where they are now.
-            recorded: on the path.
-
-        Of the gain, what noise alone would do is taken off: one for each parameter that they determine.
+        ``information`` (B, B) is on the parameters, all else being estimated with them, ``score`` (B,) the
+        gradient of the cost by them, where they are now.
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score

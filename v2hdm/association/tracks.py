@@ -51,12 +51,11 @@ def build_tracks(
     noise: PoseNoise,
     options: AssociationOptions,
 ) -> Association:
-    """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
+    """Link the ``sightings``, in image order and ``located`` under ``rig``, by camera and visit.
 
     ``direction_rad`` is how far an extrinsic is off, ``noise`` how far poses are. A sighting continues at
-    most one track and a track takes at most one sighting of an image. A sighting that continues none starts
-    its own. Sightings with fewer than two valid corners on the ground belong to no track. No track outlives
-    its visit.
+    most one track and a track takes at most one sighting of an image; with fewer than two valid corners it
+    has none.
     """
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)

@@ -57,10 +57,7 @@ class Movement:
 def compare_calibrations(
     before: Mapping[str, Calibration], after: Mapping[str, Calibration]
 ) -> list[Movement]:
-    """The movements of the cameras, by name, that both hold.
-
-    Raises MapFileError where they have no camera in common, or as :func:`movement`.
-    """
+    """The movements of the cameras that both hold; raises MapFileError where none, or as :func:`movement`."""
     common = [name for name in before if name in after]
     if not common:
         raise MapFileError(f"no camera in common: {', '.join(before)} and {', '.join(after)}; compare others")
@@ -68,10 +65,7 @@ def compare_calibrations(
 
 
 def movement(before: Calibration, after: Calibration) -> Movement:
-    """The movement between two calibrations of one camera, whose errors are independent.
-
-    Raises MapFileError where they are of two cameras or lenses, or one has no covariance.
-    """
+    """The movement between two independent calibrations of one camera and lens; else MapFileError."""
     _check_comparable(before, after)
     assert before.covariance is not None
     assert after.covariance is not None

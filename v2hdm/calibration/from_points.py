@@ -127,10 +127,7 @@ def calibrate_from_points(
 
 
 def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
-    """The mountings that explain the points, the most likely first.
-
-    Raises DriveError where none does: they lie on a line, or the table means something else than it says.
-    """
+    """The mountings that explain the points, the most likely first; DriveError, with why, where none does."""
     fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
         cause = _misreading(points, info, noise)

@@ -64,10 +64,7 @@ def residuals(fit: Fit) -> Residuals:
 
 
 def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
-    """Standard deviation (M,) of the IPM at ground places (M, 2), in the direction known worst, m.
-
-    Infinite for places behind the camera.
-    """
+    """Standard deviation (M,) of the IPM at places (M, 2), m, the worst way; inf behind the camera."""
     seen, mounting = fit.seen, fit.cam_from_vehicle
     count = len(places_vehicle)
     places = replace(
@@ -88,10 +85,7 @@ def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
 
 
 def known_around(fit: Fit) -> float:
-    """The worst of :func:`known_ground` at the right points and on a circle around them, as wide as they are.
-
-    Points along a line determine the ground on that line, and none beside it.
-    """
+    """The worst of :func:`known_ground` at the right points and on a circle around them."""
     right = fit.seen.points_vehicle[fit.is_right]
     radius = np.ptp(right, axis=0).max() / 2
     angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
@@ -103,10 +97,9 @@ def known_around(fit: Fit) -> float:
 
 
 def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """How far each point is from the others' prediction, under the noise that the others show.
+    """How far each point is, r' cov^-1 r, from the others' prediction, under the noise that they show.
 
-    Of a point that took part, q V - J C J' is the covariance of its residual, of another q V + J C J': either
-    way r' cov^-1 r is its squared distance from the others' prediction.
+    The covariance is q V - J C J' of a point that took part, of another q V + J C J'.
     """
     slopes = fit.seen.jacobian(fit.cam_from_vehicle)
     stated = fit.seen.covariance(fit.cam_from_vehicle)

@@ -58,8 +58,7 @@ def work_on(
 ) -> int:
     """Compose ``conf/<name>.yaml`` with the command line and work on it; returns the exit code.
 
-    Nothing is done after ``--help``. ``advice`` is on values that are missing. Raises ConfigError where a key
-    or value is wrong.
+    ``advice`` is on values that are missing. Raises ConfigError where a key or value is wrong.
     """
     parser = argparse.ArgumentParser(command.name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
@@ -101,8 +100,7 @@ def _compose(
 def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequence[str] = ()) -> DictConfig:
     """Compose ``conf/<name>.yaml`` with a run file, as ``--config-dir`` and ``+run=`` do, and overrides.
 
-    What the run file names in a ``defaults`` list of its own is looked for beside it, where its folder is
-    called ``run``, and among the shipped ones. Raises ConfigError where the file, a key or a value is wrong.
+    What its own ``defaults`` name is looked for beside it, in a folder ``run``, and among the shipped ones.
     """
     if not isinstance(read_yaml(path, ConfigError), dict):  # OmegaConf would expand whatever aliases repeat
         raise ConfigError(f"{path}: expected 'key: value' entries; write it as conf/run/*.yaml are")
@@ -145,10 +143,7 @@ def _refuse_headless(path: Path) -> None:
 
 
 def to_dataclass(composed: DictConfig, schema: type[_Schema], advice: str) -> _Schema:
-    """The composed configuration as the dataclass ``schema``.
-
-    Raises ConfigError where a required value is missing, for which there is ``advice``, or one is wrong.
-    """
+    """The composed configuration as ``schema``; ConfigError, with ``advice``, where a value is missing."""
     try:
         missing = sorted(OmegaConf.missing_keys(composed))
         if missing:

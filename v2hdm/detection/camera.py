@@ -139,8 +139,8 @@ class RoadCamera:
     def log_size_sigma(self, range_m: FloatArray) -> FloatArray:
         """Standard deviation of the logarithm of lengths on the ground at distances, m.
 
-        It is that of lengths along the view, h f / v^2 per px at v px below the horizon; across it half of
-        the horizon's part is left, and none of the focal length's.
+        Along the view they are h f / v^2 per px at v px below the horizon; across it half of that part is
+        left.
         """
         horizon_rad, log_focal = self.camera.mounting_sigma
         return np.hypot(2 * horizon_rad * range_m / self._height_m, log_focal)
@@ -281,10 +281,7 @@ class Horizon:
         self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * _CURVE_UNIT_PX, by_curvature])
 
     def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
-        """The a, b and c (3,) of a line's direction, place beside the camera and curvature, 1/m.
-
-        To first order, about the camera's own direction.
-        """
+        """The a, b and c (3,) of a line by direction, place beside the camera and curvature, 1/m."""
         return self._units * (direction_rad, beside_m, curvature)
 
     def basis(self, below: FloatArray) -> FloatArray:
@@ -316,10 +313,7 @@ def camera_from_calibration(
     linear_response: bool = False,
     mounting_sigma: tuple[float, float] = (0.0, 0.0),
 ) -> Camera:
-    """A camera whose IPM is the one of a finished calibration; ``mounting_sigma`` is that of a guessed one.
-
-    Raises MapFileError where the calibration cannot be that of a camera that looks at the ground.
-    """
+    """A camera of a calibration that is ``mounting_sigma`` off; MapFileError where it sees no ground."""
     info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
     problem = _problem(calibration)
     if not problem:
@@ -346,9 +340,8 @@ def rough_calibration(
 ) -> Calibration:
     """A pinhole camera that looks straight ahead, for images of which nothing better is known.
 
-    Good enough to classify markings by rough size, not to measure with. ``height_m`` is above the ground,
-    ``pitch_deg`` below the horizon, ``fov_deg`` the horizontal field of view, ``width`` and ``height`` px;
-    ``roll_deg`` turns the image's right side down, on which the horizon then rises.
+    ``pitch_deg`` is below the horizon, ``fov_deg`` horizontal; ``roll_deg`` turns the image's right side
+    down, on which the horizon then rises.
     """
     focal_px = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
     intrinsic = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])

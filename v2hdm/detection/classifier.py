@@ -96,8 +96,8 @@ def gather(
 ) -> FloatArray:
     """The :data:`FEATURES` (R, F) of R readings, each the index of one of M quadrilaterals and a class.
 
-    ``quads`` are those of the ``fit`` in the image, ``ground`` on the ground, m, NaN above the horizon;
-    ``proposals`` are the pieces of paint they come from.
+    ``quads`` are in the image, ``ground`` on the ground, m, NaN above the horizon; ``proposals`` are their
+    paint.
     """
     sides = np.sort(np.nan_to_num(ground.length, nan=1.0), axis=1)
     log_sides = np.log(np.clip(sides, *_SIZE_LIMITS_M))
@@ -335,10 +335,9 @@ def read_markings(
 def hidden_ends(patches: Patches, quads: ImageQuads, ground: Quad) -> BoolArray:
     """Which sides (M, 4) are ends of long markings at which something hides the rest of the paint.
 
-    Where paint ends, the ground beside it goes on beyond; where a thing stands before it, it ends with the
-    paint. The ground before the end, on both sides of the paint, is compared with what lies beyond the end:
-    behind the paint and behind that ground. It is bare ground, of which a spot may be stained and across
-    which a shadow's border may run just there, or a thing, of any tone and colour, which may be narrow.
+    Where paint ends, the ground beside it goes on; where a thing stands before it, it ends with the paint. So
+    the ground before the end, on both sides, is compared with what lies beyond: stained, shaded, or a thing
+    of any tone.
     """
     longer = np.roll(ground.length, 1, axis=1) + np.roll(ground.length, -1, axis=1)
     hidden = longer > 2 * _ASPECT * ground.length
@@ -415,10 +414,7 @@ def find_markings(
 
 
 def _are_points(covariance_px: FloatArray, corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
-    """Which corners (M, 4, 2) of covariances (M, 8, 8), px^2, lie at a place and not just on a line.
-
-    The ground counts, and the marking's own size: a pixel is a millimetre here and half a metre there.
-    """
+    """Which corners (M, 4, 2) lie at a place and not just on a line, for the marking's size on the ground."""
     pinhole_px = camera.undistort(corners_px.reshape(-1, 2))
     ground = camera.ground(pinhole_px).reshape(corners_px.shape)
     # What the lens does to a pixel's size is little beside the share.
@@ -434,11 +430,7 @@ def _are_points(covariance_px: FloatArray, corners_px: FloatArray, camera: RoadC
 def classify_alone(
     evidence: FloatArray, views: np.ndarray, kinds: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Log odds (R,) of each reading alone, and how far each of its sides may be off, px, (R, 4).
-
-    ``evidence`` (R, F) and ``views`` (R, C, S, S) float32 are those of :mod:`.evidence`; sides are as in
-    the views.
-    """
+    """Log odds (R,) of each reading alone, and how far each side in its view may be off, px, (R, 4)."""
     given = (views, evidence.astype(np.float32), one_hot(kinds))
     inputs = dict(zip(JUDGE_INPUTS, given, strict=True))
     odds, log_sigma = _session(JUDGE_FILE).run(list(JUDGE_OUTPUTS), inputs)
@@ -513,10 +505,7 @@ def company(ground: FloatArray, kinds: Sequence[str], probability: FloatArray) -
 
 
 def _shapes(ground: FloatArray, kind: np.ndarray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Short and long extent (M, 2), m, direction (M, 2) of the longer, and centre (M, 2).
-
-    Diamonds extend along their diagonals, everything else along its sides.
-    """
+    """Short and long extent (M, 2), m, direction (M, 2) of the longer, centre (M, 2); diamonds' diagonals."""
     ground = np.nan_to_num(ground)
     diagonals = ground[:, [2, 3]] - ground[:, [0, 1]]
     quad = Quad(ground)
@@ -530,10 +519,7 @@ def _shapes(ground: FloatArray, kind: np.ndarray) -> tuple[FloatArray, FloatArra
 
 
 def _follows(apart: FloatArray, axis: FloatArray, length: FloatArray, turned: FloatArray) -> np.ndarray:
-    """Which (M, M) others follow each along an arc, after a gap.
-
-    The chord between two points of a circle makes equal and opposite angles with the tangents there.
-    """
+    """Which (M, M) follow each along an arc: its chord makes equal and opposite angles with both tangents."""
     distance = np.hypot(apart[..., 0], apart[..., 1])
     beside = 0.5 * distance * np.abs(_angle(axis[:, None], apart) + _angle(axis[None], apart))
     gap = distance - (length[:, None] + length) / 2

@@ -152,11 +152,7 @@ class Fit:
         return self.frames.to_px(self.quad.corners)
 
     def covariance_px(self, side_sigma_px: FloatArray | None = None) -> FloatArray:
-        """Covariance (M, 8, 8) of the corners, px^2.
-
-        ``side_sigma_px`` (M, 4) is how far each side as a whole may be off besides, for reasons that
-        residuals do not show, px.
-        """
+        """Covariance (M, 8, 8) of the corners, px^2; sides are off by ``side_sigma_px`` (M, 4) besides."""
         by_side = self.side_covariance
         if side_sigma_px is not None:
             sigma = np.tile(side_sigma_px, 2)
@@ -320,10 +316,7 @@ class _State:
         return cls(*known, contrast, contrast.copy(), light, np.zeros(count))
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
-        """Gauss-Newton until each marking's step is small or says nothing; the system is of its last step.
-
-        With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
-        """
+        """Gauss-Newton until each marking's step is small or says nothing; the system is of its last step."""
         scatter, settled_px = (_FINAL_SCATTER, _SETTLED_PX) if paint is None else (_WIDE_SCATTER, _FOUND_PX)
         count = len(self.blur_px)
         system = _System(

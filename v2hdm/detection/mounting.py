@@ -79,10 +79,7 @@ class Lines:
 
 
 def image_lines(network: Network, image_bgr: np.ndarray, info: CameraInfo) -> Lines:
-    """The lines that the network's output on the whole of an image (H, W, 3) uint8 shows.
-
-    Raises DetectorError where the network cannot be run on it.
-    """
+    """The lines that the network shows in an image (H, W, 3) uint8; DetectorError where it cannot be run."""
     half = cv2.resize(image_bgr, None, fx=1 / _SCALE, fy=1 / _SCALE, interpolation=cv2.INTER_AREA)
     output = network.run(half)
     rows = anchor_rows(output.lanes, network, 0, _SCALE)

@@ -155,21 +155,13 @@ class Network:
     """The paint and lane network: uint8 BGR images in, :class:`RawOutput` out."""
 
     def __init__(self, path: Path | None = None, threads: int = 1, device: str = "cpu"):
-        """Load a model file, to be run on ``cpu`` or ``cuda``.
-
-        Raises DetectorError where there is no such file, it is not an ONNX model or not one of ours, or the
-        device is not there.
-        """
+        """Load a model file, to be run on ``cpu`` or ``cuda``; raises DetectorError where it cannot be."""
         self.path = NETWORK_FILE if path is None else Path(path)
         self._session = open_session(self.path, threads, device)
         self.info = _read_info(self._session, self.path)
 
     def run(self, image_bgr: np.ndarray) -> RawOutput:
-        """Look at an image (H, W, 3) uint8 of any size.
-
-        Raises DetectorError where the network refused the image, or its output is not what its label
-        promises.
-        """
+        """Look at an image (H, W, 3) uint8 of any size; DetectorError where the output is not as labelled."""
         height, width = image_bgr.shape[:2]
         below, right = -height % self.info.multiple, -width % self.info.multiple
         padded = image_bgr
@@ -203,10 +195,7 @@ class Network:
 def run_on_road(
     network: Network, image_bgr: np.ndarray, camera: RoadCamera, mirrored: bool = False
 ) -> NetworkOutput:
-    """Run the network on the rows of an image (H, W, 3) that show ground in reach.
-
-    ``mirrored`` runs it on the mirror image, too, and takes the mean of both outputs.
-    """
+    """Run the network on the rows that show ground in reach, and take the mean with the mirror image's."""
     info, top = network.info, camera.far_row
     band = image_bgr[top:]
     run = partial(_run_twice, network) if mirrored else network.run
@@ -292,10 +281,7 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that this onnxruntime was built without.
-
-    Raises DetectorError that says what to install.
-    """
+    """Raise DetectorError, with what to install, for a device that this onnxruntime was built without."""
     provider = _PROVIDERS[device][0]
     if provider not in onnxruntime.get_available_providers():
         raise DetectorError(
@@ -305,10 +291,7 @@ def check_device(device: str) -> None:
 
 
 def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
-    """A model file ready to run on so many threads, on ``cpu`` or ``cuda``.
-
-    Raises DetectorError where there is no such file, it is not an ONNX model, or the device is not there.
-    """
+    """A model file ready to run on ``cpu`` or ``cuda``; raises DetectorError where it cannot be."""
     check_device(device)
     if not path.is_file():
         raise DetectorError(
@@ -336,10 +319,7 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
 
 
 def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
-    """The classes that a model file describes: the shipped ones, and after them those of its user.
-
-    Raises ConfigError where one of them is wrong.
-    """
+    """The classes of a model file, the shipped ones first; raises ConfigError where one is wrong."""
     return SHIPPED.with_own(metadata.get("own_classes", {}), "its classes")
 
 

@@ -142,10 +142,7 @@ class RoadDetector:
             raise MapFileError(f"{calibration}: {error}") from error
 
     def detect(self, image_bgr: np.ndarray) -> Road:
-        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
-
-        Raises DetectorError where the image is not of that form or not of the camera's size.
-        """
+        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError."""
         markings, lanes = self.detector.detect(image_bgr, self.camera)
         with lap("metres"):
             return self._on_ground(markings, lanes)

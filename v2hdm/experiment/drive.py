@@ -34,11 +34,7 @@ from v2hdm.store.cache import StageCache
 
 
 def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:
-    """The record of a drive and of its maps by every recipe.
-
-    ``workers`` are processes to render and detect in; 1 stays in this one. Raises V2hdmError where the drive
-    cannot be rendered, read or looked at, or has no truth.
-    """
+    """The record of a drive and of its maps by every recipe; raises V2hdmError where it has no truth."""
     folder = Path(job.site.drive.path or "")
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))
@@ -123,10 +119,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Matched:
-    """Markings of a map with a true counterpart, which ``true`` (M,) indexes, in the order of the route.
-
-    ``errors_m`` (M, 4, 2) are the error vectors of their corners.
-    """
+    """Markings with a true counterpart ``true`` (M,), in route order, and their errors (M, 4, 2)."""
 
     true: IntArray
     errors_m: FloatArray

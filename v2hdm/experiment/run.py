@@ -28,12 +28,7 @@ _OPTION, _MADE = "output=", "v2hdm experiment"
 def run_experiment(
     config: ExperimentConfig, config_yaml: str, progress: DriveProgress
 ) -> tuple[Path, list[Measured]]:
-    """Map every drive by every recipe and write what comes of it into ``<output>/<name>/``.
-
-    ``config_yaml`` is the configuration as text, kept beside the results. Returns the folder, and the
-    figures of every drive.
-    Raises V2hdmError where a setting or a drive is at fault, or the folder holds something that is not ours.
-    """
+    """Map every drive by every recipe and write what comes of it; returns the folder and all figures."""
     todo = jobs(config)
     folder = Path(config.output) / config.name
     try:

@@ -187,8 +187,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
     """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
 
-    Raises ``error`` as :func:`geodetic_from_grid`, and when the projection is not conformal: then a grid has
-    no north that all directions turn with.
+    Raises ``error`` as :func:`geodetic_from_grid`, and when the projection is not conformal.
     """
     here = geodetic_from_grid(crs, points, where, error)
     pyproj = need("pyproj", "map", f"{where}: crs", error)

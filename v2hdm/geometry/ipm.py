@@ -80,10 +80,7 @@ def apply_homography(dst_from_src: FloatArray, points_src: FloatArray) -> FloatA
 
 
 def apply_in_front(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
-    """Points (..., N, 2) mapped by a homography (..., 3, 3); nan where the third coordinate is not positive.
-
-    Of the homographies of this module those are the points at, above and behind the camera's horizon.
-    """
+    """Points (..., N, 2) by a homography (..., 3, 3); nan at, above and behind the horizon (third <= 0)."""
     homogeneous = _homogeneous(dst_from_src, points_src)
     third = homogeneous[..., 2:]
     return np.asarray(homogeneous[..., :2] / np.where(third > 0, third, np.nan))

@@ -19,10 +19,7 @@ LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
-    """Roll, pitch (down) and yaw (left) in rad: from a camera that looks along the vehicle's x axis.
-
-    The order is that of REP-103: about x, then y, then z.
-    """
+    """Roll, pitch (down) and yaw (left), rad, about x, y, z: 0 where it looks along the vehicle's x axis."""
     return euler_from_rotation(cam_from_vehicle[:3, :3].T @ LEVEL.T)
 
 

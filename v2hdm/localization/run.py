@@ -224,11 +224,7 @@ def _in_view(
 
 
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
-    """Write figures, poses and the picture of the errors into a folder.
-
-    Its bands are two standard deviations of estimate and recorded pose together; frames in which the vehicle
-    does not know where it is are crosses.
-    """
+    """Write figures, poses and the errors' picture: two-sigma bands, crosses where the vehicle is lost."""
     write_json(folder / "localization.json", found.figures())
     write_tum(found.poses, folder / "localized.tum")
     noise = drive.pose_noise

@@ -66,10 +66,7 @@ def foreign_stretch(
 
 
 def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray:
-    """The gains (E,) of stretches: (2, E, G) views ``within`` that found markings, and all there are.
-
-    What hides a marking may begin or end where the stretch does, by chance: at one of its views.
-    """
+    """The gains (E,) of stretches, by views (2, E, G) within them that found markings, and all there are."""
     beyond, together = all_over - within, _log_likelihood(all_over, share)
     mistake = np.log([_BY_MISTAKE, 1 - _BY_MISTAKE])
     home, foreign = (

@@ -43,10 +43,7 @@ _LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
 @dataclass
 class _Place:
-    """A mapped marking: the number of each corner (4,) there, -1 for none.
-
-    ``images`` showed it, ``point`` (4,) corners as points, at ``preview`` (4, 2) before it was solved.
-    """
+    """A mapped marking: the number of each corner (4,), -1 for none, the images, where it was previewed."""
 
     corner: IntArray
     kind: int
@@ -79,23 +76,16 @@ class IncrementalMapper:
         solve: Solve,
         model: Model,
     ) -> None:
-        """Begin with an empty map, from the extrinsics and recorded poses of ``rig``.
-
-        ``position_sigma_m`` is how far the recorded positions are off, ``model`` that of the solve for each
-        marking, which estimates no pose.
-        """
+        """Begin with an empty map; ``model`` solves for each marking and estimates no pose."""
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
         self._drive = drive_problem(sightings, rig, cameras, model)
         self._begin(rig, 0)
 
     def run(self, progress: Callable[[str], None]) -> tuple[Association, Rig]:
-        """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
+        """Take up all tracks as they end; returns the markings as groups, and the rig that they lead to.
 
-        Returns the markings as groups of sightings, and the rig that they lead to.
-
-        Raises:
-            MappingError: nothing can be solved for.
+        ``progress`` gets the map's size. Raises MappingError where nothing can be solved for.
         """
         tracks, usable = self._link(self._rig, True)
         due, ended = _FIRST_LINK_MARKINGS, False

@@ -128,10 +128,7 @@ def find_knots(
 
 @dataclass(frozen=True)
 class _Course:
-    """Lanes as polylines by their length: ``arc_m`` (V,) of all vertices ``points_map`` (V, 2).
-
-    Lane l begins at ``begin_m[l]``, is ``length_m[l]`` long and a metre away from the next.
-    """
+    """Lanes as polylines by length: ``arc_m`` (V,) of ``points_map`` (V, 2), a metre from lane to lane."""
 
     arc_m: FloatArray
     points_map: FloatArray
@@ -167,10 +164,7 @@ class _Course:
 def _pairs(
     cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Points (P,) and knots that they tell of: of the nearest line, at most half a spacing away.
-
-    Lastly how far ahead of its knot each lies, and how far to the left of its lane there, m.
-    """
+    """Points (P,) and the nearest knots, at most half a spacing away, how far ahead and left of these, m."""
     knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
     reach_m = float(np.hypot(_SPACING_M / 2, half_width_m))
     near = cKDTree(cloud.points_map).sparse_distance_matrix(
@@ -200,8 +194,8 @@ def _passing(
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
     """Where images show lines pass knots: image, knot, pinhole pixel, its covariance and row share.
 
-    A line through the points of a piece, as turned as they are, gives how far to the left of the lane it is.
-    Their errors are taken for one, since neighbouring cells of the network err alike.
+    A line is laid through the points of a piece, whose errors are taken for one: neighbouring cells err
+    alike.
     """
     groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
     (image, at), own = groups.T, own.ravel()
@@ -233,8 +227,7 @@ def _passing(
 def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane, ...]:
     """The lanes as splines through the adjusted knots, vertices about ``spacing_m`` apart with their sigmas.
 
-    The first corner of ``solution`` that is a knot follows those of the markings. Where no image shows the
-    line, as between dashes, it keeps its course beside the knots around.
+    Where no image shows the line, as between dashes, it keeps its course beside the knots around.
     """
     return tuple(
         _drawn(lane, knots, np.flatnonzero(knots.lane == number), solution, spacing_m)

@@ -84,8 +84,8 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
 def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) -> FloatArray:
     """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
 
-    Within a marking it is what the map states. From one marking to another only the errors of the adjustment
-    are shared, drift above all: a corner that was not seen shares those of one that was.
+    From one marking to another only errors of the adjustment are shared; an unseen corner shares a seen
+    one's.
     """
     bundle = optimised.bundle
     index = bundle.corner_index[optimised.groups[marking]]
@@ -213,12 +213,10 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 def _naive_markings(
     inputs: Inputs, ipm: Mapping[str, FloatArray], ground: ImageGround
 ) -> tuple[list[Marking], list[Exclusion]]:
-    """The naive strategy: back-project by an IPM within its region of interest, and average.
+    """The paper's baseline: back-project by an IPM within its region of interest, and average.
 
-    It is the paper's baseline. Recorded poses are taken at their word; only sightings with four valid corners
-    inside the region count.
-    Tracks merge where their averages lie within ``naive_merge_m``: two cameras whose IPMs disagree by more
-    yield two markings where there is one, which is the method's own failure.
+    Recorded poses are taken at their word. Tracks merge where their averages lie within ``naive_merge_m``:
+    two cameras whose IPMs disagree by more yield two markings where there is one, the method's own failure.
     """
     sightings, options = inputs.sightings, inputs.options.association
     cameras = [inputs.drive.cameras[name] for name in sightings.cameras]

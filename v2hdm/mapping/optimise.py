@@ -178,10 +178,7 @@ class Optimiser:
         progress: Callable[[str], None] = silent,
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
     ) -> Optimised:
-        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude.
-
-        ``find_knots`` gives the knots of lanes that take part, by what is known of the rig without them.
-        """
+        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -200,13 +197,10 @@ class Optimiser:
         return self._conclude(final, bundle, inlier, usable)
 
     def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
-        """Classify the candidates of ``final``, which was solved over the accepted observations only.
+        """Classify the candidates of ``final``, solved over the accepted observations ``inlier`` (K,) only.
 
-        ``ungated`` was over all, of which ``inlier`` (K,) were accepted; ``usable`` (S, 4) says the same per
-        corner.
-
-        Raises:
-            MappingError: no candidate is accepted.
+        ``ungated`` was over all; ``usable`` (S, 4) are the corners accepted. Raises MappingError where no
+        candidate is accepted.
         """
         located = locate(self.sightings, final.rig)
         located.informs[:] &= usable
@@ -304,10 +298,7 @@ class Optimiser:
             return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
-        """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
-
-        ``progress`` is called with the size of the map. In place of :meth:`settle`.
-        """
+        """Map track after track, as the vehicle would, in place of :meth:`settle`; then solve for all."""
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             located, options = self._locate(rig), self._options.association
@@ -432,10 +423,7 @@ class Optimiser:
         return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
-        """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
-
-        The positions' stays as stated: images do not see what moves the vehicle and its map alike.
-        """
+        """The solve under the larger of stated and shown noise; that of positions, unseen, as stated."""
         stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
@@ -458,10 +446,7 @@ class Optimiser:
             self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
     def _as_stated(self, bundle: Bundle) -> Problem:
-        """The problem of ``bundle`` from where that ended, with the detector's own covariances.
-
-        What is left of errors that no model knows must not shrink with them.
-        """
+        """The problem of ``bundle`` from where that ended, with the detector's own covariances."""
         seen = bundle.problem.observations
         stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
         return replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated)
@@ -519,8 +504,8 @@ def _scatter(bundle: Bundle) -> FloatArray:
 def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
     """The corners of every group of ``bundle``; one that has lost them all lies where ``ungated`` had it.
 
-    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than stated
-    make the map less certain than the noise model claims.
+    Covariances grow with chi^2 per degree of freedom above one: residuals larger than stated make the map
+    less sure.
     """
     known = bundle.corner_index >= 0
     covariance = np.full((len(known), 8, 8), np.nan)

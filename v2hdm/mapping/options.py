@@ -143,14 +143,9 @@ class MappingOptions:
 
 
 def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -> None:
-    """Refuse values that no mapping can work with.
+    """Raise ConfigError, which names the key, for values that no mapping can work with.
 
-    Args:
-        options: the settings.
-        kinds: classes with four corners that the detector knows; None takes any.
-
-    Raises:
-        ConfigError: A value is out of range; the message names the key.
+    ``kinds`` are classes with four corners that the detector knows; None takes any.
     """
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 

@@ -148,10 +148,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outcome:
-    """An optimised camera set with its inputs and the evidence for the checks.
-
-    ``bundle`` holds the adjusted poses.
-    """
+    """An optimised camera set with its inputs, adjusted poses and the evidence for the checks."""
 
     inputs: Inputs
     bundle: Bundle
@@ -159,11 +156,7 @@ class Outcome:
 
 
 def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, Optimised]:
-    """Optimise a drive, as often as inputs have to be dropped.
-
-    Raises:
-        MappingError: there is nothing to map.
-    """
+    """Optimise a drive, as often as inputs have to be dropped; MappingError where there is nothing to map."""
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
     while True:
@@ -222,8 +215,7 @@ def _foreign(
 ) -> tuple[float, float, float]:
     """The likeliest stretch of foreign images, s, and its log odds as the cause of all that is doubtful.
 
-    The tests look at corners, the stretch at which markings are found at all. What it explains of the corners
-    is what a solve without its images leaves less doubtful, as if that had as many of them.
+    It explains of the corners what a solve without its images leaves less doubtful.
     """
     drive, names = inputs.drive, inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
@@ -345,11 +337,7 @@ def is_doubtful(one: ScoreTest) -> bool:
 
 
 def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
-    """The sigmas from which the ``odds`` are, 1 to 1 or others, that the input is off.
-
-    An error is Cauchy about the usual size, which hardly changes within the value's sigma; the p-value, and
-    so the sigmas, say how far in the tail of no error the value lies.
-    """
+    """The sigmas from which the ``odds`` are that an input is off; errors are Cauchy about the usual size."""
     return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
 
 

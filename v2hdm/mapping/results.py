@@ -27,11 +27,7 @@ from v2hdm.site.markings import Suspicion
 
 @dataclass(frozen=True)
 class Contradiction(ScoreTest):
-    """One input that would have to be wrong, as far as the residuals say, in the words of the user's inputs.
-
-    ``cameras`` by name; ``about`` is the class of a known size and its length, a surveyed point, or the visit
-    of a clock.
-    """
+    """One input that would have to be wrong, in the user's words: of which cameras, and ``about`` what."""
 
     cameras: tuple[str, ...] = ()
     about: str = ""
@@ -39,11 +35,7 @@ class Contradiction(ScoreTest):
 
 @dataclass(frozen=True)
 class CameraFit:
-    """How well one camera's ``observations`` fit.
-
-    ``variance_factor`` is how many times as large as stated by the detector their variances are, by the
-    median; ``rejected_share`` is the share of their information that the rest contradicts.
-    """
+    """How well a camera fits: its median variance over the stated, and the share that is contradicted."""
 
     observations: int
     variance_factor: float

@@ -81,10 +81,7 @@ class Canvas:
 
     @classmethod
     def around(cls, points_map: FloatArray, cell_m: float, multiple_px: int = 1) -> Canvas:
-        """The smallest one, north above, around points (N, 2) m; its edges are multiples of its pixels.
-
-        Rows and columns are filled up to a multiple of ``multiple_px``.
-        """
+        """The smallest one, north above, around points (N, 2) m, by ``multiple_px`` whole pixels."""
         low = np.floor(points_map.min(axis=0) / cell_m)
         high = np.ceil(points_map.max(axis=0) / cell_m)
         columns, rows = (np.ceil((high - low) / multiple_px) * multiple_px).astype(int).tolist()
@@ -135,10 +132,7 @@ class Shot:
 
 
 def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
-    """The part of a camera's image that shows the ground within its ROI, feathered to its edges.
-
-    The camera sits at ``cam_from_vehicle`` (4, 4); the mask of its own vehicle is left out where it is known.
-    """
+    """The part of an image that shows ground within the ROI, feathered, less the vehicle where known."""
     info = camera.info
     pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle, densified(camera.roi_vehicle, 16))
     inside = np.zeros((info.height + 2, info.width + 2), dtype=np.uint8)
@@ -175,11 +169,10 @@ def adjusted_shots(
     adjusted: Trajectory,
     surface_at: Callable[[FloatArray], Surface | None] = lambda poses: None,
 ) -> list[Shot]:
-    """The images of calibrated cameras under adjusted extrinsics and poses.
+    """The images of calibrated cameras under adjusted extrinsics and poses, in the recorded poses' frame.
 
-    ``clock_s`` is by camera how much later than stamped its images were taken. ``adjusted`` is in the frame
-    of the recorded poses; where the drive's road was not flat, its own have been laid flat. ``surface_at``
-    gives the ground under vehicles at poses (F, 4, 4).
+    ``clock_s`` is by camera how much later than stamped its images were taken; ``surface_at`` gives the
+    ground under vehicles at poses (F, 4, 4).
     """
     images = [image for image in drive.images if image.camera in calibrations]
     taken_s = np.array([image.stamp_s + clock_s[image.camera] for image in images])
@@ -235,11 +228,7 @@ def blend(
     device: str = "cpu",
     progress: Steps | None = None,
 ) -> Iterator[Sheet]:
-    """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
-
-    ``shots`` are in driving order; ``progress`` counts images put onto sheets. Raises DriveError where an
-    image is missing, damaged or of the wrong size.
-    """
+    """The sheets of a canvas that any image shows, in driving order; DriveError where one cannot be read."""
     plan = _plan(canvas, shots, lenses)
     full_weight = _full_weight(canvas, shots, lenses)
     order = [index for _, views in plan for index, _ in views]
@@ -291,10 +280,7 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
 
 
 def _tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
-    """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels.
-
-    Two convex shapes are apart if a side of either parts them; the polygon's box is the tiles' sides.
-    """
+    """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels."""
     low = np.maximum(np.floor((polygon.min(axis=0) - 1) / TILE_PX).astype(int), 0)
     high = np.minimum(np.floor((polygon.max(axis=0) + 1) / TILE_PX).astype(int) + 1, limit)
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
@@ -371,12 +357,7 @@ class _Sums:
         self._sums.index_add_(0, at, values)
 
     def _warp(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
-        """Where the pixels of tiles lie in an image, and how many of its pixels each covers.
-
-        Returns:
-            (3, T, side, side): x and y in [-1, 1] over the cut image, as of ``grid_sample``, and the
-            density in px of the image a px of the sheet.
-        """
+        """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...)."""
         points = (TILE_PX * torch.from_numpy(tiles).to(self._device)[:, None] + self._pixels).float()
         if shot.on_plane is not None:
             points = points + self._across @ self._moved_px(tiles, shot.on_plane, map_from_sheet).to(points)
@@ -400,10 +381,7 @@ class _Sums:
     def _moved_px(
         tiles: np.ndarray, on_plane: Callable[[FloatArray], FloatArray], map_from_sheet: FloatArray
     ) -> Tensor:
-        """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet.
-
-        A tile of 2 cm a pixel is 1.3 m wide, over which ground bends by less than a millimetre.
-        """
+        """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet."""
         corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
         sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
         seen = on_plane(apply_homography(map_from_sheet, corners.astype(np.float64)))

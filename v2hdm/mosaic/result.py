@@ -110,10 +110,7 @@ _AT_ONCE_BYTES = 1 << 24
 
 @contextmanager
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
-    """Put sheets into a cloud-optimised GeoTIFF: JPEG within, overviews and a mask; whole or not at all.
-
-    Raises ConfigError where rasterio is not installed.
-    """
+    """Put sheets into a cloud-optimised GeoTIFF, JPEG within, with a mask; ConfigError without rasterio."""
     rasterio = need("rasterio", "gis", path.name, ConfigError)
     west, _, _, north = canvas.bounds_m
     profile = {

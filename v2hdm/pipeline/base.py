@@ -28,10 +28,7 @@ LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the 
 
 
 def read_base(path: Path) -> Base:
-    """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
-
-    Raises MapFileError where it is missing, damaged, of an older version, of another method, or FAIL.
-    """
+    """Read an earlier map, and the poses and left-out candidates beside it; MapFileError if unusable."""
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
     if not hd_map.markings:
@@ -97,10 +94,7 @@ def _as_json(one: Change) -> dict[str, Any]:
 
 
 def write_changes(changes: Changes, hd_map: HdMap, folder: Path) -> None:
-    """Write ``changes.geojson`` into ``folder``.
-
-    A feature is a change: its outline now, or that which it had if it is gone, where the map has it now.
-    """
+    """Write ``changes.geojson``: a feature is an outline now, or that which it had if it is gone."""
     features = []
     for one in changes.changes:
         corners = one.before if one.after is None else one.after

@@ -173,10 +173,7 @@ _RANGES = {f"{below}{key}": allowed for allowed, below, keys in _KEYS_WITHIN for
 
 
 def admit(config: RunConfig) -> str:
-    """Refuse what cannot work before any long work; returns the run's name.
-
-    Raises ConfigError, which names the key, or DetectorError where ``detector.model`` cannot be used.
-    """
+    """Refuse, by ConfigError with the key, what cannot work before any long work; the run's name."""
     from v2hdm.detection.detector import Detector
     from v2hdm.pipeline.survey import table_of
 

@@ -35,11 +35,7 @@ def detect_in_pieces(
     context: Context,
     detect: Detect = detect_images,
 ) -> list[ImageDetections]:
-    """Detect in every image of a drive, in the drive's order, where that is not known yet.
-
-    ``detect`` takes the place of processes of this machine. Raises V2hdmError as
-    :func:`v2hdm.detection.batch.detect_all`.
-    """
+    """Detect in every image of a drive, in its order, where that is not known yet, by ``detect``."""
     cache, progress = context.cache, context.steps("detect")
     detector_key = cache.key(options, model_key(options))
     masks = cache.get_or_make(

@@ -70,11 +70,9 @@ _HEADER = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
 def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None:
     """Write ``trajectory.tum`` and ``trajectory_sigma.csv``, a line for each time of an image.
 
-    Of joined drives each has its own, such as ``trajectory_monday.tum``.
-
-    The poses are in the frame of the recorded ones, whose road is not flat: each is the recorded pose of that
-    time, moved as the solve has moved the flat one. ``seen`` says whether a marking was seen then; where none
-    was, the pose is the recorded one and its sigmas those that the drive states.
+    Of joined drives each has its own, such as ``trajectory_monday.tum``. Poses are in the frame of the
+    recorded ones, whose road is not flat: moved as the solve has moved the flat ones. ``seen`` says whether a
+    marking was seen then; else pose and sigmas are those of the drive.
     """
     for number, visit in enumerate(drive.visits):
         own = poses.visit == number

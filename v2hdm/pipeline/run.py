@@ -78,7 +78,7 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     """The result of a run in the place that its settings name, and whether it was there already.
 
     ``work`` makes a result in folders of this machine; a finished one of the same is taken where ``take``
-    says so. Raises V2hdmError as ``work``; or a store does not work, or holds what is not ours.
+    says so.
     """
     output = place_of(config.output, "output=")
     if is_url(config.cache):
@@ -97,10 +97,7 @@ def note_finished(result: RunResult, key: str, cache: StageCache) -> None:
 
 
 def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
-    """The result of a run where it lies in its folder already, whole, and made of the same; else None.
-
-    Nothing is refused here: the run that follows reports what cannot be read.
-    """
+    """The result of a run if it lies in its folder, whole, and made of the same; else None."""
     try:
         folder = Path(config.output) / run_name(config)
         entry = _noted(folder, cache)

@@ -51,11 +51,7 @@ class ExtrinsicMetrics:
 
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
-    """Which true markings (J,) the cameras saw whole inside their region of interest.
-
-    Whole means: all corners inside the camera's ROI at the true pose, at least
-    :data:`FULLY_VISIBLE` of the area unoccluded, in at least :data:`MIN_SIGHTINGS` images.
-    """
+    """Which true markings (J,) the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
     corners_map = np.array([marking.corners_map for marking in truth.map.markings]).reshape(-1, 4, 2)
     sightings = np.zeros(len(corners_map), dtype=int)
     for i, image in enumerate(drive.images):
@@ -180,11 +176,7 @@ def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
 
 
 def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
-    """Distance (N,) of points to a densely sampled line, the samples joined by their tangent.
-
-    The two nearest samples span the local line, so the result is lateral to far below the
-    sampling step.
-    """
+    """Distance (N,) of points to a densely sampled line, between its two nearest samples: lateral."""
     if not len(points):
         return np.empty(0)
     if len(line) < 2:
@@ -240,8 +232,7 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
 def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArray | None) -> dict[str, float]:
     """How far an extrinsic (4 x 4) moved from its start and, where known, how far it is from truth.
 
-    The turns are those of the camera about the vehicle's axes (deg): yaw to the left, pitch nose
-    down, roll to the right.
+    Turns are about the vehicle's axes, deg: yaw to the left, pitch nose down, roll to the right.
     """
     turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
     yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)

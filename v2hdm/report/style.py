@@ -54,10 +54,7 @@ RC: dict[Any, Any] = {
 
 @contextmanager
 def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Iterator[Figure]:
-    """A figure that is saved to ``path`` (whole or not at all) when the block ends.
-
-    It has a canvas of its own and never touches pyplot's global state.
-    """
+    """A figure, with a canvas of its own, that is saved to ``path``, whole, when the block ends."""
     with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
         FigureCanvasAgg(fig)

@@ -29,10 +29,7 @@ posterior; what lies farther off is of something else."""
 
 @dataclass(frozen=True)
 class Candidates:
-    """Corners ``corners_map`` (G, 4, 2), m, of G candidates and their joint covariances (G, 8, 8), m^2.
-
-    A corner that was not seen has the variance :data:`_UNSEEN_M2` and lies anywhere near the others.
-    """
+    """Corners (G, 4, 2), m, and joint covariances (G, 8, 8), m^2; of unseen ones :data:`_UNSEEN_M2`."""
 
     corners_map: FloatArray
     covariance_m2: FloatArray
@@ -41,10 +38,7 @@ class Candidates:
     def seen(
         cls, corners_map: FloatArray, covariance_m2: FloatArray, about: FloatArray | float = 0.0
     ) -> Candidates:
-        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where one was not seen.
-
-        One without any corner lies at its ``about`` (G, 2).
-        """
+        """Candidates of corners and covariances that are nan if unseen; ``about`` (G, 2) without any."""
         unseen = np.isnan(corners_map[..., 0]) | np.isnan(corners_map[..., 1])
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
@@ -108,11 +102,9 @@ def with_dissent(
     """The candidates (G,), less certain where sightings contradict what ``fused`` ones agree on.
 
     The joint solution rejected R corners: the ``corner`` (R,) of candidate ``group`` (R,), which sighting
-    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
-
-    Most images may see where bright paint ends, and the nearest ones a worn end beyond it. Either is right in
-    proportion to its information, not to a power of it: images of one view err alike. A mixture of two places
-    has the variance p (1 - p) of their distance squared; p is small. Corners of one sighting go together.
+    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2). Either is right
+    in proportion to its information, since images of one view err alike; a mixture of two places has the
+    variance p (1 - p) of their distance squared. Corners of one sighting go together.
     """
     off = seen_map - candidates.corners_map[group, corner]
     away_m = np.linalg.norm(off, axis=1)
@@ -134,12 +126,11 @@ def with_dissent(
 
 
 def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: FloatArray) -> Candidates:
-    """The solved candidates (G,), with the errors that all images of a corner share.
+    """The solved candidates (G,), with the errors that all images of a corner share, as of a worn end.
 
-    A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
-    are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
-    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says. Where the
-    images of a corner scatter more than others do, by ``scatter`` (G, 4), they know as much less of it.
+    Of errors that are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey
+    Sampling, 1965): about r times a single image's, as in ``fused``. ``scatter`` (G, 4) makes a corner less
+    known.
     """
     seen = np.maximum(fused.seen, 1)
     share = scatter - 1 + CORRELATION * seen * scatter
@@ -163,8 +154,7 @@ _LEAST_TO_COMPARE = 3  # variances from which they have a spread
 def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, float]:
     """Scale and freedom of the inverse-gamma prior of variances (M,), each estimated with ``freedom`` (M,).
 
-    By moments of their logarithms (Smyth, Linear models and empirical Bayes methods, 2004, section 6.2); of
-    fewer than three nothing is known, and none is too large.
+    By moments of their logarithms (Smyth, 2004, section 6.2); of fewer than three nothing is known.
     """
     if len(variance) < _LEAST_TO_COMPARE:
         return _LARGEST, _PRIOR_FREEDOM[1]
@@ -177,11 +167,7 @@ def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, fl
 
 
 def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
-    """How many times as large as usual the variance of corners' (G, 4) images is, at least once.
-
-    By sums of their ``squared`` residuals (G, 4), in sigmas, over ``freedom`` (G, 4) degrees: each variance
-    is a mean of its own and of what those of all corners say.
-    """
+    """How many times the usual the variance (G, 4) of corners' images is, at least once, by all corners'."""
     known = freedom > 0
     scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])
     after = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))

@@ -115,20 +115,12 @@ class Base:
 def update_map(
     base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
 ) -> tuple[HdMap, Changes, IntArray, IntArray]:
-    """Bring the ``base`` map up to date; returns it and what changed.
+    """Bring the ``base`` map up to date with ``made``, the new drive's own map, in the same frame.
 
-    Lastly the ids in it of the M markings of ``made`` (M,), 0 for one that it does not have, and where each
-    corner (M, 4) stands in its order.
-
-    Args:
-        base: the earlier map.
-        made: the new drive's own map, in the same frame.
-        observer: the new drive.
-        mapped: (S,) which sightings are of the markings of ``made``.
-        drift_over_m: distance over which the error of the drive's poses fades, m.
-
-    Raises:
-        MappingError: the drive finds too little of the map again to be of its site.
+    Returns it, what changed, the ids in it of the M markings of ``made`` (M,), 0 for none, and where each
+    corner (M, 4) stands in its order. ``mapped`` (S,) are the sightings of ``made``, ``drift_over_m`` is the
+    way over which the poses' error fades. Raises MappingError where the drive finds too little of the map
+    again.
     """
     old, new = base.hd_map.markings, made.markings
     of_old = Errors.of(old, base.hd_map.drift_over_m or _DRIFT_OVER_M)

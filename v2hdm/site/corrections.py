@@ -26,10 +26,7 @@ class Stated:
 
     @classmethod
     def of(cls, corrections: Sequence[Correction], corners_map: FloatArray, kinds: Sequence[str]) -> Stated:
-        """The corrections of candidates with corners (G, 4, 2), each of the nearest one, of its class first.
-
-        All candidates on rejected paint are rejected: another reading of it would take its place.
-        """
+        """The corrections of candidates (G, 4, 2), of the nearest, its class first; all on rejected paint."""
         rejected: dict[int, str] = {}
         kept: dict[int, Correction] = {}
         for one in corrections:

@@ -46,10 +46,7 @@ STAYED, MOVED = range(2)
 
 @dataclass(frozen=True)
 class Watched:
-    """Log likelihoods (N,) of the images of N places where the drive's map has nothing.
-
-    ``there`` if the marking is there, ``bare`` if it is not.
-    """
+    """Log likelihoods (N,) of images of places where the map has nothing, if there is a marking, if not."""
 
     there: FloatArray
     bare: FloatArray
@@ -62,10 +59,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Pair:
-    """An old and a new marking that are one: the old one's corner c is the new one's (c + ``turn``) mod 4.
-
-    ``moved`` is the probability that it was painted elsewhere.
-    """
+    """An old and a new marking that are one, corner c (c + ``turn``) mod 4, ``moved`` by probability."""
 
     old: int
     new: int
@@ -129,8 +123,8 @@ def decide(
 ) -> Decision:
     """Decide what became of ``old`` markings of an earlier map, and what the ``new`` ones of a drive are.
 
-    ``of_old`` and ``of_new`` are their errors; ``watched_now`` is how often the new drive looked at the old
-    markings that it has not mapped, ``watched_before`` the earlier drive at the places of the new ones.
+    ``watched_now`` is how often the new drive looked at the old markings that it has not mapped,
+    ``watched_before`` the earlier drive at the places of the new ones.
     """
     candidates = _candidates(old, new, of_old, of_new)
     shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))

@@ -44,10 +44,7 @@ _GUIDE_RANGE = 1.8
 
 @dataclass(frozen=True)
 class Guides:
-    """Whole lines as single images saw them, gaps of dashes included: which paint is one line.
-
-    ``points_map`` (G, 2) m; ``line`` (G,) that a point is of, an index into ``image_of_line`` (L,).
-    """
+    """Whole lines as single images saw them, gaps included: points (G, 2), m, their lines and images."""
 
     points_map: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -114,10 +111,7 @@ class ImageGround:
         return replace(self, moved_map=out)
 
     def at_rows(self, points_map: FloatArray, image: IntArray, row_share: FloatArray) -> FloatArray:
-        """Points (..., 2) that images (...) show at rows (...), by the poses at which these were read.
-
-        To first order in the motion: the second is under a millimetre.
-        """
+        """Points (..., 2) of images (...) by the poses at which their rows were read, to first order."""
         if self.moved_map is None:
             return points_map
         motion = self.moved_map[image]
@@ -128,10 +122,7 @@ class ImageGround:
 def ground_by_ipm(
     drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray], rig: Rig
 ) -> ImageGround:
-    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are.
-
-    Of ``rig``, over the same cameras, only the read-out times and twists are looked at.
-    """
+    """By an IPM per camera and the recorded poses, and of ``rig`` read-out times and twists alone."""
     rows, camera = _rows(drive, list(ipm))
     poses = np.stack([drive.images[i].map_from_vehicle for i in rows])
     forward = [facing_ipm(ipm[name], drive.cameras[name].roi_vehicle.mean(axis=0)) for name in ipm]
@@ -172,10 +163,7 @@ def collect_lane_points(
     max_range_m: float,
     jitter_rad: float,
 ) -> LaneCloud:
-    """Back-project all lane detections of the images that ``ground`` covers, up to ``max_range_m``.
-
-    ``jitter_rad`` of viewing direction goes into the weights, so that near points count for more.
-    """
+    """Back-project lane detections up to ``max_range_m``; near ones count more by a direction's jitter."""
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
     lanes = _lanes(detections, ground, whole=False)
     if not lanes:

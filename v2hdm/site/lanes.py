@@ -60,10 +60,7 @@ def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
 
 
 def join_paths(paths: list[Path], options: LaneOptions) -> list[Path]:
-    """Join paths end to end where both ends lie on one arc, shortest gaps first.
-
-    Gaps up to ``max_dash_gap_m`` are bridged between dashed pieces, up to ``max_break_m`` otherwise.
-    """
+    """Join paths end to end where both ends lie on one arc, shortest gaps first, up to the options' gaps."""
     joined = []
     for run in _runs(len(paths), _joints(paths, options)):
         own = [paths[path].turned(backwards) for path, backwards in run]
@@ -276,10 +273,7 @@ _LEAST_LENGTH_M = 6.0
 
 
 def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
-    """Polylines along the lane paint of ``cloud``, vertices ``options.node_spacing_m`` apart.
-
-    Dashes of one line become one lane of kind ``lane_dash`` that runs on across their gaps.
-    """
+    """Polylines along the lane paint, vertices ``node_spacing_m`` apart; dashes of a line are one lane."""
     if len(cloud.points_map) < 2:
         return ()
     paths = join_paths(string_nodes(find_nodes(cloud, options), options), options)

@@ -87,10 +87,7 @@ def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 def learn_paint(
     observer: Observer, markings: Sequence[Marking], paint_map: FloatArray
 ) -> Mapping[str, Paint]:
-    """By class the contrast of paint and of bare ground in a drive; classes of too few markings are left out.
-
-    ``markings`` are of the drive's own map; ``paint_map`` (N, 2) are places where there is, or was, paint.
-    """
+    """By class, of enough markings, the contrast of paint, at ``paint_map`` (N, 2), and of bare ground."""
     out = {}
     paint = cKDTree(paint_map)
     for kind in sorted({one.kind for one in markings}):
@@ -144,11 +141,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Observer:
-    """The observations of a drive: its ``sightings``, images and cameras, under a ``rig``.
-
-    ``jitter_rad`` is how far the attitude of a pose is off. ``grey`` gives its images, None where they are
-    not to be had.
-    """
+    """The observations of a drive under a ``rig``; ``grey`` gives its images, None if not to be had."""
 
     sightings: Sightings
     views: Views

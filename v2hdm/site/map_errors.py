@@ -114,11 +114,7 @@ class Shift:
         return np.asarray((self._inverse @ self.off_map.ravel()).reshape(-1, 2))
 
     def without_itself(self, pair: int) -> tuple[FloatArray, FloatArray]:
-        """Mean (2,) and covariance (2, 2) of the maps' shift at a pair, by all other pairs.
-
-        Leave-one-out prediction of a Gaussian process (Rasmussen and Williams, Gaussian Processes for Machine
-        Learning, section 5.4.2).
-        """
+        """Mean (2,) and covariance (2, 2) of the shift at a pair, by all others (leave one out)."""
         own = slice(2 * pair, 2 * pair + 2)
         spread = np.linalg.inv(self._inverse[own, own])
         mean = self.off_map[pair] - spread @ self._weighed[pair]
@@ -172,10 +168,7 @@ _LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier lin
 def updated_lanes(
     old: Sequence[Lane], new: Sequence[Lane], shift: Shift, number: Callable[[], int]
 ) -> tuple[Lane, ...]:
-    """The lines of both maps: an earlier one keeps its id, and its course where the new drive has none of it.
-
-    ``shift`` is how the maps lie to each other; ``number`` gives a fresh id.
-    """
+    """The lines of both maps: an earlier one keeps its id, and its course where the new drive has none."""
     before = [replace(one, points_map=_moved(one.points_map, shift, of_old=True)) for one in old]
     pieces: list[list[Lane]] = [[] for _ in before]
     added = []

@@ -37,10 +37,7 @@ _CLUTTER_BY = (
 
 @dataclass(frozen=True)
 class Classified:
-    """G candidates, and of each the reason why it is no marking of the map, None if it is one.
-
-    ``misfit`` (G,) is that of the posterior.
-    """
+    """G candidates, the reason why each is no marking of the map, if so, and the posterior's misfit (G,)."""
 
     kind: tuple[str, ...]
     candidates: Candidates
@@ -54,11 +51,7 @@ class Classified:
         return np.flatnonzero([reason is None for reason in self.verdict])
 
     def markings(self) -> tuple[Marking, ...]:
-        """The markings of the map, one for each accepted candidate.
-
-        Raises:
-            MappingError: there is none.
-        """
+        """The markings of the map, one for each accepted candidate; MappingError where there is none."""
         if not len(self.accepted):
             reasons = [exclusion.reason for exclusion in self.exclusions()]
             commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
@@ -100,10 +93,10 @@ def classify(
     parallax: Parallax,
     options: AcceptanceOptions,
 ) -> Classified:
-    """Decide which of the ``solved`` candidates are markings of the map, and where their corners are.
+    """Decide which ``solved`` candidates are markings of the map, and where their corners are.
 
-    They are of the classes ``kind`` (G,), by their place in ``kinds``; ``counted`` says how often candidates
-    of corners (G, 4, 2) were seen, and ``parallax`` which of them lie on the ground.
+    Of classes ``kind`` (G,) in ``kinds``; ``counted`` says how often they were seen, ``parallax`` whether on
+    the ground.
     """
     first = posterior(solved, kind, counted(np.where(solved.known[..., None], solved.corners_map, np.nan)))
     names, number = [kinds[one] for one in kind], kind.copy()
@@ -170,9 +163,8 @@ def with_relative_sigma(
 ) -> tuple[Marking, ...]:
     """The markings (M,) with what each contributes to the error of the distance to one about 10 m away.
 
-    To the errors of the adjustment comes what the marking's own covariance has beyond it: an error of its
-    paint, which it shares with no other. ``corner_index`` (M, 4) numbers their corners in the solution, -1
-    for one that was not seen; ``joint`` is of corners of the solution.
+    To the errors of the adjustment comes that of its own paint. ``corner_index`` (M, 4) numbers their corners
+    in the solution, -1 for one that was not seen; ``joint`` is of these.
     """
     seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
     if not len(seen):
@@ -238,10 +230,7 @@ class Suspicion:
 def most_suspicious(
     accepted: IntArray, misfit: FloatArray, squared: FloatArray, counts: Counts
 ) -> Sequence[Suspicion]:
-    """The most suspicious of the ``accepted`` (M,) of G candidates, the worst first.
-
-    ``misfit`` (G,) are p-values of shapes, ``squared`` (G,) the sums of squared residuals, in sigmas.
-    """
+    """The most suspicious of the ``accepted`` (M,), the worst first, by p-values of shapes and residuals."""
     seen, agreed = counts.observations[accepted], counts.agreeing[accepted]
     freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two an observation, less those of four corners
     # Beside its freedom a variance has an inverse-gamma prior, so that it follows Fisher's F distribution.

@@ -67,10 +67,7 @@ class PointViews:
         variance_factor: float,
         pose_sigma: Sequence[PoseSigma],
     ) -> PointViews:
-        """The corners that ``located`` says are informative; ``pose_sigma`` is of each visit.
-
-        Their covariances are ``variance_factor`` times as stated.
-        """
+        """The corners that ``located`` says are informative, covariances ``variance_factor`` times."""
         used = association.in_group_order(located.informs)
         rows = np.flatnonzero((association.group >= 0) & used.any(axis=1))
         corners, rays, covariance = (
@@ -92,10 +89,7 @@ class PointViews:
 
 @dataclass(frozen=True)
 class Parallax:
-    """How G candidates seem to move: ``slope`` (G, P) is s of each point, 1 on the ground.
-
-    Its covariance is ``covariance`` (G, P, P).
-    """
+    """How G candidates seem to move: ``slope`` (G, P), s of each point, 1 on the ground, and covariance."""
 
     slope: FloatArray
     covariance: FloatArray
@@ -122,8 +116,7 @@ class Parallax:
 def measure_parallax(views: PointViews, count: int) -> Parallax:
     """Estimate s of the points of each of ``count`` candidates by weighted least squares.
 
-    Beside it, where they lie and a roll and pitch that is wrong in all images alike are unknown.
-    Residuals larger than stated make s less certain.
+    Where they lie, and a roll and pitch that is wrong in all images alike, are unknown, too.
     """
     group, used, each = views.group, views.used, views.used.shape[1]
     total, slopes = 2 * each, slice(2 * each, 3 * each)
@@ -182,10 +175,7 @@ def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatAr
 
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
-    """Derivative (N, P, 2, 6) of ground points at the ends of rays (N, P, 2) by the states of a pose.
-
-    The order is that of :data:`v2hdm.adjust.POSE_STATES`; rotations are about the camera and the map's axes.
-    """
+    """Derivative (N, P, 2, 6) of ground points at the ends of rays (N, P, 2), by :data:`POSE_STATES`."""
     x, y = ray[..., 0], ray[..., 1]
     one, none, h = np.ones_like(x), np.zeros_like(x), np.broadcast_to(height_m[:, None], x.shape)
     columns = (
@@ -200,11 +190,7 @@ def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
 
 
 def _views(views: PointViews, centre: FloatArray) -> tuple[IntArray, IntArray]:
-    """The view (N,) of each sighting, by number, and how many images each view has.
-
-    A camera's images of a candidate are one view until the camera, at ``centre`` (N, 2), has moved on by more
-    than :data:`_ONE_VIEW_M` and what the poses may be off.
-    """
+    """The view (N,) of each sighting, and images of each: one until the camera (N, 2) has moved on enough."""
     reach_m = _ONE_VIEW_M + _POSE_SIGMAS * views.pose_sigma[:, 0]
     begun: dict[tuple[int, int], int] = {}
     first: list[int] = []

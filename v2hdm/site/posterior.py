@@ -219,10 +219,7 @@ def _geometric(images: IntArray, stay: float) -> FloatArray:
 
 
 def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
-    """Log likelihood (N,) that markings are ``found`` (N,) times in so many ``easy_views`` (N,).
-
-    ``rate`` is that of their class. Some are worn or hidden, and are found at any rate.
-    """
+    """Log likelihood (N,) of ``found`` (N,) in ``easy_views`` (N,), by the class's ``rate`` or any rate."""
     usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
     neglected = _rates(found, easy_views, 1.0, 1.0)
     both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
@@ -345,8 +342,8 @@ def _hypotheses(
 ) -> list[_Hypothesis]:
     """All that N candidates may be, given the shapes of their class.
 
-    ``weight`` and ``other_length`` (N,) are the probabilities so far of being a marking, and one of another
-    length; ``vague`` (N, 4) is the log likelihood ratio of views that do not agree on a corner's place.
+    ``weight`` and ``other_length`` (N,) are probabilities of being a marking, and of another length;
+    ``vague`` (N, 4) the log likelihood ratio of views that disagree on a corner.
     """
     space = _Space(candidates, share, paint)
     total, ragged = sum(shape.share for shape in shapes), np.zeros(len(candidates))
@@ -371,11 +368,7 @@ def _add_shape(
     other_length: FloatArray,
     vague: FloatArray,
 ) -> FloatArray:
-    """Add the hypotheses of one shape of the class, a ``part`` of it; arguments as for :func:`_hypotheses`.
-
-    Returns:
-        The log likelihood (N,) that what is no marking has ends as ragged as these.
-    """
+    """Add the hypotheses of one shape, a ``part`` of the class; log likelihood (N,) of as ragged clutter."""
     candidates, share = space.candidates, space.share
     laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
     scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
@@ -443,8 +436,8 @@ def _worn_evidence(
 ) -> list[FloatArray]:
     """Log likelihood ratios (N,) that an end is worn rather than sound, by how far images disagree on it.
 
-    ``ends`` (N, 8) are motions inwards of two corners by 1 m each, in opposite pairs; what moves a pair alike
-    shifts the whole marking and does not count. ``weight`` (N,) says who is a marking.
+    ``ends`` (N, 8) move two corners by 1 m inwards, in opposite pairs, of which what both share does not
+    count.
     """
     whole = candidates.known.all(axis=1)
     variance = [
@@ -459,11 +452,7 @@ def _worn_evidence(
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on its place.
-
-    They are as few for a sound one as for all corners of markings; for every second worn or hidden one any
-    share of them is as likely.
-    """
+    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on it."""
     found = np.maximum(counts.found[:, None], counts.pointed)
     vague = found - counts.pointed
     rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
@@ -474,11 +463,10 @@ def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
 def _other_lengths(
     candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Sigma, m, of other lengths, and the log likelihood ratio (N,) of one as others have it.
+    """Sigma, m, of other lengths, and the log likelihood ratio (N,) of one as others have it, to its own.
 
-    That is beside a length of its own: of paint that has another length with the probabilities ``weight``
-    (N,) each may be repeated (a Dirichlet process). ``shorter`` (N, 8) moves corners so that paint gets
-    shorter by 1 m.
+    Paint of another length, by ``weight`` (N,), may be repeated (a Dirichlet process); ``shorter`` (N, 8)
+    shortens it by 1 m.
     """
     off_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     own_m2 = _along(candidates.covariance_m2, shorter, shorter)

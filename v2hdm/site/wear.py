@@ -78,11 +78,7 @@ class Cells:
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
     def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit the cells by each of :data:`_CONTRASTS`, were it that of full paint.
-
-        Returns the log likelihoods, the shares of paint, and the sigmas of these for want of knowing which
-        cells are paint, and for images that disagree.
-        """
+        """Log likelihoods by contrast, shares of paint, and these ones' sigmas by cells and images."""
         every = np.clip(np.median(self.contrasts, axis=0).reshape(3, -1), -0.5, 4.0)
         cells = every[:, None, :: -(-every.shape[1] // _FITTED)]
         paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]

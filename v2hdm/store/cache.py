@@ -51,19 +51,13 @@ class CodecError(ValueError):
 
 
 def encode(value: Any) -> bytes:
-    """The bytes of dataclasses, enumerations, paths, numpy arrays and plain values.
-
-    Equal values of one type and order have equal bytes. Raises TypeError for what cannot be kept.
-    """
+    """The bytes of dataclasses, enumerations, paths, numpy arrays, plain values; TypeError for others."""
     data: bytes = _encoder().encode(value)
     return data
 
 
 def decode(data: bytes, kind: type[_Value]) -> _Value:
-    """The value of type ``kind`` that :func:`encode` made ``data`` of; arrays are laid out row by row.
-
-    Raises CodecError where the bytes are of no such value.
-    """
+    """The value of type ``kind`` that :func:`encode` made ``data`` of; CodecError where it is none."""
     codec = _codec()
     try:
         value: _Value = codec.msgpack.decode(data, type=kind, dec_hook=_special)
@@ -187,10 +181,7 @@ class StageCache:
     def put(
         self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[Line] | None = None
     ) -> _Value:
-        """Keep ``value`` under ``key`` and return it as :meth:`get` will.
-
-        Where nothing can be written, a warning says so, once.
-        """
+        """Keep ``value`` under ``key`` and return it as :meth:`get` will; a warning where it cannot."""
         content, path = encode(value), self.path(stage, key)
         partial = path.with_name(f".{HOST}-{secrets.token_hex(8)}.part")
         try:

@@ -129,11 +129,7 @@ def file_digest(path: Path) -> str:
 
 
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
-    """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.safe.texts.read_yaml`.
-
-    Raises ``error`` when the file is missing, has a syntax error (with its line) or holds anything but a
-    mapping.
-    """
+    """The mapping at the top of a YAML file, whose keys are texts; else raises ``error``, with the line."""
     content = read_yaml(path, error)
     if not isinstance(content, dict):
         raise error(f"{path}: expected 'key: value' entries, got {shown(content)}; see its description")

@@ -62,9 +62,9 @@ def items_of(cache: Path) -> list[Item]:
 
 
 def prune(cache: Path, limit: float) -> list[Item]:
-    """Remove what was not used for longest until the rest has ``limit`` bytes; returns what was removed.
+    """Remove what was unused for longest until the rest has ``limit`` bytes, and all that killed runs left.
 
-    What killed runs have left goes in any case. More than the limit stays where runs in progress use it.
+    Returns what was removed. More than the limit stays where runs in progress use it.
     """
     before_s, items, removed = unused_before(cache), items_of(cache), []
     size = sum(item.size for item in items)

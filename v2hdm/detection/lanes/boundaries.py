@@ -186,12 +186,7 @@ def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
 
 
 def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Probability of each state (N, T, S) and log likelihood (N,) of all rows.
-
-    Args:
-        likelihood: Logarithms of those of each row in each state (N, T, S).
-        step_m: Ground from each row to the next (N, T - 1).
-    """
+    """Probabilities of states (N, T, S) and log likelihood (N,), by that of rows, ``step_m`` apart."""
     values, right, left, shares = _modes()
     move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
     evidence = np.exp(likelihood)
@@ -259,10 +254,7 @@ def _shown(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
 
 
 def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | None:
-    """A line's points in the image, near to far, with their standard deviations; None if it has not two.
-
-    A double line is drawn along its middle where both strands are present, and along the one that goes on.
-    """
+    """A line's points in the image, near to far, with their standard deviations; None if fewer than two."""
     assert line.span is not None
     camera, below, present = image.camera, line.span.below, line.span.present
     along, sigma = _followed(points, line, image, below)
@@ -288,10 +280,7 @@ def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | No
 def _followed(
     points: LinePoints, line: Line, image: LaneImage, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a line is along the horizon and its standard deviation (N,), px, ``at`` (N,) px below it.
-
-    The mean of the points around, weighted, and of the curve, as good as lines follow curves.
-    """
+    """Where a line is along the horizon and its sigma (N,), px, ``at`` (N,) px below: points and curve."""
     phi = image.horizon.basis(at)
     curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
     members = line.members

@@ -95,8 +95,8 @@ class Evidence:
     def of(cls, phi: FloatArray, u: FloatArray, sigma: FloatArray, ends: Sequence[int]) -> Evidence:
         """Groups of points, one after the other; group n ends at ``ends[n]``, none is empty.
 
-        ``phi`` (M, 3) is the basis at the points, ``u`` (M,) their place along the horizon from its
-        ``centre_px`` and ``sigma`` (M,) the standard deviation of that, px.
+        ``phi`` (M, 3) is the basis there, ``u`` (M,) their place along the horizon from its centre, ``sigma``
+        (M,) px.
         """
         weighted = phi * (sigma**-2.0)[:, None]
         terms = np.column_stack(
@@ -114,10 +114,7 @@ class Evidence:
         )
 
     def log_evidence(self, prior: Prior) -> FloatArray:
-        """Log probability (N,) of each group as one line of that prior, up to a constant per point.
-
-        Of several priors it is (P, N).
-        """
+        """Log probability (N,), of P priors (P, N), of each group as one line, up to a constant per point."""
         moment = self.moment - (self.information @ prior.mean[..., None])[..., 0]
         square = self.square - ((self.moment + moment) * prior.mean).sum(axis=-1)
         gain, log_determinant = _completed_square(self.information + prior.information, moment)
@@ -150,10 +147,7 @@ class Curve:
 
 
 def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """For positive matrices A (..., 3, 3) and vectors m (..., 3): m' inv(A) m (...) and log det A (...).
-
-    By Cholesky written out: LAPACK takes ten times as long for as many small matrices.
-    """
+    """M' inv(A) m and log det A of A (..., 3, 3), m (..., 3), by hand: LAPACK takes ten times as long."""
     pivot0, below10, below20 = (information[..., k, 0] for k in range(3))
     l10, l20 = below10 / pivot0, below20 / pivot0
     pivot1 = information[..., 1, 1] - l10 * below10

@@ -29,10 +29,9 @@ def trace_lanes(
 ) -> list[LaneDetection]:
     """The centre lines of lane paint with its score, a point every ``step_m`` on the ground, near to far.
 
-    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are
-    taken to the ground by the camera's initial IPM and averaged there, so perspective does not pull
-    the centre. Cuts through the slanted ends, narrower than the rest, are left out. A blob of two
-    lines that touch gives one row of points for each branch.
+    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are averaged on
+    the ground, so that perspective does not pull the centre. Cuts through slanted ends are left out; of two
+    lines that touch each has points.
     """
     branches = [(paint, edges) for paint in paints for edges in _branches(paint[0].blob)]
     if not branches:

@@ -170,10 +170,7 @@ CALIBRATION_FORMATS: Mapping[str, tuple[str, Callable[[Calibration, Provenance],
 def write_calibration_as(
     name: str, calibration: Calibration, about: Provenance, folder: Path, stem: str
 ) -> Path:
-    """Write one of :data:`CALIBRATION_FORMATS` to ``<folder>/<stem>_<ending>``, atomically; returns the path.
-
-    Raises MapFileError when the format cannot describe this camera.
-    """
+    """Write a calibration to ``<folder>/<stem>_<ending>``, atomically; MapFileError for another lens."""
     ending, text_of = CALIBRATION_FORMATS[name]
     path = folder / f"{stem}_{ending}"
     replace_text(path, text_of(calibration, about))

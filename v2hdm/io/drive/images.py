@@ -91,7 +91,7 @@ def assemble_drive(
 ) -> Drive:
     """The drive of its ``recorded`` poses: the road laid flat, every image of ``files`` posed and checked.
 
-    ``where`` names the poses in errors; ``mount_rad`` is the sensor's turn where the poses have lost it.
+    ``mount_rad`` is the sensor's turn where the poses have lost it.
     """
     assert drive.recorded is not None
     check_trajectory(drive.recorded, drive.origin, where)

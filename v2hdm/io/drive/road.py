@@ -123,10 +123,7 @@ def log_road(laid: Laid, where: Path) -> None:
 def _fit(
     stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights (N,) and slopes (N, 2) of the ground, and the mount (2,) forward and left, agreed upon.
-
-    By the recorded heights (N,) and the up-axes (N, 2, 3) of :func:`_with_mount`.
-    """
+    """Heights (N,), slopes (N, 2) of the ground and the mount (2,), by heights (N,) and leans (N, 2, 3)."""
     road = local_lines(stations, leans.reshape(len(leans), 6), _ROAD_M).reshape(leans.shape)
     # Heights along the route over a ground of these slopes, from zero at its start.
     steps = np.diff(stations.points_map, axis=0)
@@ -155,10 +152,7 @@ def _mount(leans: FloatArray) -> FloatArray:
 
 
 def _with_mount(lean: FloatArray, yaw: FloatArray, measured: BoolArray) -> FloatArray:
-    """Slopes (P, 2, 3) by map x and y: recorded, and the change by a unit of mount forward and left.
-
-    ``lean`` (P, 2) is the recorded floor's, forward and left; only ``measured`` (2,) directions have a mount.
-    """
+    """Slopes (P, 2, 3) by map x and y: recorded, and the change by a unit of mount forward and left."""
     directions = (np.tile(unit, (len(yaw), 1)) for unit in np.diag(measured.astype(np.float64)))
     return np.stack([_turned(lean, yaw), *(-_turned(direction, yaw) for direction in directions)], axis=2)
 
@@ -276,10 +270,7 @@ class Unevenness:
 
 
 def unevenness(road: Road, reach_m: float) -> Unevenness:
-    """The worst deviation of the ground, over distance, between half of ``reach_m`` and all of it.
-
-    The ground is known along the path by its heights, beside it by its slope, so that its cross-fall counts.
-    """
+    """The worst deviation of the ground, over distance, between half of ``reach_m`` and all of it."""
     station_m = length_along(road.points_map)
     # Unit vectors to the left of the path, zero where it is a point.
     ahead = np.gradient(road.points_map, axis=0) if len(station_m) > 1 else np.zeros((1, 2))

@@ -131,12 +131,11 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
 
 
 def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedPoint, ...]:
-    """The points of ``table`` in the map of a drive with that ``origin``.
+    """The points of ``table`` in the map of a drive with that ``origin``, at whose height unknown ones are.
 
-    Eastings and northings become latitudes and longitudes, and these local metres, over the earth's centre,
-    without the grid's scale and convergence. A point without a height is at the origin's. Sigmas stay: a
-    grid's north is a few degrees off at most. Raises DriveError when the drive has no origin that the
-    coordinates need, they are of another datum, or outside of their system.
+    Grids become local metres over the earth's centre, without scale and convergence; sigmas stay. Raises
+    DriveError when the drive has no origin that the coordinates need, they are of another datum, or outside
+    of their system.
     """
     positions, height_m = table.coordinates, table.height_m
     if table.frame is not Frame.MAP:

@@ -82,8 +82,7 @@ def read_poses(
     """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
 
     File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
-    attitudes further apart than ``max_gap_s`` are not interpolated across, ``where`` names the key in errors,
-    and ``read_topic`` reads the topic of the drive's bag that is named, if one is.
+    and ``read_topic`` reads the named topic of the drive's bag.
     """
     if isinstance(content, str):
         return Recorded(read_tum(root / content), {}, origin)
@@ -129,9 +128,8 @@ def assemble(
 ) -> Recorded:
     """The vehicle's poses in the map, from the ``readings`` of the source ``where``.
 
-    Without an ``origin`` the first position is that of a source which has a place on the earth. Attitudes
-    further apart than ``max_gap_s`` are not interpolated across. Raises DriveError for positions without a
-    heading, of an antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
+    Without an ``origin`` it is the first position. Raises DriveError for positions without a heading, of an
+    antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
     """
     if readings.antenna and settings.lever_arm_m is None:
         raise DriveError(

@@ -153,8 +153,7 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
 def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The names in the first line of a CSV file, and the cells of each further line with its number.
 
-    The first of ``separators`` that the line of names holds separates the cells, else blanks do. ``#`` before
-    the names is dropped; further lines that begin with it are comments. A line is one ``thing``.
+    The first of ``separators`` in the line of names separates cells, else blanks do; ``#`` begins a comment.
     """
     text = read_text(path, DriveError)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]

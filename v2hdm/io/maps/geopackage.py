@@ -63,10 +63,7 @@ AnyArray = NDArray[Any]
 def write_geopackage(
     hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
 ) -> None:
-    """Write ``hd_map`` to ``path``, atomically, with the ``verdict`` on the run that made it.
-
-    Raises ConfigError when ``pyogrio`` is not installed, MapFileError when GDAL cannot write there.
-    """
+    """Write ``hd_map`` and the ``verdict``, atomically; MapFileError when GDAL cannot write there."""
     raw = need("pyogrio.raw", "gis", "the format gpkg", ConfigError)
     features = features_of(hd_map)
     about: dict[str, Any] = {"frame": "map"}

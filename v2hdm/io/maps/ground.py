@@ -20,8 +20,7 @@ _NOTHING = -9999.0
 def write_ground_geotiff(hd_map: HdMap, path: Path) -> None:
     """Write the ground as a GeoTIFF of two bands, heights above the map's origin and their sigmas, m.
 
-    Cells that no strip covers hold no data; of two strips, the surer one counts. Raises ConfigError when
-    ``rasterio`` is not installed.
+    Cells that no strip covers hold no data; of two strips, the surer one counts.
     """
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
     edges = np.concatenate(

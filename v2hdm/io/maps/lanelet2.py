@@ -106,8 +106,7 @@ def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None
 def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """The edge of a stop line's ``corners`` (4, 3) to stop at, and the other one, each (2, 3).
 
-    Vehicles stop at the edge that they meet first (Autoware's requirement vm-02-01), at the middle of the
-    paint where the ``direction`` (2,) of travel is not known.
+    Vehicles stop at the edge that they meet first (Autoware's vm-02-01), else at the middle of the paint.
     """
     length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     start = int(length[1] + length[3] > length[0] + length[2])
@@ -171,10 +170,9 @@ class _Lanes:
 
 
 def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> tuple[str, FloatArray]:
-    """Points (N,) in the Military Grid Reference System: UTM within one square of 100 km, as ``54SUE``.
+    """The MGRS square of points (N,), as ``54SUE``, and m (N, 2) east and north of its south-west corner.
 
-    Returns the square, and the points (N, 2), m east and north of its south-west corner. Raises ConfigError
-    when they lie in several squares or beyond the grid, or ``mgrs`` or ``pyproj`` is missing.
+    Raises ConfigError when they lie in several squares or beyond the grid, or a package is missing.
     """
     pyproj, mgrs = (need(one, "gis", "lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs"))
     if np.min(latitude_deg) < -80 or np.max(latitude_deg) >= 84:

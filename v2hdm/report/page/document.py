@@ -23,10 +23,7 @@ from v2hdm.store.files import replace_text
 
 
 def document(facts: Facts) -> SimpleNamespace:
-    """The content of the page by the names of its templates; parts that a run lacks are None or empty.
-
-    Raises DriveError where an image of the drive cannot be read.
-    """
+    """The content of the page by the names of its templates; parts that a run lacks are None or empty."""
     metrics, verdict = facts.metrics, facts.metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
     findings = {which: tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")}

@@ -98,11 +98,7 @@ class Facts:
 
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
-    """Read the result folder of a run; ``drive`` is the one that it mapped, if it is at hand.
-
-    Raises MapFileError where the folder is no result, or a file in it is damaged, DriveError where the
-    drive's truth is damaged.
-    """
+    """Read the result folder of a run, and what is known by its ``drive``; MapFileError where damaged."""
     if not (folder / "metrics.json").is_file():
         raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
     metrics = load_json(folder / "metrics.json", MapFileError)
@@ -130,10 +126,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
-    """The calibrations of a result folder by camera.
-
-    Raises MapFileError where a file is damaged.
-    """
+    """The calibrations of a result folder by camera; raises MapFileError where a file is damaged."""
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
         content, calibration = load_yaml(path, MapFileError), read_calibration(path)
@@ -168,10 +161,7 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
 
 
 def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
-    """The ground of a result folder under vehicles at poses (F, 4, 4), None where it is a plane.
-
-    Raises MapFileError where its file is damaged.
-    """
+    """The ground of a result under vehicles at poses (F, 4, 4), None where plane; MapFileError if damaged."""
     path = folder / GROUND
     if not path.is_file():
         return None

@@ -44,10 +44,7 @@ _COMPARISON_WIDTH_PX = 1400
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
-    """The mosaic for the map: WebP in base64 and its bounds (west, south, east, north), m; None without one.
-
-    Raises MapFileError where ``mosaic.json`` is damaged, or the picture that it names is missing.
-    """
+    """The mosaic, if any: WebP in base64, bounds (west, south, east, north), m; MapFileError if damaged."""
     if not (folder / EXTENT).is_file():
         return None
     content, where = load_json(folder / EXTENT, MapFileError), f"{folder / EXTENT}"
@@ -93,10 +90,7 @@ def _source(path: Path) -> dict[str, Any]:
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
-    """A GeoTIFF or XYZ tiles of the user's own in the map's frame, as :func:`mosaic_layer` gives one.
-
-    Raises MapFileError where they cannot be read or laid under the map, DriveError where a tile is damaged.
-    """
+    """A GeoTIFF or XYZ tiles of the user's own, as :func:`mosaic_layer`; MapFileError if they do not fit."""
     rasterio, warped = (
         need(name, "gis", "a background", MapFileError) for name in ("rasterio", "rasterio.vrt")
     )
@@ -224,10 +218,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
 
 
 def _systems(facts: Facts) -> list[dict[str, Any]]:
-    """Coordinates beside local metres: by system cubics in x and y, m, which meet it to a millimetre.
-
-    Within 10 km the earth's curvature leaves no more; without an origin there are none.
-    """
+    """Coordinates beside local metres, to a millimetre: by system cubics in x and y; none without origin."""
     hd_map = facts.hd_map
     if hd_map is None or hd_map.origin is None:
         return []
@@ -298,7 +289,7 @@ def _number(text: str | None) -> float | None:
 
 
 def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
-    """By marking an arrow a camera: number of the camera, mean of projected minus observed on the ground, m.
+    """By marking an arrow a camera: its number, mean of projected minus observed on the ground, m, count.
 
     A pixel covers ground that grows with the squared range, so observations count by its inverse, squared.
     """

@@ -211,10 +211,7 @@ def _off_neighbours(motion: Motion, values: FloatArray) -> FloatArray:
 
 
 def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
-    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, none stands out.
-
-    A lost fix moves a few records, and any way; a late stamp moves each, and only along the way.
-    """
+    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, all of them."""
     ahead = motion.rotation[1:-1, :2, 0]
     driven = motion.moving[:-2] & motion.moving[1:-1] & motion.moving[2:]
     if not driven.any():
@@ -337,10 +334,7 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
 
 
 def _white_noise(motion: Motion) -> tuple[float, float] | tuple[None, None]:
-    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose.
-
-    None where the poses are too rare or uneven, so that driving would hide the noise.
-    """
+    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose, if known."""
     if len(motion.stamp_s) < 50:
         return None, None
     interval_s = float(np.median(motion.interval_s))

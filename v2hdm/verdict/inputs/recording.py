@@ -133,10 +133,7 @@ def _spacing(drive: Drive, motion: Motion, name: str) -> Iterator[Finding]:
 
 
 def check_images(drive: Drive) -> list[Finding]:
-    """Whether the images are those of a moving camera each, and show road.
-
-    Raises DriveError where a sampled image cannot be decoded.
-    """
+    """Whether the images are those of a moving camera each, and show road; DriveError for a damaged one."""
     findings = _shared(drive)
     for name, camera in drive.cameras.items():
         images = [image for image in drive.images if image.camera == name]

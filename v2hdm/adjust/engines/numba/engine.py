@@ -163,11 +163,7 @@ class NumbaEngine(Engine):
         return prior_blocks_of(self.arrays, estimate)
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
-        """Linearise, and subtract the eliminated corners from the reduced system.
-
-        Raises:
-            AdjustError: corners that lengths join cannot be solved for together.
-        """
+        """Linearise and eliminate the corners; raises AdjustError where joined ones cannot be solved for."""
         arrays, layout, spread = self.arrays, self.layout, system.spread
         clock, width, pairs = _by_pair(spread.clock), system.tip, arrays.pair_count
         touched, chunks = len(layout.touched), len(layout.chunk) - 1

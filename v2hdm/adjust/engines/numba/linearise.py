@@ -95,17 +95,10 @@ def linearise(
     scratch: Scratch,
     out: Linearisation,
 ) -> None:
-    """Linearise chunks ``begin`` to ``end``.
+    """Linearise chunks ``begin`` to ``end``; factors and rows of ``base`` are written.
 
-    Args:
-        begin: the first chunk.
-        end: the chunk after the last.
-        layout: the problem.
-        base: where; its factors and rows are written.
-        clock: (P, 6 Q) the pairs' left tangents by the clock offset of their camera.
-        by_pair: whether J'J is asked for by pair.
-        scratch: room to work in.
-        out: where the results go.
+    ``clock`` (P, 6 Q) are the pairs' left tangents by the clock offset of their camera; ``by_pair`` asks for
+    J'J by pair.
     """
     table, corners, states = base.table, base.corners, len(base.rows) == 0
     cameras, width = len(table) // layout.moments, out.tip.shape[1]

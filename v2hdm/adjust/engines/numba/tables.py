@@ -76,12 +76,8 @@ def with_priors(
 ) -> tuple[dict[str, float], Gradient]:
     """The cost by name and its gradient; by corners, where it is whitened already, (0, 2).
 
-    Args:
-        arrays: the problem.
-        estimate: where.
-        spread: how pairs move there.
-        costs: (3,) of the observations, the survey and the known lengths.
-        wrench: (C, M, 6) the observations' gradient by the pairs' left tangents.
+    ``costs`` (3,) are of observations, survey and known lengths, ``wrench`` (C, M, 6) the observations'
+    gradient by the pairs' left tangents.
     """
     cameras, centre_root = estimate.cam_from_vehicle.numpy(), arrays.centre_information_root.numpy()
     centre = (rigid.camera_centre(cameras) - arrays.centre.numpy()) * centre_root

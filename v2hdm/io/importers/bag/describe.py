@@ -40,10 +40,7 @@ IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
 
 
 def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
-    """The content of a ``drive.yaml`` for the bag at ``path``, which names the bag relative to its folder.
-
-    Raises DriveError where the bag does not suffice.
-    """
+    """The content of a ``drive.yaml`` for the bag at ``path``; DriveError where it does not suffice."""
     folder = entry_folder(cache, bag_files(path), "drive", ["bare"])
     if not is_whole(folder):
         description = BagDescription(path, cache)
@@ -71,10 +68,7 @@ def list_topics(path: Path, cache: Path) -> str:
 
 
 class BagDescription:
-    """The ``content`` of a ``drive.yaml`` as far as a bag tells it.
-
-    ``missing`` has the keys that stay "?", dotted, each with what it is asked for.
-    """
+    """The ``content`` of a ``drive.yaml`` as far as a bag tells it, and the ``missing`` keys, dotted."""
 
     def __init__(self, path: Path, cache: Path) -> None:
         self.missing: dict[str, str] = {}

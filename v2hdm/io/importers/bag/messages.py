@@ -97,9 +97,9 @@ class VideoDecoder:
         self._complained = False
 
     def frames(self, data: bytes | None, number: int) -> Iterator[tuple[int, np.ndarray]]:
-        """The frames that the packet ``number`` completes, with their packets' numbers; None ends the video.
+        """The frames (H, W, 3) BGR that packet ``number`` completes, with their numbers; None ends the video.
 
-        Pixels are (H, W, 3) BGR. Frames before the first key frame never come. Raises DriveError on damage.
+        Frames before the first key frame never come. Raises DriveError on damage.
         """
         packet = None
         if data is not None:
