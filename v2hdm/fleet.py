@@ -43,21 +43,17 @@ STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR
 
 @dataclass(frozen=True)
 class Row:
-    """The outcome of one drive: ``says`` is the worst finding, or the error, in one line.
-
-    ``kept`` says that an earlier result of the same content was found. ``folder`` is that of the result,
-    or its URL, empty without one; ``source`` is the run file.
-    """
+    """The outcome of one drive."""
 
     drive: str
     status: str
-    says: str
+    says: str  # the worst finding, or the error, in one line
     images: int | None
     markings: int | None
     minutes: float | None
-    kept: bool
-    folder: str
-    source: str
+    kept: bool  # an earlier result of the same content was found
+    folder: str  # of the result, or its URL, empty without one
+    source: str  # the run file
 
     @classmethod
     def of_error(cls, drive: str, source: str, message: str) -> Row:
@@ -172,16 +168,12 @@ ALL = "fleet"  # in place of a drive's name, for the progress of the fleet
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """The choices of a user beside the drives.
+    """The choices of a user beside the drives."""
 
-    ``workers`` are the cores that are used, 0 for all. ``folder`` takes the table; ``again`` does what is
-    finished again. ``share`` = (k, n) maps every n-th drive, beginning with the k-th; other machines map the
-    others.
-    """
-
-    folder: Path
-    workers: int = 0
-    again: bool = False
+    folder: Path  # takes the table
+    workers: int = 0  # cores that are used, 0 for all
+    again: bool = False  # does what is finished again
+    # (k, n): every n-th drive, from the k-th on; other machines map the others
     share: tuple[int, int] = (1, 1)
 
 

@@ -28,28 +28,20 @@ RENEWAL_WITH_STATES = 10.0
 
 @dataclass(frozen=True)
 class Descent:
-    """Where a descent ended.
+    """Where a descent ended."""
 
-    Attributes:
-        engine, plan: of the problem.
-        estimate, robust, terms: where it ended, under which loss, and the cost there by name.
-        gap: the predicted remaining decrease as a fraction of the cost.
-        evaluations: of cost and gradient.
-        progressing: it was still going down when it was stopped.
-        is_singular: observations and priors leave a direction of the reduced unknowns free.
-        made: the whitening at the estimate, where the descent had to make it.
-    """
-
+    # of the problem
     engine: Engine
     plan: Plan
+    # where it ended, under which loss, and the cost there by name
     estimate: Estimate
     robust: Loss
     terms: dict[str, float]
-    gap: float
-    evaluations: int
-    progressing: bool
-    is_singular: bool
-    made: Whitening | None
+    gap: float  # the predicted remaining decrease as a fraction of the cost
+    evaluations: int  # of cost and gradient
+    progressing: bool  # it was still going down when it was stopped
+    is_singular: bool  # observations and priors leave a direction of the reduced unknowns free
+    made: Whitening | None  # the whitening at the estimate, where the descent had to make it
 
     @cached_property
     def whitening(self) -> Whitening:

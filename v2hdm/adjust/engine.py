@@ -24,35 +24,25 @@ WEIGHT_FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Cost and gradient after a step.
+    """Cost and gradient after a step."""
 
-    Attributes:
-        estimate: where the step led.
-        terms: the cost there, by name.
-        gradient: by the step.
-        whitened, coupled: what :meth:`Linearised.carry` makes of the corners' part.
-    """
-
-    estimate: Estimate
-    terms: dict[str, float]
-    gradient: Gradient
+    estimate: Estimate  # where the step led
+    terms: dict[str, float]  # the cost there, by name
+    gradient: Gradient  # by the step
+    # what :meth:`Linearised.carry` makes of the corners' part
     whitened: Tensor
     coupled: Coupled
 
 
 @dataclass(frozen=True)
 class Linearised(ABC):
-    """A problem linearised at an estimate, its corners eliminated.
+    """A problem linearised at an estimate, its corners eliminated."""
 
-    Attributes:
-        terms, gradient: the cost at the estimate, by name, and its gradient.
-        corner_factor: L, the factor of the corners' own block.
-        whitened, coupled: what :meth:`carry` makes of the gradient's corner part.
-    """
-
+    # the cost at the estimate, by name, and its gradient
     terms: dict[str, float]
     gradient: Gradient
-    corner_factor: CornerFactor
+    corner_factor: CornerFactor  # L, the factor of the corners' own block
+    # what :meth:`carry` makes of the gradient's corner part
     whitened: Tensor
     coupled: Coupled
 

@@ -23,23 +23,14 @@ _TILE_ROWS = 96
 
 @dataclass(frozen=True)
 class Plan:
-    """How a problem's reduced system is cut into tiles; depends on who observed what, not on numbers.
+    """How a problem's reduced system is cut into tiles; depends on who observed what, not on numbers."""
 
-    Attributes:
-        frames_per_tile: frames of a tile.
-        size: rows of a tile.
-        frame_tiles: how many tiles are of frames; those of kept corners follow.
-        pattern: which tiles are not zero, and their order of elimination.
-        kept: (n,) the corners that are not eliminated before the frames, ascending.
-        most_tiles: tiles that the observations of a unit of corners touch at most.
-    """
-
-    frames_per_tile: int
-    size: int
-    frame_tiles: int
-    pattern: Pattern
-    kept: Tensor
-    most_tiles: int = 0
+    frames_per_tile: int  # frames of a tile
+    size: int  # rows of a tile
+    frame_tiles: int  # how many tiles are of frames; those of kept corners follow
+    pattern: Pattern  # which tiles are not zero, and their order of elimination
+    kept: Tensor  # (n,) the corners that are not eliminated before the frames, ascending
+    most_tiles: int = 0  # tiles that the observations of a unit of corners touch at most
 
     @property
     def tile_count(self) -> int:
@@ -101,15 +92,11 @@ class Coupled:
 
 @dataclass(frozen=True)
 class Spread:
-    """How pairs move with what they belong to: derivatives of their left tangents.
-
-    ``state`` (C, M, 6, S) by the states of the frame; ``clock`` (C, M, 6, Q) by the camera's clock offset. By
-    the camera's extrinsic it is the identity.
-    """
+    """How pairs move: derivatives of their left tangents; by the camera's extrinsic it is the identity."""
 
     arrays: Arrays
-    state: Tensor
-    clock: Tensor
+    state: Tensor  # (C, M, 6, S) by the states of the frame
+    clock: Tensor  # (C, M, 6, Q) by the camera's clock offset
 
     @property
     def camera(self) -> Tensor:

@@ -112,32 +112,25 @@ CHANGES = (Fault.STEP, Fault.KNOCK)
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """One fault, as the residuals see it.
+    """One fault, as the residuals see it."""
 
-    Attributes:
-        fault: what would be wrong.
-        camera: of which camera of the problem; -1 for all together.
-        axis: along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope,
-            datum; step: east, north, north-east, north-west), of the image (principal); the side (crown:
-            both, left, right), the shape of a drift.
-        item: which of the problem's control points, known lengths or (clock) visits, or the frame from which
-            on inputs are wrong (step, knock); -1 for none or all.
-        value: by how much, true minus stated.
-        sigma: how well the drive observes it, by what its stretches disagree; inf where it cannot.
-        model_sigma: how well it would, were all noise as the model has it.
-        p_value: how often a drive without the fault would show as large a value, 1 where it is unobservable.
-        gain: by how much the fault raises the log likelihood of each stretch as the others predict it, summed
-            over all; negative where the stretches do not agree on it.
-    """
-
-    fault: Fault
-    camera: int
+    fault: Fault  # what would be wrong
+    camera: int  # of which camera of the problem; -1 for all together
+    # along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope, datum;
+    # step: east, north, north-east, north-west), of the image (principal); the side (crown: both, left,
+    # right), the shape of a drift
     axis: int
+    # which of the problem's control points, known lengths or (clock) visits, or the frame from which on
+    # inputs are wrong (step, knock); -1 for none or all
     item: int
-    value: float = 0.0
+    value: float = 0.0  # by how much, true minus stated
+    # how well the drive observes it, by what its stretches disagree; inf where it cannot
     sigma: float = float("inf")
-    model_sigma: float = float("inf")
+    model_sigma: float = float("inf")  # how well it would, were all noise as the model has it
+    # how often a drive without the fault would show as large a value, 1 where it is unobservable
     p_value: float = 1.0
+    # by how much the fault raises the log likelihood of each stretch as the others predict it, summed over
+    # all; negative where the stretches do not agree on it
     gain: float = 0.0
 
     @property
@@ -159,20 +152,14 @@ class _Hypothesis:
 
 @dataclass(frozen=True)
 class _Answer:
-    """The scores and the information that the stretches of the route hold on one fault.
+    """The scores and the information that the stretches of the route hold on one fault."""
 
-    Attributes:
-        hypothesis: the fault.
-        score, information: (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch.
-        drawn: (D, G + 1) scores of noise as the model has it.
-        own: the fault's information if all else were known.
-    """
-
-    hypothesis: _Hypothesis
+    hypothesis: _Hypothesis  # the fault
+    # (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch
     score: FloatArray
     information: FloatArray
-    drawn: FloatArray
-    own: float
+    drawn: FloatArray  # (D, G + 1) scores of noise as the model has it
+    own: float  # the fault's information if all else were known
 
     @classmethod
     def to(cls, hypothesis: _Hypothesis, solved: Sensitivity) -> _Answer:

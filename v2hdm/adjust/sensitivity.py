@@ -33,21 +33,13 @@ of :func:`v2hdm.adjust.model.prior_residuals`; kinds that a fault does not touch
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """A solution as weighted least squares, whose residuals can be derived by further parameters.
+    """A solution as weighted least squares, whose residuals can be derived by further parameters."""
 
-    Attributes:
-        whitening: the solution's Hessian.
-        root: (K,) of the weights.
-        residuals: of everything.
-        whitened_px: (2, K) residuals of the observations without weights.
-        stretch: (J,) of the route that each frame is in, from 0.
-    """
-
-    whitening: Whitening
-    root: Tensor
-    residuals: Rows
-    whitened_px: Tensor
-    stretch: Tensor
+    whitening: Whitening  # the solution's Hessian
+    root: Tensor  # (K,) of the weights
+    residuals: Rows  # of everything
+    whitened_px: Tensor  # (2, K) residuals of the observations without weights
+    stretch: Tensor  # (J,) of the route that each frame is in, from 0
 
     @classmethod
     def at(cls, whitening: Whitening) -> Sensitivity:

@@ -29,14 +29,10 @@ TIP = -1
 
 @dataclass(frozen=True)
 class Pattern:
-    """Which tiles are not zero.
+    """Which tiles are not zero."""
 
-    Attributes:
-        position: where each tile along the route stands in the elimination order.
-        below: for each column in that order, the rows below its diagonal, fill included, ascending.
-    """
-
-    position: tuple[int, ...]
+    position: tuple[int, ...]  # where each tile along the route stands in the elimination order
+    # for each column in that order, the rows below its diagonal, fill included, ascending
     below: tuple[tuple[int, ...], ...]
 
     def multiplications(self, size: int, tip: int) -> float:
@@ -95,23 +91,17 @@ def _least_degree(tile_count: int, edges: set[tuple[int, int]]) -> list[int]:
 
 @dataclass(frozen=True)
 class TiledMatrix:
-    """The lower tiles of a symmetric matrix, laid out as those of its factor, which takes their place.
+    """The lower tiles of a symmetric matrix, laid out as those of its factor, which takes their place."""
 
-    Attributes:
-        pattern: which there are.
-        values: all numbers. What follows are views of them.
-        columns: the tiles of each column but the tip's, stacked, in elimination order, the tip's rows last.
-        tip: the last tile on the diagonal.
-        tiles: all of them by (row, column) in elimination order, or :data:`TIP`.
-        keys, at: of those in columns, ascending, the column times G + 1 plus the row, the tip's being G; and
-            where each begins among the values.
-    """
-
-    pattern: Pattern
-    values: Tensor
+    pattern: Pattern  # which there are
+    values: Tensor  # all numbers. What follows are views of them.
+    # the tiles of each column but the tip's, stacked, in elimination order, the tip's rows last
     columns: tuple[Tensor, ...]
-    tip: Tensor
+    tip: Tensor  # the last tile on the diagonal
+    # all of them by (row, column) in elimination order, or :data:`TIP`
     tiles: Mapping[tuple[int, int], Tensor]
+    # of those in columns, ascending, the column times G + 1 plus the row, the tip's being G; and where each
+    # begins among the values
     keys: NDArray[np.int64]
     at: NDArray[np.int64]
 
@@ -136,21 +126,13 @@ class TiledMatrix:
 
 @dataclass(frozen=True)
 class TiledCholesky:
-    """L of a positive definite matrix in tiles of ``size``, the tip last.
+    """L of a positive definite matrix in tiles of ``size``, the tip last."""
 
-    Attributes:
-        diagonal: lower factors of the diagonal tiles (G, size, size).
-        panels: what stands below each, stacked, the tip's rows last.
-        rows: which rows of the vector each panel acts on.
-        tip: lower factor of the tip, the identity where that is held.
-        held: what is left of a tip that is held, the others eliminated.
-    """
-
-    diagonal: tuple[Tensor, ...]
-    panels: tuple[Tensor, ...]
-    rows: tuple[Tensor, ...]
-    tip: Tensor
-    held: Tensor | None = None
+    diagonal: tuple[Tensor, ...]  # lower factors of the diagonal tiles (G, size, size)
+    panels: tuple[Tensor, ...]  # what stands below each, stacked, the tip's rows last
+    rows: tuple[Tensor, ...]  # which rows of the vector each panel acts on
+    tip: Tensor  # lower factor of the tip, the identity where that is held
+    held: Tensor | None = None  # what is left of a tip that is held, the others eliminated
 
     @property
     def size(self) -> int:

@@ -37,30 +37,19 @@ JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 
 @dataclass(frozen=True)
 class Whitening:
-    """The factorised Hessian at one estimate.
+    """The factorised Hessian at one estimate."""
 
-    Attributes:
-        engine: of the problem that it belongs to.
-        plan: the tiles of its reduced system.
-        estimate, robust: where, and under which loss, it was linearised.
-        linearised: the problem there, the corners eliminated.
-        gradient: of the cost there by y.
-        spread: how the pairs move with frames and cameras.
-        reduced_factor: L_S.
-        smallest_pivot: least share of an unknown's own information that the others leave it.
-        jitter: share of U's diagonal that had to be added to it for there to be an L_S.
-    """
-
-    engine: Engine
-    plan: Plan
+    engine: Engine  # of the problem that it belongs to
+    plan: Plan  # the tiles of its reduced system
+    # where, and under which loss, it was linearised
     estimate: Estimate
     robust: Loss
-    linearised: Linearised
-    gradient: Tensor
-    spread: Spread
-    reduced_factor: TiledCholesky
-    smallest_pivot: float
-    jitter: float
+    linearised: Linearised  # the problem there, the corners eliminated
+    gradient: Tensor  # of the cost there by y
+    spread: Spread  # how the pairs move with frames and cameras
+    reduced_factor: TiledCholesky  # L_S
+    smallest_pivot: float  # least share of an unknown's own information that the others leave it
+    jitter: float  # share of U's diagonal that had to be added to it for there to be an L_S
 
     @property
     def terms(self) -> dict[str, float]:

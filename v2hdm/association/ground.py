@@ -34,20 +34,14 @@ BORDER_PX = 10.0  # width of the image's border, px, within which a marking may 
 
 @dataclass(frozen=True)
 class Located:
-    """Ground positions of S sightings.
+    """Ground positions of S sightings."""
 
-    ``corners_map`` (S, 4, 2) m with the covariance ``covariance_m2`` (S, 4, 2, 2) that the pixel
-    noise alone gives them; ``ray_map`` (S, 4, 2) from below the camera to the corner; ``height_m``
-    (S,) of the camera. ``valid`` (S, 4) are points and ``informs`` (S, 4) all corners that say something,
-    as :class:`~v2hdm.association.sightings.Sightings` has them, without those that miss the ground.
-    """
-
-    corners_map: FloatArray
-    covariance_m2: FloatArray
-    ray_map: FloatArray
-    height_m: FloatArray
-    valid: BoolArray
-    informs: BoolArray
+    corners_map: FloatArray  # (S, 4, 2) m
+    covariance_m2: FloatArray  # (S, 4, 2, 2) by the pixel noise alone
+    ray_map: FloatArray  # (S, 4, 2) from below the camera to the corner
+    height_m: FloatArray  # (S,) of the camera
+    valid: BoolArray  # (S, 4) points, without those that miss the ground
+    informs: BoolArray  # (S, 4) all corners that say something, as sightings have them
 
     @property
     def range_m(self) -> FloatArray:

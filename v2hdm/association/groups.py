@@ -38,16 +38,11 @@ _OPEN_END_M = 10.0
 
 @dataclass(frozen=True)
 class Association:
-    """Groups of sightings: tracks of one camera, or markings of the map.
+    """Groups of sightings: tracks of one camera, or markings of the map."""
 
-    ``group`` (S,) numbers groups from 0, -1 for sightings that belong to none; ``shift`` (S,) turns
-    a sighting's corners into its group's order: corner c of the group is corner (c + shift) mod 4
-    of the sighting. ``count`` is the number of groups.
-    """
-
-    group: IntArray
-    shift: IntArray
-    count: int
+    group: IntArray  # (S,) from 0, -1 for sightings that belong to none
+    shift: IntArray  # (S,) corner c of the group is corner (c + shift) mod 4 of the sighting
+    count: int  # of groups
 
     def corner_order(self) -> IntArray:
         """Which of each sighting's corners is corner c of its group (S, 4)."""
@@ -76,15 +71,11 @@ def same_groups(a: Association, b: Association) -> bool:
 
 @dataclass(frozen=True)
 class FusedGroups:
-    """Where G groups lie: ``corners_map`` (G, 4, 2) m with ``covariance_m2`` (G, 4, 2, 2).
+    """Where G groups lie; corners of which nothing is known are nan."""
 
-    ``seen`` (G, 4) counts the sightings that show a corner as a point. A corner without any may still lie on
-    a known line, and says so by its covariance; if nothing is known of it, it is nan.
-    """
-
-    corners_map: FloatArray
-    covariance_m2: FloatArray
-    seen: IntArray
+    corners_map: FloatArray  # (G, 4, 2) m
+    covariance_m2: FloatArray  # (G, 4, 2, 2), large along a line that a corner is known to lie on
+    seen: IntArray  # (G, 4) sightings that show a corner as a point
 
     @property
     def valid(self) -> BoolArray:

@@ -19,18 +19,13 @@ LEAST_HEIGHT_M = 0.1
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras and frames as the mapping currently believes them to be.
+    """Cameras and frames as the mapping currently believes them to be."""
 
-    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4). Where a camera's
-    shutter rolls, ``read_out_s`` (C,) are the cameras' read-out times and ``twist_vehicle`` (F, 6) how the
-    vehicle moves, m/s and rad/s in its own frame; else None.
-    """
-
-    intrinsic: FloatArray
-    cam_from_vehicle: FloatArray
-    map_from_vehicle: FloatArray
-    read_out_s: FloatArray | None = None
-    twist_vehicle: FloatArray | None = None
+    intrinsic: FloatArray  # (C, 3, 3)
+    cam_from_vehicle: FloatArray  # (C, 4, 4)
+    map_from_vehicle: FloatArray  # (F, 4, 4)
+    read_out_s: FloatArray | None = None  # (C,) where a camera's shutter rolls
+    twist_vehicle: FloatArray | None = None  # (F, 6) the vehicle's motion then, m/s, rad/s
 
     def cam_from_map(
         self, camera: IntArray, frame: IntArray, row_share: FloatArray | None = None
@@ -94,33 +89,23 @@ def collect_symbols(
 
 @dataclass(frozen=True)
 class Sightings:
-    """S quadrilateral detections of a drive, in the order of its images.
-
-    ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
-    F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
-    images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
-    ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
-    says which of them are points, small in every direction. ``row_share`` (S, 4) is when in the read-out
-    their rows were taken (:func:`row_shares`); ``log_odds`` (S,) of being markings are the detector's.
-    ``symbols`` are those of the same images.
-    ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
-    """
+    """S quadrilateral detections of a drive, by image; images taken together share a frame."""
 
     cameras: tuple[str, ...]
-    stamp_s: FloatArray
-    map_from_vehicle: FloatArray
-    image: IntArray
-    camera: IntArray
-    frame: IntArray
-    kind: IntArray
-    corners_pinhole_px: FloatArray
-    covariance_px: FloatArray
-    valid: BoolArray
+    stamp_s: FloatArray  # (F,) distinct times, sorted by visit, then time
+    map_from_vehicle: FloatArray  # (F, 4, 4) as recorded
+    image: IntArray  # (S,) indices into ``Drive.images``
+    camera: IntArray  # (S,) into ``cameras``
+    frame: IntArray  # (S,) into the frames
+    kind: IntArray  # (S,) into ``kinds``, the names of the classes
+    corners_pinhole_px: FloatArray  # (S, 4, 2)
+    covariance_px: FloatArray  # (S, 4, 2, 2), px^2
+    valid: BoolArray  # (S, 4) which are points, small in every direction
     kinds: tuple[str, ...]
-    visit: IntArray
-    row_share: FloatArray
-    log_odds: FloatArray
-    symbols: Symbols = NO_SYMBOLS
+    visit: IntArray  # (F,) as in ``Image.visit``
+    row_share: FloatArray  # (S, 4) when in the read-out their rows were taken
+    log_odds: FloatArray  # (S,) of being markings, by the detector
+    symbols: Symbols = NO_SYMBOLS  # of the same images
 
     def __len__(self) -> int:
         return len(self.image)

@@ -78,15 +78,11 @@ _STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")
 
 @dataclass(frozen=True)
 class Recorded:
-    """The heights and slopes that were recorded on the path: the ``road``, None where it is level.
+    """The heights and slopes recorded on the path; errors are sums of processes: sigma, way to fade."""
 
-    Errors of heights, m, and of slopes are sums of processes: standard deviation, and the way in m over which
-    they fade.
-    """
-
-    road: Road | None
-    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)
-    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)
+    road: Road | None  # None where it is level
+    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)  # m, m
+    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)  # 1, m
 
     @classmethod
     def of(cls, road: Road | None, noise: PoseNoise) -> Recorded:
@@ -113,29 +109,17 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Paths:
-    """The paths of a drive's visits through F frames.
+    """The paths of a drive's visits through F frames."""
 
-    Attributes:
-        place: (F,) the place, of N, that each frame is at.
-        points_map: (N, 2) m.
-        ahead: (N, 2) unit vectors of the vehicle's heading.
-        sense: (N,) 1 where it drives that way, -1 backwards.
-        station_m: (N,) the way, rising with it, through one visit after the other.
-        bounds_m: (F, 2) stations between which a frame's ground is looked for.
-        position_map: (F, 2) m, of the vehicle.
-        heading: (F, 2) unit vectors.
-        visit_ends: (V, 2) stations at which each visit begins and ends.
-    """
-
-    place: IntArray
-    points_map: FloatArray
-    ahead: FloatArray
-    sense: FloatArray
-    station_m: FloatArray
-    bounds_m: FloatArray
-    position_map: FloatArray
-    heading: FloatArray
-    visit_ends: FloatArray
+    place: IntArray  # (F,) the place, of N, that each frame is at
+    points_map: FloatArray  # (N, 2) m
+    ahead: FloatArray  # (N, 2) unit vectors of the vehicle's heading
+    sense: FloatArray  # (N,) 1 where it drives that way, -1 backwards
+    station_m: FloatArray  # (N,) the way, rising with it, through one visit after the other
+    bounds_m: FloatArray  # (F, 2) stations between which a frame's ground is looked for
+    position_map: FloatArray  # (F, 2) m, of the vehicle
+    heading: FloatArray  # (F, 2) unit vectors
+    visit_ends: FloatArray  # (V, 2) stations at which each visit begins and ends
 
     @classmethod
     def of(cls, map_from_vehicle: FloatArray, visit: IntArray) -> Paths:
@@ -231,21 +215,14 @@ def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntAr
 
 @dataclass(frozen=True)
 class Surface:
-    """The ground along the ``paths``.
+    """The ground along the ``paths``."""
 
-    Attributes:
-        paths: of the visits.
-        parameters: (B,) slopes a of the cross-section, left ones first, then c, across within along.
-        covariance: (B, B) of them.
-        knots: the spline's first along the way, m, the way between two, m, and how many functions they make.
-        datum_m: what is added to all heights.
-    """
-
-    paths: Paths
-    parameters: FloatArray
-    covariance: FloatArray
+    paths: Paths  # of the visits
+    parameters: FloatArray  # (B,) slopes a of the cross-section, left ones first, then c, across within along
+    covariance: FloatArray  # (B, B) of them
+    # the spline's first along the way, m, the way between two, m, and how many functions they make
     knots: tuple[float, float, int]
-    datum_m: float = 0.0
+    datum_m: float = 0.0  # what is added to all heights
     _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

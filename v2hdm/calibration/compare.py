@@ -24,17 +24,13 @@ _SAME_LENS = 2e-3
 
 @dataclass(frozen=True)
 class Movement:
-    """How a camera has moved along and about the vehicle's axes: forward, left, up.
-
-    ``shift_m`` (3,) and ``turn_rad`` (3,) are the movement, ``covariance`` (6, 6) is that of both.
-    ``probability`` is that of differences at least as large where nothing has moved.
-    """
+    """How a camera has moved along and about the vehicle's axes: forward, left, up."""
 
     camera: str
-    shift_m: FloatArray
-    turn_rad: FloatArray
-    covariance: FloatArray
-    probability: float
+    shift_m: FloatArray  # (3,)
+    turn_rad: FloatArray  # (3,)
+    covariance: FloatArray  # (6, 6) of both
+    probability: float  # of differences at least as large where nothing has moved
 
     @property
     def sigma(self) -> FloatArray:

@@ -147,18 +147,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Fit:
-    """A mounting and how well the points determine it.
-
-    ``covariance`` (6, 6) is of the left tangent of ``cam_from_vehicle``, infinite on the diagonal where the
-    points leave it free. ``factor`` is q, of the stated variances, ``right`` (N,) the probability that each
-    point is right.
-    """
+    """A mounting and how well the points determine it."""
 
     seen: Seen
     cam_from_vehicle: FloatArray
+    # (6, 6) of the left tangent, infinite on the diagonal where the points leave it free
     covariance: FloatArray
-    factor: float
-    right: FloatArray
+    factor: float  # q, of the stated variances
+    right: FloatArray  # (N,) probability that each point is right
     log_posterior: float
 
     @property

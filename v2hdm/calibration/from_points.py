@@ -50,19 +50,12 @@ _UNRELATED = "the pixels have nothing to do with the places; check which pixel b
 
 @dataclass(frozen=True)
 class PointCalibration:
-    """A camera calibrated from surveyed points.
+    """A camera calibrated from surveyed points."""
 
-    Attributes:
-        points: the table.
-        fit: the mounting, its covariance, and the probability of each point to be right.
-        residuals: of the points.
-        verdict: whether points, intrinsics and mounting agree.
-    """
-
-    points: SurveyedPoints
-    fit: Fit
-    residuals: Residuals
-    verdict: Verdict
+    points: SurveyedPoints  # the table
+    fit: Fit  # the mounting, its covariance, and the probability of each point to be right
+    residuals: Residuals  # of the points
+    verdict: Verdict  # whether points, intrinsics and mounting agree
 
     @property
     def calibration(self) -> Calibration:

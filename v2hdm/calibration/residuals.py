@@ -36,19 +36,13 @@ _AROUND = 12  # places on the circle of known_around
 
 @dataclass(frozen=True)
 class Residuals:
-    """N points under a mounting.
+    """N points under a mounting."""
 
-    ``off_px`` (N, 2) is the recorded less the predicted pixel, ``off_m`` (N, 2) where the IPM puts the pixel
-    less where the point was surveyed, nan above the horizon. ``sigmas`` (N,) is the distance from what all
-    others predict, in standard deviations, ``probability`` (N,) that of a right point being as far off by
-    chance, ``known_m`` (N,) the standard deviation of the IPM there, in the direction known worst.
-    """
-
-    off_px: FloatArray
-    off_m: FloatArray
-    sigmas: FloatArray
-    probability: FloatArray
-    known_m: FloatArray
+    off_px: FloatArray  # (N, 2) recorded less predicted pixel
+    off_m: FloatArray  # (N, 2) where the IPM puts the pixel less where it was surveyed, nan above the horizon
+    sigmas: FloatArray  # (N,) distance from what all others predict
+    probability: FloatArray  # (N,) of a right point being as far off by chance
+    known_m: FloatArray  # (N,) sigma of the IPM there, in the direction known worst
 
 
 def residuals(fit: Fit) -> Residuals:
@@ -136,14 +130,10 @@ def scatter(fit: Fit, chance: float) -> Scatter:
 
 
 class Lens(NamedTuple):
-    """Whether the points agree with the intrinsics.
+    """Whether the points agree with the intrinsics."""
 
-    ``probability`` is of as large a disagreement by chance, with both focal lengths freed. ``focal`` is by
-    which share the points want the focal length longer, and the standard deviation of that.
-    """
-
-    probability: float
-    focal: tuple[float, float]
+    probability: float  # of as large a disagreement by chance, both focal lengths freed
+    focal: tuple[float, float]  # by which share the points want it longer, and its sigma
 
 
 def lens(fit: Fit) -> Lens:

@@ -210,16 +210,12 @@ class RoadCamera:
 
 @dataclass(frozen=True)
 class GroundPoints:
-    """Points on the ground plane: ``points_vehicle`` (N, 2), m, nan where a pixel shows no ground.
+    """Points on the ground plane and their derivatives."""
 
-    ``by_px`` (N, 2, 2) and ``by_mounting`` (N, 2, 6) are their derivatives by the recorded pixel and by the
-    tangent of ``cam_from_vehicle``, whose covariance is ``mounting_covariance`` (6, 6).
-    """
-
-    points_vehicle: FloatArray
-    by_px: FloatArray
-    by_mounting: FloatArray
-    mounting_covariance: FloatArray
+    points_vehicle: FloatArray  # (N, 2) m, nan where a pixel shows no ground
+    by_px: FloatArray  # (N, 2, 2) by the recorded pixel
+    by_mounting: FloatArray  # (N, 2, 6) by the tangent of ``cam_from_vehicle``
+    mounting_covariance: FloatArray  # (6, 6) of that
 
     def __getitem__(self, part: slice) -> GroundPoints:
         """Some of the points."""

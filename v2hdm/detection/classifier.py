@@ -282,23 +282,17 @@ _MOST_TURNED_RAD = 0.9
 
 @dataclass(frozen=True)
 class Readings:
-    """R readings of M fitted quadrilaterals, each of one as one class: the input of the classifier.
-
-    ``quadrilateral`` (R,) is the index of each, ``kinds`` its class; ``evidence`` (R, F) and ``views``
-    (R, C, S, S) are given to the network, ``ground`` (R, 4, 2) are corners, m. The first side in a view is
-    side ``first_side`` (R,) of the quadrilateral. ``hidden_ends`` (M, 4) are ends of what
-    is seen of it rather than of its paint. ``parts`` lists, by quadrilateral around a whole piece of
-    paint, those around its parts: either the one or the others are markings.
-    """
+    """R readings of M fitted quadrilaterals, each of one as one class: the input of the classifier."""
 
     fit: Fit
-    quadrilateral: np.ndarray
-    kinds: list[str]
-    evidence: FloatArray
-    views: np.ndarray
-    ground: FloatArray
-    first_side: np.ndarray
-    hidden_ends: BoolArray
+    quadrilateral: np.ndarray  # (R,) index of each
+    kinds: list[str]  # its class
+    evidence: FloatArray  # (R, F) for the network
+    views: np.ndarray  # (R, C, S, S) for the network
+    ground: FloatArray  # (R, 4, 2) corners, m
+    first_side: np.ndarray  # (R,) the quadrilateral's side that is the first in a view
+    hidden_ends: BoolArray  # (M, 4) ends of what is seen of it rather than of its paint
+    # by quadrilateral around a piece, those around its parts: one or the others are markings
     parts: Mapping[int, Sequence[int]]
 
 

@@ -133,18 +133,14 @@ _CORNER = np.arange(4)
 
 @dataclass(frozen=True)
 class Fit:
-    """M fitted quadrilaterals ``quad`` in their ``frames``.
-
-    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their
-    outward normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels.
-    ``open_sides`` (M, 4) are those cut by the image's border.
-    """
+    """M fitted quadrilaterals in their frames."""
 
     frames: LensFrames
     quad: Quad
+    # (M, 8, 8), px^2, of moves of the sides' starts and ends along outward normals
     side_covariance: FloatArray
-    statistics: FloatArray
-    open_sides: BoolArray
+    statistics: FloatArray  # (M, len(STATISTICS)) how well the model explains the pixels
+    open_sides: BoolArray  # (M, 4) those cut by the image's border
 
     @cached_property
     def corners_px(self) -> FloatArray:
@@ -258,17 +254,13 @@ def _sound(quad: Quad, before: Quad) -> BoolArray:
 
 @dataclass
 class _System:
-    """Normal equations at the last linearisation: ``information`` (M, U, U), scatter, weights, last step.
+    """Normal equations at the last linearisation."""
 
-    ``scatter`` (M, 4) of log grey by side, ``inliers`` (M,) mean robust weight, ``by_side`` (M, 8) last step,
-    ``decrement`` (M,) by how much chi-square was to fall by it (Newton's decrement).
-    """
-
-    information: FloatArray
-    scatter: FloatArray
-    inliers: FloatArray
-    by_side: FloatArray
-    decrement: FloatArray
+    information: FloatArray  # (M, U, U)
+    scatter: FloatArray  # (M, 4) of log grey by side
+    inliers: FloatArray  # (M,) mean robust weight
+    by_side: FloatArray  # (M, 8) last step
+    decrement: FloatArray  # (M,) by how much chi-square was to fall by it (Newton's decrement)
 
 
 def _put(whole: _System | _State, rows: np.ndarray, part: _System | _State) -> None:
@@ -280,20 +272,15 @@ def _put(whole: _System | _State, rows: np.ndarray, part: _System | _State) -> N
 
 @dataclass
 class _State:
-    """The unknowns of M markings: quadrilateral, blur, contrast, light (M, KNOTS) and its slope across.
-
-    ``outline`` (M, 4, 2) are the corners that the network drew, ``outline_sigma_px`` (M, 8) how far its
-    sides' starts and ends are off along their normals. ``closure`` (M, 2, 8) takes the corners to p0 - p1 +
-    p2 - p3 on the ground in its standard deviation, ``gap`` (M, 2) is that of the outline.
-    """
+    """The unknowns of M markings: quadrilateral, blur, contrast, light (M, KNOTS) and its slope across."""
 
     quad: Quad
     blur_px: FloatArray
     expected_blur_px: float
-    outline: FloatArray
-    outline_sigma_px: FloatArray
-    closure: FloatArray
-    gap: FloatArray
+    outline: FloatArray  # (M, 4, 2) corners that the network drew
+    outline_sigma_px: FloatArray  # (M, 8) of its sides' starts and ends along their normals
+    closure: FloatArray  # (M, 2, 8) from the corners to p0 - p1 + p2 - p3 on the ground, in its sigma
+    gap: FloatArray  # (M, 2) that of the outline
     contrast: FloatArray
     expected_contrast: FloatArray
     light: FloatArray

@@ -46,19 +46,14 @@ def read_bgr(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image (H, W, 3) uint8 BGR to look at.
+    """One image to look at."""
 
-    ``source`` is its file, or the video or camera it comes from, ``index`` its number there. ``stamp_s`` is
-    the time within a video, Unix time for a live camera, None for a file. ``name`` names it. ``dropped``
-    counts the live images before it that nobody has looked at, since newer ones came.
-    """
-
-    source: str
+    source: str  # its file, or the video or camera it comes from
     name: str
-    index: int
-    stamp_s: float | None
-    pixels: np.ndarray
-    dropped: int = 0
+    index: int  # its number there
+    stamp_s: float | None  # within a video, Unix time of a live camera, None of a file
+    pixels: np.ndarray  # (H, W, 3) uint8 BGR
+    dropped: int = 0  # live images before it that nobody has looked at, since newer ones came
 
 
 def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:

@@ -53,26 +53,18 @@ _GREY_FIRST = 1.2
 
 @dataclass(frozen=True)
 class Lattice:
-    """Up to N pixels about each of M markings.
+    """Up to N pixels about each of M markings, float32."""
 
-    ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values`` (M, N) float32 log grey;
-    ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``limited`` (M, N) where the sensor was at its
-    limit; ``clipped`` (M, 1) the share of those. ``neighbours`` (M, 2, N) is the place in the list of the
-    lattice's next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, 4, N) float32
-    is 1 for the side that is nearest. ``hats`` (M, KNOTS, N) interpolate between knots along the marking,
-    ``across`` (M, N) runs from -1 to 1 across it. ``count`` (M, 1) of the N pixels are there, the first ones.
-    """
-
-    points: np.ndarray
-    values: np.ndarray
-    use: np.ndarray
-    limited: np.ndarray
-    clipped: FloatArray
-    neighbours: np.ndarray
-    of_side: np.ndarray
-    hats: np.ndarray
-    across: np.ndarray
-    count: IntArray
+    points: np.ndarray  # (M, 3, N) (x, y, 1) in the markings' frames
+    values: np.ndarray  # (M, N) log grey
+    use: np.ndarray  # (M, N) 1 where a pixel takes part, else 0
+    limited: np.ndarray  # (M, N) where the sensor was at its limit
+    clipped: FloatArray  # (M, 1) the share of those
+    neighbours: np.ndarray  # (M, 2, N) place of the next pixel right and below, 0 for none
+    of_side: np.ndarray  # (M, 4, N) 1 for the side that is nearest
+    hats: np.ndarray  # (M, KNOTS, N) interpolate between knots along the marking
+    across: np.ndarray  # (M, N) from -1 to 1 across it
+    count: IntArray  # (M, 1) of the N are there, the first ones
 
     @classmethod
     def about(

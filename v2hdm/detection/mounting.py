@@ -49,33 +49,25 @@ _STEEPEST_RAD = np.deg2rad(80.0)  # nearer to straight down or up lines look par
 
 @dataclass(frozen=True)
 class Mounting:
-    """How a camera sits: its height, m; pitch, down from the horizon; roll; horizontal field of view.
-
-    ``sigma_rad`` (2,) are the standard deviations of pitch and roll, ``log_focal_sigma`` that of the
-    logarithm of the focal length.
-    """
+    """How a camera sits."""
 
     height_m: float
-    pitch_rad: float
+    pitch_rad: float  # down from the horizon
     roll_rad: float
-    fov_rad: float
-    sigma_rad: tuple[float, float]
-    log_focal_sigma: float = 0.0
+    fov_rad: float  # horizontal
+    sigma_rad: tuple[float, float]  # of pitch and roll
+    log_focal_sigma: float = 0.0  # of the logarithm of the focal length
 
 
 @dataclass(frozen=True)
 class Lines:
-    """N lines of an image: a point (N, 2) and the unit direction (N, 2) of each, pinhole px.
+    """N lines of an image."""
 
-    ``sigma_px`` and ``sigma_rad`` (N,) are their standard deviations across, ``weight`` (N,) how much each
-    counts.
-    """
-
-    point_px: FloatArray
-    direction: FloatArray
-    sigma_px: FloatArray
-    sigma_rad: FloatArray
-    weight: FloatArray
+    point_px: FloatArray  # (N, 2) on each, pinhole
+    direction: FloatArray  # (N, 2) unit
+    sigma_px: FloatArray  # (N,) across
+    sigma_rad: FloatArray  # (N,)
+    weight: FloatArray  # (N,) how much each counts
 
 
 def image_lines(network: Network, image_bgr: np.ndarray, info: CameraInfo) -> Lines:

@@ -55,14 +55,10 @@ def as_probability(odds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NetworkInfo:
-    """The label of a model file.
+    """The label of a model file; strides are px per element of each output."""
 
-    ``classes`` are those of the channels of ``kinds``; inputs are padded to ``multiple`` px; the strides are
-    the numbers of px per element of each output. ``catalogue`` describes the classes.
-    """
-
-    classes: tuple[str, ...]
-    multiple: int
+    classes: tuple[str, ...]  # of the channels of ``kinds``
+    multiple: int  # px that inputs are padded to
     paint_stride: int
     kind_stride: int
     lane_stride: int
@@ -76,16 +72,11 @@ class NetworkInfo:
 
 @dataclass(frozen=True)
 class RawOutput:
-    """The network's output on one image.
+    """The network's output on an image; element (i, j) of stride s is at s * j + (s - 1) / 2, likewise i."""
 
-    Element (i, j) of an output of stride s belongs to the image point (s * j + (s - 1) / 2, likewise i).
-    ``paint`` (h, w) float32: log odds of paint. ``kinds`` (K, h', w') float32: logits of its class.
-    ``lanes`` (2, h", w") float32: log odds that a lane's line crosses the row anchor in the cell, and its
-    offset from the cell's centre in cells.
-    """
-
-    paint: np.ndarray
-    kinds: np.ndarray
+    paint: np.ndarray  # (h, w) float32: log odds of paint
+    kinds: np.ndarray  # (K, h', w') float32: logits of its class
+    # (2, h", w") float32: log odds that a line crosses the row anchor in the cell; offset, cells
     lanes: np.ndarray
 
 
@@ -100,18 +91,14 @@ class AnchorRow:
 
 @dataclass(frozen=True)
 class NetworkOutput:
-    """The network's output on the rows of an image that show road.
-
-    ``paint`` (h, w) and ``kinds`` (K, h', w'), logits of the ``classes``, are as in :class:`RawOutput`; they
-    start at image row ``top``, ``stride`` px per element of paint. ``anchors`` run from near to far.
-    """
+    """The network's output, as :class:`RawOutput`, on the rows of an image that show road."""
 
     paint: np.ndarray
     kinds: np.ndarray
-    anchors: list[AnchorRow]
-    classes: tuple[str, ...]
-    stride: int
-    top: int
+    anchors: list[AnchorRow]  # from near to far
+    classes: tuple[str, ...]  # of ``kinds``
+    stride: int  # px per element of paint
+    top: int  # the first image row
 
     @cached_property
     def kind_scale(self) -> float:

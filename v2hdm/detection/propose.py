@@ -65,25 +65,16 @@ _BORDER_PX = 3.0
 
 @dataclass(frozen=True)
 class Blob:
-    """One connected piece of paint.
+    """One connected piece of paint; one that may be several markings comes whole, followed by its parts."""
 
-    ``level`` (h, w) float32 is positive inside, its zero crossing is the soft outline; element
-    (i, j) lies at recorded pixel ``origin_px + stride * (j, i)``. ``outline_px`` (N, 2) are the
-    zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
-    each class to its mean probability over the blob. ``touches_symbol`` says that it was split
-    off a connected piece of paint another part of which is an arrow, a chevron or other paint. A piece that
-    may be several markings comes whole, followed by its ``parts``. Lanes are ``traced`` in pieces of likely
-    paint, or in their parts of different classes.
-    """
-
-    class_score: dict[str, float]
-    level: np.ndarray
-    origin_px: FloatArray
+    class_score: dict[str, float]  # mean probability of each class
+    level: np.ndarray  # (h, w) float32, positive inside
+    origin_px: FloatArray  # of element (0, 0), recorded px; others are ``stride`` apart
     stride: int
-    outline_px: FloatArray
-    touches_symbol: bool = False
+    outline_px: FloatArray  # (N, 2) zero crossings of ``level``, recorded px, in no order
+    touches_symbol: bool = False  # split off a piece another part of which is a symbol or other paint
     parts: int = 0
-    traced: bool = True
+    traced: bool = True  # lanes are, in pieces of likely paint or parts of one class
 
     @property
     def kind(self) -> str:
@@ -93,18 +84,14 @@ class Blob:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A piece of paint: ``blob`` and its ``index``, the ``share`` of each class by network and size.
-
-    ``outline_vehicle`` (N, 2), m, is its outline on the ground. ``corners_pinhole_px`` (4, 2) is the tightest
-    quadrilateral around it, of which it fills ``fill``; None where there is none.
-    """
+    """A piece of paint as the classifier's candidate."""
 
     blob: Blob
     index: int
-    share: Mapping[str, float]
-    outline_vehicle: FloatArray
-    corners_pinhole_px: FloatArray | None
-    fill: float
+    share: Mapping[str, float]  # of each class, by network and size
+    outline_vehicle: FloatArray  # (N, 2) m, on the ground
+    corners_pinhole_px: FloatArray | None  # (4, 2) of the tightest quadrilateral, if any
+    fill: float  # share of that
 
     @property
     def kind(self) -> str:

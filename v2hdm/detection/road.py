@@ -86,15 +86,11 @@ class RoadMarking:
 
 @dataclass(frozen=True)
 class RoadLane:
-    """One lane's line: ``points_vehicle`` (N, 2) belong to ``image.points_px``.
-
-    ``covariance_m2`` (N, 2, 2) holds the errors of pixels and calibration, point by point. Both are empty
-    where the camera is not calibrated.
-    """
+    """One lane's line; on the ground empty where the camera is not calibrated."""
 
     image: LaneDetection
-    points_vehicle: FloatArray
-    covariance_m2: FloatArray
+    points_vehicle: FloatArray  # (N, 2) m, of ``image.points_px``
+    covariance_m2: FloatArray  # (N, 2, 2) by the errors of pixels and calibration
 
 
 @dataclass(frozen=True)

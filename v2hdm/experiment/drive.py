@@ -100,21 +100,16 @@ ROWS: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one set of cameras of one drive; lengths in m, nan where nothing matched.
-
-    ``recall`` is that of the diamonds driven past, of all markings where there are none. ``spread_m`` is the
-    root mean square distance of the error vectors from their mean. ``shared`` counts the markings that every
-    method of this camera set has mapped, ``shared_rmse_m`` is of those alone.
-    """
+    """One method on one set of cameras of one drive; nan where nothing matched."""
 
     markings: int
-    recall: float
+    recall: float  # of the diamonds driven past, of all markings where there are none
     false_markings: int
     rmse_m: float
     bias_m: float
-    spread_m: float
-    shared: int
-    shared_rmse_m: float
+    spread_m: float  # root mean square distance of the error vectors from their mean
+    shared: int  # markings that every method of this camera set has mapped
+    shared_rmse_m: float  # of those alone
 
 
 @dataclass(frozen=True)

@@ -107,16 +107,11 @@ class Quad:
 
 
 class Alignment(NamedTuple):
-    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift.
+    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift."""
 
-    ``shift``: corner c of a matches corner (c + shift) mod 4 of b; ``offset`` (..., 2) is the mean
-    displacement of b's corners; ``deformation_m`` the largest deviation of a corner from that mean, infinite
-    where fewer than two corners are valid in both.
-    """
-
-    shift: IntArray
-    offset: FloatArray
-    deformation_m: FloatArray
+    shift: IntArray  # corner c of a matches (c + shift) mod 4 of b
+    offset: FloatArray  # (..., 2) mean displacement of b's corners
+    deformation_m: FloatArray  # largest deviation from that, infinite for fewer than two common corners
 
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:

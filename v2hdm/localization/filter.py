@@ -151,16 +151,12 @@ class Seen:
 
 @dataclass(frozen=True)
 class Match:
-    """A detection and a marking of the map that it may show.
-
-    ``rows`` (2 K,) of the detection's stacked corners, those that say anything, are the rows ``kept`` of the
-    marking's. ``noise`` (2 K, 2 K) is the covariance of both, px^2.
-    """
+    """A detection and a marking of the map that it may show."""
 
     seen: Seen
-    rows: IntArray
-    kept: BoolArray
-    noise: FloatArray
+    rows: IntArray  # (2 K,) of the detection's stacked corners that say anything
+    kept: BoolArray  # those of the marking's
+    noise: FloatArray  # (2 K, 2 K) covariance of both, px^2
     corners_map: FloatArray
 
     def against(self, mean: FloatArray) -> tuple[FloatArray, FloatArray]:

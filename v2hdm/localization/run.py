@@ -44,25 +44,16 @@ _KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
 
 @dataclass(frozen=True)
 class Localised:
-    """A vehicle followed through F frames.
+    """A vehicle followed through F frames."""
 
-    Attributes:
-        stamp_s: (F,) time of each frame.
-        recorded: (F, 4, 4) ``map_from_vehicle`` as recorded.
-        states: after each frame.
-        matched: (F,) markings matched.
-        in_view: (F,) whether a marking was in view.
-        shared: (3,) variances of ahead, left and heading that map and calibration share among all frames.
-        detections: number of all frames together.
-    """
-
-    stamp_s: FloatArray
-    recorded: FloatArray
-    states: tuple[State, ...]
-    matched: IntArray
-    in_view: BoolArray
+    stamp_s: FloatArray  # (F,) time of each frame
+    recorded: FloatArray  # (F, 4, 4) ``map_from_vehicle`` as recorded
+    states: tuple[State, ...]  # after each frame
+    matched: IntArray  # (F,) markings matched
+    in_view: BoolArray  # (F,) whether a marking was in view
+    # (3,) variances of ahead, left and heading that map and calibration share among all frames
     shared: FloatArray
-    detections: int
+    detections: int  # number of all frames together
 
     @property
     def poses(self) -> Trajectory:

@@ -49,31 +49,25 @@ _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
 @dataclass(frozen=True)
 class Knots:
-    """The knots of lanes, and where images show a line pass them.
+    """The knots of lanes, and where images show a line pass them."""
 
-    Attributes:
-        lanes: as they were drawn under the adjustment without them.
-        lane, at_m, points_map, along: (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that
-            it lies, its place on it and the unit direction there.
-        unknown: (N,) its number among those that enough images show, -1 where they do not.
-        camera, frame, knot: (K,) of each observation; ``knot`` counts those with a number.
-        pinhole_px, covariance_px, row_share: (K, 2), (K, 2, 2) and (K,) of it.
-        variance_factor: what its covariance is to be multiplied by, as residuals say.
-    """
-
-    lanes: tuple[Lane, ...]
+    lanes: tuple[Lane, ...]  # as they were drawn under the adjustment without them
+    # (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that it lies, its place on it and the
+    # unit direction there
     lane: IntArray
     at_m: FloatArray
     points_map: FloatArray
     along: FloatArray
-    unknown: IntArray
+    unknown: IntArray  # (N,) its number among those that enough images show, -1 where they do not
+    # (K,) of each observation; ``knot`` counts those with a number
     camera: IntArray
     frame: IntArray
     knot: IntArray
+    # (K, 2), (K, 2, 2) and (K,) of it
     pinhole_px: FloatArray
     covariance_px: FloatArray
     row_share: FloatArray
-    variance_factor: float = 1.0
+    variance_factor: float = 1.0  # what its covariance is to be multiplied by, as residuals say
 
     @property
     def count(self) -> int:

@@ -97,22 +97,16 @@ def silent(step: str) -> None:
 
 @dataclass(frozen=True)
 class Optimised:
-    """The outcome of the joint optimisation.
+    """The outcome of the joint optimisation; errors are root mean squares over the markings' points."""
 
-    ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``. Reprojection
-    errors are root mean squares over the points seen of the accepted markings, under the optimised and the
-    initial extrinsics.
-    ``suspicions`` are of the most suspicious markings, the worst first.
-    """
-
-    bundle: Bundle
-    groups: IntArray
+    bundle: Bundle  # the adjusted extrinsics and poses
+    groups: IntArray  # of the markings
     markings: tuple[Marking, ...]
     excluded: tuple[Exclusion, ...]
     calibrations: Mapping[str, Calibration]
-    reprojection_rmse_px: float
-    initial_reprojection_rmse_px: float
-    suspicions: Sequence[Suspicion] = ()
+    reprojection_rmse_px: float  # under the optimised extrinsics
+    initial_reprojection_rmse_px: float  # under the initial ones
+    suspicions: Sequence[Suspicion] = ()  # the worst first
 
 
 class Optimiser:

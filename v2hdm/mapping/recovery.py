@@ -48,20 +48,14 @@ _DOUBT = 0.05
 
 @dataclass(frozen=True)
 class _Size:
-    """Sizes of a fault, in its unit.
+    """Sizes of a fault, in its unit."""
 
-    Attributes:
-        least: below it an input is as good as a drive needs it, however sure the drive is.
-        sigma: up to which a drive observes it, were nothing wrong. A less observable fault is nearly what
-            something else can be, and takes up what is left of other errors: k1 on a straight street, say.
-        usual: that it has where an input is wrong: half of all are smaller.
-        most: that is physical. What calls for more is wrong in a way that nobody has foreseen.
-    """
-
-    least: float
+    least: float  # below it an input is as good as a drive needs it, however sure the drive is
+    # up to which a drive observes it, were nothing wrong. A less observable fault is nearly what something
+    # else can be, and takes up what is left of other errors: k1 on a straight street, say.
     sigma: float
-    usual: float
-    most: float
+    usual: float  # that it has where an input is wrong: half of all are smaller
+    most: float  # that is physical. What calls for more is wrong in a way that nobody has foreseen.
 
 
 _SIZES: Mapping[Fault, _Size] = {

@@ -46,17 +46,13 @@ from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Tr
 
 @dataclass(frozen=True)
 class Canvas:
-    """``rows`` x ``columns`` square pixels of ``cell_m`` on the ground, seen from above.
+    """Square pixels on the ground, seen from above; north is above where columns rise east."""
 
-    ``corner_map`` (2,) m is the outer corner of the first pixel, ``right_map`` (2,) the unit vector along
-    which columns rise; rows rise at a right angle to it, clockwise. North is above where columns rise east.
-    """
-
-    corner_map: FloatArray
+    corner_map: FloatArray  # (2,) m, outer corner of the first pixel
     cell_m: float
     rows: int
     columns: int
-    right_map: tuple[float, float] = (1.0, 0.0)
+    right_map: tuple[float, float] = (1.0, 0.0)  # unit vector of rising columns
 
     @property
     def canvas_from_map(self) -> FloatArray:
@@ -101,28 +97,21 @@ _OUTLINE_STEP_PX = 16  # distance of the points by which the outline of what is 
 
 @dataclass(frozen=True)
 class Lens:
-    """One camera: its intrinsics, and how far each pixel is trusted to show the ground.
-
-    ``trust`` (height, width) float32 is 1 within, 0 outside of the camera's ROI and on its own vehicle.
-    ``outline_pinhole_px`` (N, 2) is the convex hull of what is trusted.
-    """
+    """One camera: its intrinsics, and how far each pixel is trusted to show the ground."""
 
     info: CameraInfo
-    trust: np.ndarray
-    outline_pinhole_px: FloatArray
+    trust: np.ndarray  # (height, width) float32, 1 within, 0 outside of the ROI and on its own vehicle
+    outline_pinhole_px: FloatArray  # (N, 2) convex hull of what is trusted
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image: its file, its camera, and the homography (3, 3) of the ground plane of the map.
-
-    The homography's third coordinate is positive in front of the camera. ``on_plane`` gives the points (K, 2)
-    of that plane that are seen where the ground's are, None where it is the plane.
-    """
+    """One image, and the homography of the map's ground plane, positive in front of the camera."""
 
     path: Path
     camera: str
     pinhole_px_from_map: FloatArray
+    # points (K, 2) of that plane seen where the ground's are, None where it is the plane
     on_plane: Callable[[FloatArray], FloatArray] | None = None
 
     def outline_map(self, lens: Lens) -> FloatArray:
@@ -199,14 +188,11 @@ _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
 @dataclass(frozen=True)
 class Sheet:
-    """A finished part of a canvas, its first pixel at (``row``, ``column``).
-
-    ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as
-    finely as a single one shows the farthest ground that it is trusted for, less where more coarsely.
-    """
+    """A finished part of a canvas, its first pixel at (``row``, ``column``)."""
 
     row: int
     column: int
+    # (rows, columns, 4) uint8; alpha 255 where ground is shown as finely as any is trusted for
     rgba: np.ndarray
 
 

@@ -22,15 +22,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Inspection:
-    """A drive as it is mapped, its cameras as it describes them, and all findings before the run.
+    """A drive as it is mapped, its cameras as it describes them, and all findings before the run."""
 
-    In ``drive`` the clocks that the ground contradicts are corrected, and cameras begin where the ground puts
-    them; ``ground`` is of each visit, by camera, what the bare ground says.
-    """
-
-    drive: Drive
+    drive: Drive  # clocks corrected by the ground, cameras where it puts them
     given: Mapping[str, Camera]
-    ground: tuple[Mapping[str, GroundEstimate], ...]
+    ground: tuple[Mapping[str, GroundEstimate], ...]  # by session and camera, what bare ground says
     findings: tuple[Finding, ...]
 
     @property

@@ -27,19 +27,14 @@ FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unocclud
 
 @dataclass(frozen=True)
 class MarkingMetrics:
-    """Mapped markings of one class, or of all, against the true ones.
-
-    ``false_markings`` have no true counterpart, ``expected`` are the true ones driven past within the region
-    of interest and ``recall`` their mapped share. ``corner_bias_m`` is the length of the corners' mean error
-    vector; it and the RMSE are nan where nothing matched.
-    """
+    """Mapped markings of one class, or of all, against the true ones; nan where nothing matched."""
 
     markings: int
-    false_markings: int
-    expected: int
-    recall: float
+    false_markings: int  # without a true counterpart
+    expected: int  # true ones driven past within the region of interest
+    recall: float  # their mapped share
     corner_rmse_m: float
-    corner_bias_m: float
+    corner_bias_m: float  # length of the corners' mean error vector
 
 
 @dataclass(frozen=True)
@@ -130,18 +125,13 @@ LATERAL_GATE_M = 0.3  # a mapped lane this near to a true one maps it
 
 @dataclass(frozen=True)
 class LaneMetrics:
-    """Mapped lane lines against the true ones.
-
-    ``mean_lateral_error_m`` is over the mapped length that lies within :data:`LATERAL_GATE_M` of a
-    true line, ``mapped_fraction`` the share of the visible true length with a mapped line that
-    near, ``false_length_m`` the mapped length without a true line beside it.
-    """
+    """Mapped lane lines against the true ones, near within :data:`LATERAL_GATE_M`."""
 
     lanes: int
     length_m: float
-    mean_lateral_error_m: float
-    mapped_fraction: float
-    false_length_m: float
+    mean_lateral_error_m: float  # of mapped length near a true line
+    mapped_fraction: float  # of the visible true length, with a mapped line near
+    false_length_m: float  # mapped without a true line near
 
 
 def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:

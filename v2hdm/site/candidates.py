@@ -68,22 +68,16 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Counts:
-    """How often G candidates were seen, each (G,).
+    """How often G candidates were seen, each (G,)."""
 
-    ``images`` with accepted observations; ``observations`` of corners, how many are ``agreeing`` with the
-    solution, and the mean of the detector's ``log_odds`` of these; ``easy_views``, images with the whole
-    candidate in easy view, those where it was ``found``, and of these the ones in which each corner is a
-    point that agrees, ``pointed`` (G, 4); ``as_symbol``, images in which a symbol lies on it.
-    """
-
-    images: IntArray
-    observations: IntArray
-    agreeing: IntArray
-    log_odds: FloatArray
-    easy_views: IntArray
-    found: IntArray
-    pointed: IntArray
-    as_symbol: IntArray
+    images: IntArray  # with accepted observations
+    observations: IntArray  # of corners
+    agreeing: IntArray  # of these, with the solution
+    log_odds: FloatArray  # mean of the detector's, of these
+    easy_views: IntArray  # images with the whole candidate in easy view
+    found: IntArray  # of these, where it was found
+    pointed: IntArray  # (G, 4) of these, where each corner is a point that agrees
+    as_symbol: IntArray  # images in which a symbol lies on it
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
         """The candidates at ``rows``."""

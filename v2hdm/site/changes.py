@@ -101,15 +101,11 @@ _LOOKED = 3  # easy views from which a drive has looked at a place for that shar
 
 @dataclass(frozen=True)
 class Base:
-    """An earlier map, and from where its drives looked.
-
-    ``hd_map`` has ids. ``poses`` (F, 4, 4) are those of its images, (0, 4, 4) where they are not known;
-    ``left_out`` are the class, place (2,) and sightings of candidates that it was not sure of.
-    """
+    """An earlier map, with ids, and from where its drives looked."""
 
     hd_map: HdMap
-    poses: FloatArray
-    left_out: tuple[tuple[str, FloatArray, int], ...] = ()
+    poses: FloatArray  # (F, 4, 4) of its images, (0, 4, 4) where not known
+    left_out: tuple[tuple[str, FloatArray, int], ...] = ()  # class, place (2,), sightings of candidates
 
 
 def update_map(

@@ -69,33 +69,25 @@ class Pair:
 
 @dataclass(frozen=True)
 class Decision:
-    """The fates of the markings.
+    """The fates of the markings."""
 
-    ``pairs`` were seen again; ``gone`` are the probabilities by old marking that was not, ``fresh`` those by
-    new marking that has no partner, that it is new paint. ``shift`` is how the maps lie to each other.
-    """
-
-    pairs: tuple[Pair, ...]
-    gone: dict[int, float]
-    fresh: dict[int, float]
-    shift: Shift
+    pairs: tuple[Pair, ...]  # seen again
+    gone: dict[int, float]  # probability, by old marking not seen again
+    fresh: dict[int, float]  # that a new marking without partner is new paint
+    shift: Shift  # how the maps lie to each other
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off.
-
-    ``off`` (P, 8), m, has the ``noise`` (P, 8, 8), m^2, of both; ``basis`` (P, 8, 8) has rows for two shifts,
-    the turn, in which it counts ``arm_m`` (P,) times, and five deformations.
-    """
+    """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off."""
 
     old: IntArray
     new: IntArray
     turn: IntArray
-    off: FloatArray
-    noise: FloatArray
-    basis: FloatArray
-    arm_m: FloatArray
+    off: FloatArray  # (P, 8) m
+    noise: FloatArray  # (P, 8, 8) m^2, of both
+    basis: FloatArray  # (P, 8, 8) rows of two shifts, the turn and five deformations
+    arm_m: FloatArray  # (P,) how often the turn counts
 
     def __len__(self) -> int:
         return len(self.old)

@@ -53,38 +53,29 @@ class Guides:
 
 @dataclass(frozen=True)
 class LaneCloud:
-    """P points on lane paint.
+    """P points on lane paint."""
 
-    ``points_map`` (P, 2) m, unit ``tangent`` (P, 2) of either sense, ``weight`` (P,) = 1 / variance
-    across the line in 1 / m^2, ``image`` (P,) that a point was seen in, ``dash`` (P,) whether its
-    detection was a dash; beside them the ``guides``. Images show them at pinhole pixels ``points_px`` (P, 2)
-    and row shares (P,); ``jacobian`` (P, 2, 2) is that of a point by its pixel.
-    """
-
-    points_map: FloatArray
-    tangent: FloatArray
-    weight: FloatArray
-    image: IntArray
-    dash: BoolArray
+    points_map: FloatArray  # (P, 2) m
+    tangent: FloatArray  # (P, 2) unit, of either sense
+    weight: FloatArray  # (P,) 1 / variance across the line, 1 / m^2
+    image: IntArray  # (P,) that it was seen in
+    dash: BoolArray  # (P,) its detection was one
     guides: Guides = field(default_factory=Guides)
-    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (P, 2) pinhole
     row_share: FloatArray = field(default_factory=lambda: np.zeros(0))
+    # (P, 2, 2) of a point by its pixel
     jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
 
 @dataclass(frozen=True)
 class ImageGround:
-    """How each image of a drive maps to the ground; nan for images of cameras that are not used.
+    """How each image of a drive maps to the ground; nan for images of cameras that are not used."""
 
-    ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3). Where shutters roll,
-    ``moved_map`` (I, 2, 3) takes a point of the ground (x, y, 1) to how far it seems to move with the vehicle
-    during the read-out. ``flattened_px`` moves pinhole pixels (P, 2) of images (P,) to where these would show
-    the same on the plane z = 0.
-    """
-
-    map_from_pinhole_px: FloatArray
-    centre_map: FloatArray
+    map_from_pinhole_px: FloatArray  # (I, 3, 3)
+    centre_map: FloatArray  # (I, 3) of the camera
+    # (I, 2, 3) from (x, y, 1) to its motion with the vehicle during read-out, if any
     moved_map: FloatArray | None = None
+    # moves pinhole px (P, 2) of images (P,) to where z = 0 would show the same
     flattened_px: Callable[[IntArray, FloatArray], FloatArray] = lambda image, points_px: points_px
 
     @classmethod
@@ -265,16 +256,12 @@ _THIN_SPACINGS = 0.7  # spacings of nodes within which the best supported one su
 
 @dataclass(frozen=True)
 class Nodes:
-    """N points on the ridges.
+    """N points on the ridges."""
 
-    ``points_map`` (N, 2), unit ``tangent`` (N, 2) of either sense, ``images`` (N,) that support a
-    node and ``dash`` (N,), the share of its points that were seen as a dash.
-    """
-
-    points_map: FloatArray
-    tangent: FloatArray
-    images: IntArray
-    dash: FloatArray
+    points_map: FloatArray  # (N, 2)
+    tangent: FloatArray  # (N, 2) unit, of either sense
+    images: IntArray  # (N,) that support a node
+    dash: FloatArray  # (N,) share of its points seen as a dash
 
 
 def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:

@@ -32,16 +32,12 @@ SHIFT = np.tile(np.eye(2), (4, 1))
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors of M markings, taken apart.
+    """The errors of M markings, taken apart."""
 
-    ``centres_map`` (M, 2), m; ``own_m2`` (M, 8, 8) covariances of each marking's own errors; ``shared_m2``
-    (M,) variances, a coordinate, of the shift that it shares with its surroundings, over about ``over_m``, m.
-    """
-
-    centres_map: FloatArray
-    own_m2: FloatArray
-    shared_m2: FloatArray
-    over_m: float
+    centres_map: FloatArray  # (M, 2) m
+    own_m2: FloatArray  # (M, 8, 8) of each marking's own errors
+    shared_m2: FloatArray  # (M,) a coordinate, of the shift shared with its surroundings
+    over_m: float  # how far that is shared
 
     @classmethod
     def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
@@ -86,18 +82,14 @@ def _positive(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Shift:
-    """How a new map lies to an old one, by P pairs of markings that both have.
-
-    ``old`` and ``new`` (P,) are the pairs' markings; ``off_map`` (P, 2) how far the new one is from the old,
-    of the covariance ``noise_m2`` (P, 2, 2) by their own errors.
-    """
+    """How a new map lies to an old one, by P pairs of markings that both have."""
 
     of_old: Errors
     of_new: Errors
-    old: IntArray
-    new: IntArray
-    off_map: FloatArray
-    noise_m2: FloatArray
+    old: IntArray  # (P,)
+    new: IntArray  # (P,)
+    off_map: FloatArray  # (P, 2) of the new one from the old
+    noise_m2: FloatArray  # (P, 2, 2) of that, by their own errors
 
     @cached_property
     def _inverse(self) -> FloatArray:

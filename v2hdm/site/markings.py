@@ -208,18 +208,13 @@ _LISTED = 10  # markings that are listed: as many as a user looks at
 
 @dataclass(frozen=True)
 class Suspicion:
-    """How unlikely the marking of id ``marking`` is, were it like the others of its class.
-
-    P-values: ``p_shape`` of how far it is from the shape of its class under the posterior predictive (1 where
-    the class has none), ``p_residuals`` of its accepted observations, ``p_sightings`` of the share
-    ``disputed`` of its observations that the joint solution rejected.
-    """
+    """How unlikely the marking of an id is, by p-values, were it like the others of its class."""
 
     marking: int
-    p_shape: float
-    p_residuals: float
-    p_sightings: float
-    disputed: float
+    p_shape: float  # under the posterior predictive, 1 for a class without shape
+    p_residuals: float  # of its accepted observations
+    p_sightings: float  # of the share ``disputed``
+    disputed: float  # of its observations that the joint solution rejected
 
     @property
     def p(self) -> float:

@@ -42,21 +42,16 @@ _ANY_SLOPE = 10.0  # sigma of s before any image: nothing comes nearer much fast
 
 @dataclass(frozen=True)
 class PointViews:
-    """N sightings of P points each, by sighting: which of G candidates, by which camera, and from where.
+    """N sightings of P points each, by sighting."""
 
-    ``points_map`` (N, P, 2), m, on the ground have the covariances ``covariance_m2`` (N, P, 2, 2) beside what
-    the errors ``pose_sigma`` (N, 6) of the poses do to them; ``ray_map`` (N, P, 2) leads there from below the
-    camera, which is ``height_m`` (N,) up. Of points that are not ``used`` (N, P) nothing counts.
-    """
-
-    group: IntArray
+    group: IntArray  # (N,) of the candidate
     camera: IntArray
-    points_map: FloatArray
-    ray_map: FloatArray
-    covariance_m2: FloatArray
-    used: BoolArray
-    height_m: FloatArray
-    pose_sigma: FloatArray
+    points_map: FloatArray  # (N, P, 2) m, on the ground
+    ray_map: FloatArray  # (N, P, 2) there from below the camera
+    covariance_m2: FloatArray  # (N, P, 2, 2) beside that of poses
+    used: BoolArray  # (N, P) else nothing counts
+    height_m: FloatArray  # (N,) of the camera
+    pose_sigma: FloatArray  # (N, 6) of the poses' errors
 
     @classmethod
     def of_corners(

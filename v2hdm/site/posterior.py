@@ -119,19 +119,13 @@ _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECO
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of G candidates.
+    """The posterior of G candidates."""
 
-    ``probability`` (G, 8) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
-    of a marking. ``evidence`` (G, 5) speaks for a marking and against clutter, in nats: the shape, how many
-    images show it, how many of its easy views, how well they agree, and how it looks to the detector.
-    ``misfit`` (G,) is the p-value of its deviation from its class's nearest shape, 1 if the class has none.
-    """
-
-    probability: FloatArray
-    log_odds: FloatArray
-    candidates: Candidates
-    evidence: FloatArray
-    misfit: FloatArray
+    probability: FloatArray  # (G, 8) of each kind
+    log_odds: FloatArray  # (G,) of being a marking
+    candidates: Candidates  # with the corners of a marking
+    evidence: FloatArray  # (G, 5) nats for a marking: shape, images, easy views, agreement, look
+    misfit: FloatArray  # (G,) p-value of the deviation from its class's nearest shape, 1 without
 
 
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
@@ -239,24 +233,18 @@ def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) ->
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One hypothesis on N ``candidates``.
-
-    In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
-    laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced`` (..., 8,
-    8), only along each of the K columns of ``one_way`` (N, 8, K) if given: paint wears inwards, and runs on
-    outwards. ``beside`` (N,) is the log likelihood of what else is known of them.
-    """
+    """One hypothesis on N candidates."""
 
     kind: int
     log_prior: float
     candidates: Candidates
-    directions: FloatArray
-    residual: FloatArray
-    scatter: FloatArray
-    misplaced: FloatArray
+    directions: FloatArray  # (N, 5, 8) in which deviations count
+    residual: FloatArray  # (N, 5) from where a shape was laid
+    scatter: FloatArray  # (..., 8, 8) of painted corners
+    misplaced: FloatArray  # (..., 8, 8) by all images
     paint_m2: float
-    one_way: FloatArray | None
-    beside: FloatArray | float
+    one_way: FloatArray | None  # (N, 8, K) or only along these: paint wears inwards
+    beside: FloatArray | float  # (N,) log likelihood of what else is known
 
     @cached_property
     def formal(self) -> FloatArray:

@@ -52,16 +52,11 @@ _HALF_WIDTH_M = 3.5  # ground to either side of the path that counts for unevenn
 
 @dataclass(frozen=True)
 class Laid:
-    """Poses with the road laid flat: z = 0, plan and heading as recorded, roll, pitch relative to the road.
-
-    ``road`` is the recorded ground, None where it was recorded as the plane z = 0; ``mount_rad`` (2,) are
-    roll (left side up) and pitch (nose down) of the sensor on the vehicle, which ``trajectory`` no longer
-    has.
-    """
+    """Poses with the road laid flat: z = 0, plan and heading as recorded, attitude relative to the road."""
 
     trajectory: Trajectory
-    road: Road | None
-    mount_rad: FloatArray
+    road: Road | None  # as recorded, None for the plane z = 0
+    mount_rad: FloatArray  # (2,) roll (left side up), pitch (nose down) of the sensor, taken off
 
 
 def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
@@ -172,15 +167,11 @@ def _turned(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Stations:
-    """Places (N, 2) along a route, each the mean of the successive poses within a metre.
+    """Places along a route, each the mean of the successive poses within a metre."""
 
-    ``first`` (N + 1,) are indices of the stations' first poses, and the number of poses; ``path_m`` (N,) the
-    way.
-    """
-
-    first: np.ndarray
-    points_map: FloatArray
-    path_m: FloatArray
+    first: np.ndarray  # (N + 1,) indices of the stations' first poses, and the number of poses
+    points_map: FloatArray  # (N, 2)
+    path_m: FloatArray  # (N,) the way
 
     def mean(self, values: FloatArray) -> FloatArray:
         """Means (N, ...) over the poses of each station of their ``values`` (P, ...)."""
@@ -257,16 +248,12 @@ def _means(values: FloatArray, first: np.ndarray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Unevenness:
-    """The ground's worst deviation ``value_m`` from the plane beneath the vehicle, ``distance_m`` away.
-
-    Roll and pitch of ``sigma`` rad are worth ``sigma * distance_m`` there, too. The vehicle is at ``at_map``
-    (2,), ``station_m`` along the route.
-    """
+    """The ground's worst deviation from the plane beneath the vehicle, at a distance."""
 
     value_m: float
     distance_m: float
-    at_map: FloatArray
-    station_m: float
+    at_map: FloatArray  # (2,) the vehicle
+    station_m: float  # along the route
 
 
 def unevenness(road: Road, reach_m: float) -> Unevenness:

@@ -50,15 +50,11 @@ class PoseSettings:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Poses ``map_from_vehicle`` as a drive has them.
-
-    ``noise`` holds those fields of :class:`PoseNoise` that the source states; ``origin`` is the map's place
-    on the earth, None where the poses are the map's own.
-    """
+    """Poses ``map_from_vehicle`` as a drive has them."""
 
     trajectory: Trajectory
-    noise: Mapping[str, float]
-    origin: GeodeticOrigin | None
+    noise: Mapping[str, float]  # the fields of :class:`PoseNoise` that the source states
+    origin: GeodeticOrigin | None  # None where the poses are the map's own
 
 
 _Reader = Callable[[Path, dict[str, Any], Path, str], Readings]

@@ -65,25 +65,20 @@ class CameraFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """A result folder, read; what is not in it is None or empty.
-
-    ``excluded`` are the candidates that the map of all cameras left out, ``check_points`` the rows of
-    ``check_points.csv`` by its columns; ``truth`` is there if the drive was rendered. ``surface`` is the
-    ground under the poses of ``route``, None where it is a plane.
-    """
+    """A result folder, read; what is not in it is None or empty."""
 
     folder: Path
     metrics: Mapping[str, Any]
     config: str
     hd_map: HdMap | None
-    excluded: tuple[Exclusion, ...]
+    excluded: tuple[Exclusion, ...]  # that the map of all cameras left out
     cameras: Mapping[str, CameraFacts]
     route: Route | None
-    surface: Surface | None
+    surface: Surface | None  # under the poses of ``route``, None for a plane
     residuals: Residuals | None
-    check_points: tuple[Mapping[str, str], ...]
+    check_points: tuple[Mapping[str, str], ...]  # rows of ``check_points.csv`` by its columns
     drive: Drive | None
-    truth: Truth | None
+    truth: Truth | None  # of a rendered drive
 
     @property
     def results(self) -> Mapping[str, Any]:
@@ -182,14 +177,10 @@ def _table(path: Path) -> tuple[tuple[str, ...], ...]:
 
 @dataclass(frozen=True)
 class GroundResiduals:
-    """K corner observations, as in :class:`Residuals`; ``camera`` (K,) indexes ``cameras``.
-
-    ``range_m`` (K,) is from the camera's foot to the corner, as observed, ``ground_m`` (K, 2) projected minus
-    observed on the ground, in the map; both are nan above the horizon.
-    """
+    """K corner observations, as in :class:`Residuals`; nan above the horizon."""
 
     cameras: tuple[str, ...]
-    camera: IntArray
+    camera: IntArray  # (K,) into ``cameras``
     marking: IntArray
     corner: IntArray
     is_point: BoolArray
@@ -197,8 +188,8 @@ class GroundResiduals:
     observed_px: FloatArray
     residual_px: FloatArray
     distance_sigma: FloatArray
-    range_m: FloatArray
-    ground_m: FloatArray
+    range_m: FloatArray  # (K,) from the camera's foot to the corner, as observed
+    ground_m: FloatArray  # (K, 2) projected minus observed, in the map
 
     @property
     def size_px(self) -> FloatArray:

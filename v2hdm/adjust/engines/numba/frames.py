@@ -12,20 +12,13 @@ from v2hdm.records import FloatArray, IntArray
 
 
 class TileMap(NamedTuple):
-    """Where the tiles of a :class:`~v2hdm.adjust.tiles.TiledMatrix` lie among its ``values``.
+    """Where the tiles of a :class:`~v2hdm.adjust.tiles.TiledMatrix` lie among its ``values``."""
 
-    Attributes:
-        per_tile: frames of a tile.
-        size: rows of a tile.
-        position: (G,) of each tile along the route in the order of elimination.
-        begin: (G,) the first tile of each column, that on the diagonal.
-        row, at: the row of each tile, G for the tip's, and where it lies.
-    """
-
-    per_tile: int
-    size: int
-    position: IntArray
-    begin: IntArray
+    per_tile: int  # frames of a tile
+    size: int  # rows of a tile
+    position: IntArray  # (G,) of each tile along the route in the order of elimination
+    begin: IntArray  # (G,) the first tile of each column, that on the diagonal
+    # the row of each tile, G for the tip's, and where it lies
     row: IntArray
     at: IntArray
 

@@ -27,27 +27,16 @@ from v2hdm.records import FloatArray
 
 
 class Linearisation(NamedTuple):
-    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks.
+    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks."""
 
-    Attributes:
-        costs: (Q, 3) of observations, survey and known lengths.
-        wrench: (R, 6) the gradient by the pairs.
-        coupled: (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states.
-        carried: (Q, D) the same by the cameras' unknowns, where they have none.
-        whitened: (2 N,) the gradient by the corners, L^-1 g.
-        own: J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21).
-        tip: (Q, D, D) B'B of the cameras' unknowns, its lower triangle.
-        failed: (Q,) units whose block has no factor.
-    """
-
-    costs: FloatArray
-    wrench: FloatArray
-    coupled: FloatArray
-    carried: FloatArray
-    whitened: FloatArray
-    own: FloatArray
-    tip: FloatArray
-    failed: FloatArray
+    costs: FloatArray  # (Q, 3) of observations, survey and known lengths
+    wrench: FloatArray  # (R, 6) the gradient by the pairs
+    coupled: FloatArray  # (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states
+    carried: FloatArray  # (Q, D) the same by the cameras' unknowns, where they have none
+    whitened: FloatArray  # (2 N,) the gradient by the corners, L^-1 g
+    own: FloatArray  # J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21)
+    tip: FloatArray  # (Q, D, D) B'B of the cameras' unknowns, its lower triangle
+    failed: FloatArray  # (Q,) units whose block has no factor
 
 
 @inlined
