@@ -19,8 +19,14 @@ import numpy as np
 from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association, group_kinds
-from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.tracks import (
+    GATE_SIGMAS,
+    LEAST_SIGHTINGS,
+    MAX_GATE_M,
+    REFINED_SIGMA_RAD,
+    SHAPE_TOLERANCE,
+)
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths
@@ -230,15 +236,15 @@ class IncrementalMapper:
         valid = np.asarray(np.isfinite(corners).all(axis=1))
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
-        tolerance_m = max(self._options.association.shape_tolerance * size_m, LEAST_TOLERANCE_M)
+        tolerance_m = max(SHAPE_TOLERANCE * size_m, LEAST_TOLERANCE_M)
         # How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic.
         middle = np.nanmean(corners, axis=0)
-        options, frame = self._options.association, self._sightings.frame[track.rows]
+        frame = self._sightings.frame[track.rows]
         away = middle - self._rig.map_from_vehicle[frame, :2, 3]
         range_m = float(np.median(np.linalg.norm(away, axis=1)))
         height_m = float(np.median(self._rig.height_m[self._sightings.camera[track.rows]]))
-        floor_m = np.hypot(self._floor_m, options.refined_sigma_rad * range_m**2 / height_m)
-        gate_m = float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
+        floor_m = np.hypot(self._floor_m, REFINED_SIGMA_RAD * range_m**2 / height_m)
+        gate_m = float(min(GATE_SIGMAS * np.sqrt(2) * floor_m, MAX_GATE_M))
         best: tuple[float, int | None, int] = (gate_m, None, 0)
         near = np.linalg.norm(self._centres - middle, axis=1) < gate_m + size_m
         for marking in np.flatnonzero(near).tolist():

@@ -25,6 +25,8 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
+    HALF_WIDTH_M,
+    NODE_SPACING_M,
     OWN_SIGMA_M,
     LaneCloud,
     collect_lane_points,
@@ -103,7 +105,7 @@ def find_knots(
     course = _Course.of(lanes)
     lane, at_m = course.stations()
     points_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    pairs = _pairs(cloud, course, lane, at_m, options.half_width_m)
+    pairs = _pairs(cloud, course, lane, at_m)
     image, at, *shown = _passing(cloud, points_map, along, *pairs)
     enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
     unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
@@ -156,11 +158,11 @@ class _Course:
 
 
 def _pairs(
-    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
+    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """Points (P,) and the nearest knots, at most half a spacing away, how far ahead and left of these, m."""
     knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    reach_m = float(np.hypot(_SPACING_M / 2, half_width_m))
+    reach_m = float(np.hypot(_SPACING_M / 2, HALF_WIDTH_M))
     near = cKDTree(cloud.points_map).sparse_distance_matrix(
         cKDTree(knots_map), reach_m, output_type="ndarray"
     )
@@ -170,7 +172,7 @@ def _pairs(
     here = lane[knot], at_m[knot] + ahead_m
     off_m = ((points_map - course.at(*here)) * (course.along(*here) @ _TURN)).sum(axis=1)
     fits = np.abs((cloud.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
-    fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= half_width_m)
+    fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= HALF_WIDTH_M)
     order = np.lexsort((np.abs(off_m), ~fits, point))
     best = order[np.unique(point[order], return_index=True)[1]]
     best = best[fits[best]]
@@ -218,7 +220,7 @@ def _passing(
     return image, at, cloud.points_px[nearest] + off_px, covariance_px, cloud.row_share[nearest]
 
 
-def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane, ...]:
+def draw_lanes(knots: Knots, solution: Solution, spacing_m: float = NODE_SPACING_M) -> tuple[Lane, ...]:
     """The lanes as splines through the adjusted knots, vertices about ``spacing_m`` apart with their sigmas.
 
     Where no image shows the line, as between dashes, it keeps its course beside the knots around.

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from v2hdm.adjust import Fault, Status, observability
 from v2hdm.association.ground import ground_points, views_of
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
-from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import camera_of, frames_of
+from v2hdm.association.tracks import LEAST_SIGHTINGS, SHAPE_TOLERANCE
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex
@@ -210,15 +210,18 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
     )
 
 
+_NAIVE_MERGE_M = 1.0  # how far apart the naive methods may put two tracks of one marking
+
+
 def _naive_markings(
     inputs: Inputs, ipm: Mapping[str, FloatArray], ground: ImageGround
 ) -> tuple[list[Marking], list[Exclusion]]:
     """The paper's baseline: back-project by an IPM within its region of interest, and average.
 
-    Recorded poses are taken at their word. Tracks merge where their averages lie within ``naive_merge_m``:
+    Recorded poses are taken at their word. Tracks merge where their averages lie within a metre:
     two cameras whose IPMs disagree by more yield two markings where there is one, the method's own failure.
     """
-    sightings, options = inputs.sightings, inputs.options.association
+    sightings = inputs.sightings
     cameras = [inputs.drive.cameras[name] for name in sightings.cameras]
     rois = [camera.roi_vehicle for camera in cameras]
     forward = [facing_ipm(ipm[c.info.name], c.roi_vehicle.mean(axis=0)) for c in cameras]
@@ -236,10 +239,10 @@ def _naive_markings(
         tracks,
         sightings,
         _average(tracks, corners_map),
-        floor_m=options.naive_merge_m,
+        floor_m=_NAIVE_MERGE_M,
         gate_sigmas=np.inf,
-        max_distance_m=options.naive_merge_m,
-        shape_tolerance=2 * options.shape_tolerance,
+        max_distance_m=_NAIVE_MERGE_M,
+        shape_tolerance=2 * SHAPE_TOLERANCE,
     )
     average = _average(association, corners_map)
     markings: list[Marking] = []
@@ -286,7 +289,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     known = observability(bundle.problem, solution)
     surface = inputs.optimiser.surface
     if bundle.knots is not None:
-        lanes = draw_lanes(bundle.knots, solution, options.lanes.node_spacing_m)
+        lanes = draw_lanes(bundle.knots, solution)
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]

@@ -36,7 +36,14 @@ from v2hdm.association.groups import (
 )
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.surface import Paths, Recorded, Surface
-from v2hdm.association.tracks import build_tracks
+from v2hdm.association.tracks import (
+    GATE_SIGMAS,
+    IPM_SIGMA_RAD,
+    MAX_GATE_M,
+    REFINED_SIGMA_RAD,
+    SHAPE_TOLERANCE,
+    build_tracks,
+)  # fmt: skip
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
 from v2hdm.mapping.bundle import (
@@ -143,7 +150,7 @@ class Optimiser:
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
         located = self._locate(self.initial_rig)
-        return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
+        return self._track(self.initial_rig, located, IPM_SIGMA_RAD)
 
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
@@ -295,9 +302,7 @@ class Optimiser:
         """Map track after track, as the vehicle would, in place of :meth:`settle`; then solve for all."""
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
-            located, options = self._locate(rig), self._options.association
-            direction_rad = options.ipm_sigma_rad if coarse else options.refined_sigma_rad
-            tracks = self._track(rig, located, direction_rad)
+            tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)
             return tracks, self._usable(tracks, rig)
 
         def solve(association: Association, usable: BoolArray, rig: Rig) -> Rig:
@@ -368,25 +373,23 @@ class Optimiser:
         return in_view(association, locate(self.sightings, rig), self.sightings, rig, jitter_rad)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
-        options = self._options.association
-        return build_tracks(self.sightings, located, rig, direction_rad, self._pose_noise, options)
+        return build_tracks(self.sightings, located, rig, direction_rad, self._pose_noise)
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""
-        options = self._options.association
         located = self._locate(rig)
-        tracks = self._track(rig, located, options.refined_sigma_rad)
+        tracks = self._track(rig, located, REFINED_SIGMA_RAD)
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
-        direction_m = options.refined_sigma_rad * range_m**2 / float(np.median(rig.height_m))
+        direction_m = REFINED_SIGMA_RAD * range_m**2 / float(np.median(rig.height_m))
         merged = merge_groups(
             tracks,
             self.sightings,
             fused,
             floor_m=float(np.hypot(self._pose_noise.position_m, direction_m)),
-            gate_sigmas=options.gate_sigmas,
-            max_distance_m=options.max_gate_m,
-            shape_tolerance=options.shape_tolerance,
+            gate_sigmas=GATE_SIGMAS,
+            max_distance_m=MAX_GATE_M,
+            shape_tolerance=SHAPE_TOLERANCE,
         )
         return self._with_all_that_fit(merged, rig)
 

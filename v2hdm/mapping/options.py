@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from v2hdm.association.options import AssociationOptions
 from v2hdm.errors import ConfigError
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
@@ -26,25 +25,12 @@ POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "c
 
 _RANGES = dict.fromkeys(
     (
-        "max_range_m", "loss_scale",
-        "association.ipm_sigma_rad", "association.refined_sigma_rad", "association.gate_sigmas",
-        "association.max_gate_m",
-        "known_sizes.sigma_m", "known_sizes.tolerance",
-        "survey.sigma_m", "survey.reach_m",
+        "max_range_m", "loss_scale", "known_sizes.sigma_m", "known_sizes.tolerance", "survey.sigma_m",
+        "survey.reach_m",
     ),
     POSITIVE,
 ) | dict.fromkeys(
-    (
-        "model_floor_px",
-        "association.max_gap_m", "association.shape_tolerance", "association.naive_merge_m",
-        "acceptance.max_sigma_m",
-        "lanes.max_range_m", "lanes.max_dash_gap_m", "lanes.max_break_m", "lanes.min_length_m",
-        "lanes.min_images",
-    ),
-    NOT_NEGATIVE,
-) | dict.fromkeys(
-    # From half the width of a painted line, 0.1 m: less holds no line's paint.
-    ("lanes.node_spacing_m", "lanes.half_width_m", "lanes.half_length_m"), Within(0.05),
+    ("model_floor_px", "acceptance.max_sigma_m", "lanes.max_range_m", "lanes.min_images"), NOT_NEGATIVE
 ) | {"rounds": Within(1, 100), "acceptance.min_probability": Within(0, 1 - 1e-9, open=True)}  # fmt: skip
 
 
@@ -135,7 +121,6 @@ class MappingOptions:
     loss_scale: float = 2.0
     rounds: int = 2
     device: str = "cpu"
-    association: AssociationOptions = field(default_factory=AssociationOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     lanes: LaneOptions = field(default_factory=LaneOptions)
     known_sizes: SizeOptions = field(default_factory=SizeOptions)

@@ -29,7 +29,9 @@ from v2hdm.records import (
     IntArray,
     LaneDetection,
 )
-from v2hdm.site.options import LaneOptions
+
+NODE_SPACING_M = 0.5  # between the vertices of a polyline
+HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # across and along a line, of the neighbourhood that is averaged
 
 CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""
@@ -264,8 +266,8 @@ class Nodes:
     dash: FloatArray  # (N,) share of its points seen as a dash
 
 
-def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
-    """Nodes on the ridges of ``cloud``, about ``options.node_spacing_m`` apart."""
+def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
+    """Nodes on the ridges of ``cloud`` that so many images show, about :data:`NODE_SPACING_M` apart."""
     # A seed for each cell of position and direction.
     angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
     place = np.floor(cloud.points_map / _SEED_CELL_M)
@@ -273,20 +275,20 @@ def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
     seeds = np.unique(cell, axis=0, return_index=True)[1]
     points, tangent = cloud.points_map[seeds], cloud.tangent[seeds]
     # Pairs of seed and point of the cloud that may ever lie in its neighbourhood.
-    reach_m = float(np.hypot(options.half_length_m, 2 * options.half_width_m))
+    reach_m = float(np.hypot(_HALF_LENGTH_M, 2 * HALF_WIDTH_M))
     apart = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
     pairs = apart["i"].astype(np.int64), apart["j"].astype(np.int64)
     for _ in range(_ITERATIONS):
-        points, tangent = _shift(points, tangent, cloud, pairs, options)
+        points, tangent = _shift(points, tangent, cloud, pairs)
     along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= options.node_spacing_m) & (np.abs(across) <= 0.5 * options.half_width_m)
+    near = (np.abs(along) <= NODE_SPACING_M) & (np.abs(across) <= 0.5 * HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
     seed, point = pairs[0][near], pairs[1][near]
     shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
     images, total = np.bincount(shown, minlength=len(points)), np.bincount(seed, minlength=len(points))
     dash = np.bincount(seed, cloud.dash[point].astype(float), len(points)) / np.maximum(total, 1)
-    supported = np.flatnonzero(images >= options.min_images)
-    kept = supported[_thin(points[supported], tangent[supported], images[supported], options)]
+    supported = np.flatnonzero(images >= least_images)
+    kept = supported[_thin(points[supported], tangent[supported], images[supported])]
     return Nodes(points[kept], tangent[kept], images[kept], dash[kept])
 
 
@@ -303,19 +305,15 @@ def _coordinates(
 
 
 def _shift(
-    points: FloatArray,
-    tangent: FloatArray,
-    cloud: LaneCloud,
-    pairs: tuple[IntArray, IntArray],
-    options: LaneOptions,
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Move each seed across its line onto the weighted regression line of its neighbourhood."""
     along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= options.half_length_m) & (np.abs(across) <= options.half_width_m)
+    near = (np.abs(along) <= _HALF_LENGTH_M) & (np.abs(across) <= HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
     x, y = along[near], across[near]
     # Gaussian across, so that of two lines within reach the nearer one wins.
-    kernel = np.exp(-0.5 * (2.0 * y / options.half_width_m) ** 2) * (1 - (x / options.half_length_m) ** 2)
+    kernel = np.exp(-0.5 * (2.0 * y / HALF_WIDTH_M) ** 2) * (1 - (x / _HALF_LENGTH_M) ** 2)
     weight = cloud.weight[pairs[1][near]] * kernel
     count = len(points)
 
@@ -327,17 +325,17 @@ def _shift(
     # A little stiffness keeps the direction where all neighbours lie at one place.
     spread = wxx - wx**2 / safe + 1e-3 * safe
     slope = np.clip((wxy - wx * wy / safe) / np.maximum(spread, 1e-12), -0.5, 0.5)
-    offset = np.clip((wy - slope * wx) / safe, -options.half_width_m, options.half_width_m)
+    offset = np.clip((wy - slope * wx) / safe, -HALF_WIDTH_M, HALF_WIDTH_M)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     turned = tangent + slope[:, None] * normal
     return points + offset[:, None] * normal, turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
-def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: LaneOptions) -> IntArray:
+def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray:
     """Indices of the best supported nodes, no two closer than .7 of the spacing along or beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
-    reach_m = _THIN_SPACINGS * options.node_spacing_m
+    reach_m = _THIN_SPACINGS * NODE_SPACING_M
     near = cKDTree(points).query_ball_point(points, reach_m)
     alive = np.ones(len(points), dtype=bool)
     kept = []
@@ -349,5 +347,5 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: La
         offset = points[others] - points[node]
         across = offset[:, 1] * tangent[node, 0] - offset[:, 0] * tangent[node, 1]
         same = np.abs(tangent[others] @ tangent[node]) >= _SAME_DIRECTION
-        alive[others[same & (np.abs(across) <= 0.5 * options.half_width_m)]] = False
+        alive[others[same & (np.abs(across) <= 0.5 * HALF_WIDTH_M)]] = False
     return np.array(kept, dtype=np.int64)
