@@ -26,7 +26,7 @@ from v2hdm.adjust.checks import check_observations
 from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.descent import narrowed
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.numba.motion import move
+from v2hdm.adjust.engines.numba.tables import move
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions

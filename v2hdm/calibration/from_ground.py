@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from v2hdm.geometry.mounting import mounting_words
+from v2hdm.geometry.ipm import mounting_words
 from v2hdm.ground import GroundEstimate, GroundStatus, Reading, estimate_cameras
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import MapFileError, V2hdmError
-from v2hdm.extras import need
+from v2hdm.errors import MapFileError, V2hdmError, need
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84

@@ -15,8 +15,7 @@ import numpy as np
 
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
-from v2hdm.errors import ConfigError, DriveError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, DriveError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum

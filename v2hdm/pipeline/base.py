@@ -18,7 +18,7 @@ from v2hdm.io.maps.evidence import read_exclusions
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
-from v2hdm.pipeline.keys import base_files
+from v2hdm.pipeline.config import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, HdMap, Image
 from v2hdm.site.changes import Base
 

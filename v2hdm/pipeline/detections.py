@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import key_of
 

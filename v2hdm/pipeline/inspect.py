@@ -12,8 +12,8 @@ from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
+from v2hdm.pipeline.config import Contents
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
 from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 

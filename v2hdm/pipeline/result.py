@@ -34,9 +34,9 @@ from v2hdm.io.trajectory import write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.camera_sets import BEST
+from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
-from v2hdm.pipeline.keys import Contents, made_of_drives
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.photos import save_overlay

@@ -19,8 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, need
 from v2hdm.store.files import file_digest
 from v2hdm.store.inputs import LIST
 

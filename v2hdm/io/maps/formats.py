@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, V2hdmError, need
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
 from v2hdm.io.maps.geojson import write_geojson

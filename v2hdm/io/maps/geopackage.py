@@ -22,8 +22,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS

@@ -21,8 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of

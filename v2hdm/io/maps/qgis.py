@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, need
 from v2hdm.geometry.geodetic import Grid, crs_of
 from v2hdm.io.maps.features import POINTS, features_of
 from v2hdm.io.maps.geopackage import LOCAL_CRS, layer_style

@@ -10,8 +10,7 @@ from xml.sax.saxutils import escape
 import cv2
 import numpy as np
 
-from v2hdm.errors import MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.records import FloatArray, Lane, Marking, Symbol

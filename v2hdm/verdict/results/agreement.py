@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from v2hdm.geometry.mounting import centre_sigmas
+from v2hdm.geometry.ipm import centre_sigmas
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.mounting import mounting_angles
+from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag

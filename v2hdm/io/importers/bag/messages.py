@@ -9,8 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError
-from v2hdm.extras import need
+from v2hdm.errors import DriveError, need
 from v2hdm.io.importers.tables import Attitudes, Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import checked_rotations, in_order
