@@ -18,7 +18,8 @@ from tests.cameras import mounted
 from tests.docs.blocks import blocks, document
 from tests.drive.example import make_drive
 from v2hdm.calibration.compare import FALSE_ALARM, movement
-from v2hdm.calibration.from_points import calibrate_from_points, check_points, read_points
+from v2hdm.calibration.from_points import calibrate_from_points
+from v2hdm.calibration.points import check_points, read_points
 from v2hdm.cli.main import run as run_command
 from v2hdm.detection.camera import camera_from_calibration
 from v2hdm.errors import DriveError, MapFileError

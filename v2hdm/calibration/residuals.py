@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, Seen, fit_mountings
-from v2hdm.calibration.from_points import LEAST_POINTS, SurveyedPoints
+from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints
 from v2hdm.geometry.ipm import (
     apply_in_front,
     facing_ipm,

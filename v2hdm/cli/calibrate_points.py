@@ -31,12 +31,8 @@ def run(arguments: Sequence[str]) -> int:
     parsed = parser.parse_args(arguments)
     from dataclasses import replace
 
-    from v2hdm.calibration.from_points import (
-        calibrate_from_points,
-        read_points,
-        summary_lines,
-        write_point_calibration,
-    )
+    from v2hdm.calibration.from_points import calibrate_from_points, summary_lines, write_point_calibration
+    from v2hdm.calibration.points import read_points
     from v2hdm.detection.frames import read_bgr
     from v2hdm.io.calibration.intrinsics import read_intrinsics
 
