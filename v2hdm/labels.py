@@ -167,22 +167,12 @@ class _Eye:
 def write_labels(
     folder: Path, drive: Drive, output: Path, range_m: float = RANGE_M, progress: Steps | None = None
 ) -> dict[str, int]:
-    """Write ``instances.json`` (COCO) of a run's map in all images of its drive into the folder ``output``.
+    """Write ``instances.json`` (COCO) of a result's map in all images of its drive into ``output``.
 
-    Args:
-        folder: result of a run.
-        drive: what it has mapped.
-        output: where the file is written; its ``file_name`` entries start from the drive's folder.
-        range_m: how far from a camera markings are labelled.
-        progress: counts images.
-
-    Returns:
-        How many labels are whole and shown ("shown"), of unsure visibility ("unsure"), and how many markings
-        in view are hidden ("hidden").
-
-    Raises:
-        MapFileError: the folder is no result, or its verdict is FAIL.
-        DriveError: an image cannot be read.
+    Its ``file_name`` entries start from the drive's folder; markings are labelled up to ``range_m`` from a
+    camera. Returns how many are whole and shown ("shown"), of unsure visibility ("unsure"), and in view but
+    hidden ("hidden"). Raises MapFileError where the folder is no result or its verdict is FAIL, DriveError
+    where an image cannot be read.
     """
     facts = read_facts(folder, drive)
     status = (facts.metrics.get("verdict") or {}).get("status")

@@ -39,11 +39,7 @@ its view."""
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 
-DISTORTION_COEFFICIENTS: Mapping[str, int] = {
-    "plumb_bob": 5,
-    "rational_polynomial": 8,
-    "equidistant": 4,
-}
+DISTORTION_COEFFICIENTS: Mapping[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Distortion models by their ROS ``camera_info`` name, with their number of coefficients."""
 
 
@@ -243,16 +239,13 @@ class Drive:
 
 @dataclass(frozen=True)
 class MarkingDetection:
-    """One quadrilateral marking in one image.
+    """One quadrilateral marking, or symbol, in one image.
 
-    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, which is also how they run on
-    the screen (their shoelace area in (u, v) is negative, since v points down); which comes first is
-    arbitrary. ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is large in a
-    direction that the image hides, as along a dash whose end lies beyond the border. ``corner_valid`` (4,)
-    says which corners are points: known well in every direction.
-
-    Symbols, as arrows and chevrons, are no quadrilaterals: their corners are nan and not valid, and
-    ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals.
+    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, and so on the screen; which
+    comes first is arbitrary. ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is
+    large in a direction that the image hides, as along a dash whose end lies beyond the border.
+    ``corner_valid`` (4,) says which are known well in every direction. Symbols, as arrows and chevrons, have
+    corners of nan, not valid, and a polygon ``outline_px`` (N, 2); it is empty for quadrilaterals.
     """
 
     kind: str

@@ -79,10 +79,8 @@ def side_by_side(
     """Do long jobs in several processes; yields each job's number and result as it is done.
 
     ``work`` reports its steps to the progress that it is given. A job whose process dies is begun once more,
-    and a WorkerError is its result where that dies, too. An exception of ``work`` is raised here.
-
-    Processes are spawned: a fork would inherit the locks of other libraries' threads. Messages go through a
-    pipe per process: one that is killed takes no other's with it, and nobody else could reach them.
+    and a WorkerError is its result where that dies, too. An exception of ``work`` is raised here. Processes
+    are spawned, as a fork would inherit the locks of threads; a pipe each takes no other's messages with it.
     """
     left, died = list(range(len(jobs)))[::-1], set[int]()
     others = set(multiprocessing.active_children())

@@ -53,20 +53,15 @@ def minimise(
     max_iterations: int,
     renewal: float = math.inf,
 ) -> Minimum:
-    """Minimise from y = 0, whose cost and gradient are given.
+    """Minimise from y = 0, whose cost and gradient (n,) are given; the Hessian there is about identity.
 
-    torch's first step is ``-min(1, 1 / |g|_1) g``. On u = y / a with the objective scaled by 1 / a^2 and
-    a = |g_y(0)|_1 the gradient's 1-norm is 1 and that step is y = -g_y: the unit step that the
-    whitening was made for, with no internals touched.
+    torch's first step is ``-min(1, 1 / |g|_1) g``. On u = y / a with the objective scaled by 1 / a^2 and a =
+    |g_y(0)|_1 the gradient's 1-norm is 1 and that step is y = -g_y: the unit step that the whitening was made
+    for, with no internals touched.
 
-    Args:
-        objective: cost and gradient; the Hessian at 0 is about the identity.
-        cost: at 0.
-        gradient: at 0, (n,).
-        tolerance: stop when :func:`predicted_gap` is below this.
-        max_iterations: after these the whitening is better renewed.
-        renewal: evaluations that a new whitening costs. Where the steps that are left, at the rate of the
-            last, cost more than that and the few steps from nearby, this one was made too far away.
+    It stops when :func:`predicted_gap` is below ``tolerance``. A new whitening, which costs ``renewal``
+    evaluations, is better after ``max_iterations``, or where the steps that are left, at the rate of the
+    last, cost more than that and the few steps from nearby.
     """
     scale = float(gradient.abs().sum())
     u = torch.zeros_like(gradient)

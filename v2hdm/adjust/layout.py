@@ -58,13 +58,10 @@ _MIN_WHITE_SHARE = 1e-3
 def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
     """The states of a frame: for each error its white part, then its drift, where there are any.
 
-    All visits have the same states; what only others have is rounding in a visit's own, and none outlasts its
-    visit. A drift is a first-order Gauss-Markov process along the driven distance d: memory
-    m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section
-    3.8).
-
-    Returns the tangent's column (S,) of each, the transition (J, S, S) and the inverse sigma (J, S) of what
-    is new in a frame's.
+    All visits have the same; none outlasts its visit. A drift is a first-order Gauss-Markov process along the
+    driven distance d: memory m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied
+    Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition (J, S, S) and
+    the inverse sigma (J, S) of what is new in a frame's.
     """
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]

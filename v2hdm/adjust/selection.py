@@ -112,13 +112,11 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
     """Choose the richest of the models ``names`` that predicts as well as the best.
 
     As well means: within one standard error of the paired difference, by frames, since errors within a frame
-    go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). Of
-    equals the richest, since its priors keep it from fitting noise, and an error that is not estimated is
-    missing from the stated accuracy, too. A clock offset trades against the camera's forward offset, so it is
-    taken only where it predicts better than all others by more than three standard errors.
-
-    The extrinsics of ``problem`` had better be near already; ``names`` begin with the simplest, and ``clock``
-    is left out where twists are not known. Raises AdjustError where a model's problem cannot be solved.
+    go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). A clock
+    offset trades against the camera's forward offset, so it is taken only where it predicts better than all
+    others by more than three standard errors. The extrinsics of ``problem`` had better be near already;
+    ``names`` begin with the simplest, and ``clock`` is left out where twists are not known. Raises
+    AdjustError where a model's problem cannot be solved.
     """
     unknown = [name for name in names if name not in MODELS]
     if unknown:

@@ -57,13 +57,7 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
     start, opening, spent = _start(near, engine, robust, options)
     del near
     descent = descend(
-        engine,
-        start,
-        robust,
-        options.gap_tolerance,
-        options.max_refreshes,
-        options.max_evaluations,
-        opening,
+        engine, start, robust, options.gap_tolerance, options.max_refreshes, options.max_evaluations, opening
     )
     del opening
     return _report(problem, origin_map, options, descent, spent)
@@ -109,11 +103,7 @@ def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tup
 
 
 def _report(
-    problem: Problem,
-    origin_map: FloatArray,
-    options: SolveOptions,
-    descent: Descent,
-    spent: int,
+    problem: Problem, origin_map: FloatArray, options: SolveOptions, descent: Descent, spent: int
 ) -> Solution:
     """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
     robust = Loss(options.loss, options.loss_scale)

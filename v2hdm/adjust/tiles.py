@@ -1,11 +1,10 @@
 """Sparse Cholesky factorisation in dense tiles, for a matrix with an arrow's shape.
 
-The frames of a drive, cut into tiles along the route, couple to their neighbours and, where the
-route is driven again, to the tiles of earlier laps; the extrinsics couple to everything and come last,
-as the *tip*. Tiles are ordered by reverse Cuthill-McKee or, where many couple, by least degree, and their
-fill is found beforehand (the elimination tree: George and Liu, Computer Solution of Large Sparse Positive
-Definite Systems, 1981), so time and memory grow with the length of the route. Everything inside a tile is a
-dense product.
+Frames, cut into tiles along the route, couple to their neighbours and to tiles of earlier laps; the
+extrinsics couple to everything and come last, as the *tip*. Tiles are ordered by reverse Cuthill-McKee or,
+where many couple, by least degree, and their fill is found beforehand (the elimination tree: George and Liu,
+Computer Solution of Large Sparse Positive Definite Systems, 1981), so time and memory grow with the route's
+length.
 """
 
 from __future__ import annotations

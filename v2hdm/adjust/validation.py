@@ -53,11 +53,7 @@ def line_variance_factor(squared: FloatArray, taken: float) -> float:
 
 
 def classify(
-    observations: Observations,
-    mahalanobis2: FloatArray,
-    behind: BoolArray,
-    probability: float,
-    scale: float,
+    observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float, scale: float
 ) -> VerdictArray:
     """A :class:`Verdict` (K,) for every observation, by its squared residual in sigmas ``mahalanobis2`` (K,).
 

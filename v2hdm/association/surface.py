@@ -147,15 +147,7 @@ class Paths:
             map_from_vehicle[:, :2, 0], axis=1, keepdims=True
         )
         return cls(
-            place,
-            at,
-            heading[first],
-            sense,
-            station,
-            bounds,
-            points,
-            heading,
-            np.array(list(span.values())),
+            place, at, heading[first], sense, station, bounds, points, heading, np.array(list(span.values()))
         )
 
     def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -18,8 +18,6 @@ from v2hdm.cli.main import parser_of
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.records import FloatArray
 
-_POSITION_SIGMA_M = 0.02  # of the written poses' heights, by which their road is laid flat
-
 
 def run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
@@ -106,7 +104,7 @@ def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list
     _refuse_crs(parsed, "a point cloud is in the map's own frame")
     if parsed.format != ["pcd"]:
         raise ConfigError("--format: a mosaic is a GeoTIFF already; its other format is pcd")
-    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")), _POSITION_SIGMA_M)
+    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")))
 
     def height_m(places: FloatArray) -> FloatArray:
         return np.zeros(len(places)) if driven.road is None else ground_height_m(driven.road, places)

@@ -50,13 +50,12 @@ _FARTHEST_MOUNT_M = 100.0
 class RoadCamera:
     """One camera with fast lens and ground mappings, and the rows worth looking at.
 
-    Recorded pixels are those of the image, pinhole pixels those without distortion. ``top`` is the first of
-    the image rows below the horizon of the camera's initial IPM (with a margin, since that IPM is coarse; the
-    rows from there on are a multiple of ``multiple`` where the image is tall enough). ``far_row``, by a
-    multiple of ``multiple`` below ``top``, is the one from which on ground within :data:`FARTHEST_M` shows.
-    From ``fine_row`` on (None if there is no such row) a pixel is less than ``_FINE_ENOUGH_M`` of ground
-    wide. ``aside`` cameras look across the way that the vehicle drives. ``foot_vehicle`` (2,) lies below the
-    camera. Points far from any lens singularity are assumed.
+    Recorded pixels are those of the image, pinhole pixels those without distortion; points far from any lens
+    singularity are assumed. ``top`` is the first image row below the horizon of the initial IPM, with a
+    margin; from there on rows are a multiple of ``multiple`` where the image is tall enough. From
+    ``far_row``, a multiple of it below ``top``, ground within :data:`FARTHEST_M` shows, from ``fine_row``
+    (None if none) a pixel is less than ``_FINE_ENOUGH_M`` of ground wide. ``aside`` cameras look across the
+    way that the vehicle drives. ``foot_vehicle`` (2,) lies below the camera.
     """
 
     def __init__(self, camera: Camera, multiple: int = 16):
@@ -305,9 +304,7 @@ class Horizon:
 
 
 def camera_from_calibration(
-    calibration: Calibration,
-    linear_response: bool = False,
-    mounting_sigma: tuple[float, float] = (0.0, 0.0),
+    calibration: Calibration, linear_response: bool = False, mounting_sigma: tuple[float, float] = (0.0, 0.0)
 ) -> Camera:
     """A camera of a calibration that is ``mounting_sigma`` off; MapFileError where it sees no ground."""
     info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle

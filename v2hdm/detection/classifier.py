@@ -1,18 +1,14 @@
 """How probable it is that a quadrilateral is a whole marking, and which of its sides to trust.
 
-The classifier has two stages. The network in ``judge.onnx`` takes each reading alone: numbers about a fitted
-quadrilateral, and a picture of it in its own frame. A homography takes the four corners to those of a
-rectangle, so that every marking of a class looks the same wherever it lies in the image (Faster R-CNN's
-region of interest, Ren et al., NeurIPS 2015, along the marking's own sides): light and distance cancel, and
-left is what sets a worn marking off from a fleck of sun. It gives log odds, and how far each side may be off
-for reasons that the fit's residuals do not show: worn ends, seams along a side, shadows, something in front.
-Then a logistic function, whose weights are in ``confidence.json``, takes each among the others of its image.
-Both files belong to the paint network.
+The network in ``judge.onnx`` takes each reading alone: numbers about a fitted quadrilateral, and a picture of
+it in its own frame, where every marking of a class looks alike (as Faster R-CNN's region of interest, Ren et
+al., NeurIPS 2015): what sets a worn marking off from a fleck of sun is left. It gives log odds, and how far
+each side may be off for reasons that the fit's residuals do not show: worn ends, seams along a side, shadows,
+something in front. Then a logistic function, whose weights are in ``confidence.json``, takes each among the
+others of its image. Both files belong to the paint network.
 
-A site's markings are painted from few stencils: the diamonds of a field are of one size and lie one way, the
-dashes of a line are as long as each other and follow one another in a row. Where the way bends, directions
-turn with it, by an angle that grows with the distance, and a row is an arc. Flecks of sun do nothing of the
-kind.
+A site's markings are painted from few stencils: the diamonds of a field are of one size and lie one way,
+dashes are as long as each other and follow one another in a row, or an arc where the way bends.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """How a camera of which little is known is mounted, from the lines that its images show.
 
-Lines along a road are parallel on the ground and meet in one point of the horizon, wherever the road bends:
-points of several images, beside each other, also show the roll. A first network run on half the resolution
-finds crossings of lanes' lines and the edges of paint. Each of these lines is either one of the road's or any
-other; the horizon has a posterior on a grid of pitch and roll, whose prior is the stated or a usual mounting.
-An image's own horizon moves about the camera's with the vehicle's body. One vanishing point does not show the
-focal length: that stays as uncertain as its prior, and so does the height.
+Lines along a road are parallel on the ground and meet in one point of the horizon: points of several images,
+beside each other, also show the roll. A first network run on half the resolution finds crossings of lanes'
+lines and the edges of paint; each is one of the road's or any other. The horizon has a posterior on a grid of
+pitch and roll, whose prior is the stated or a usual mounting; an image's own moves about it with the
+vehicle's body. Focal length and height stay as uncertain as their priors.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """The drive mapped as it would be on the vehicle: marking by marking, with nothing known of what comes.
 
-A track that the vehicle has left behind becomes a marking as soon as it ends: one of the map, where it lies
-on it, or else a further one. Map and extrinsics are up to date after each (:mod:`v2hdm.adjust.incremental`),
-under a model that takes the poses at their word, and their errors for noise in the image.
-
-The first tracks are linked under a coarse IPM. Whenever the map has grown fourfold, and when the drive ends,
-all is solved together with the errors of the poses, as the batch does, and what has been seen so far is
-linked again under the extrinsics and poses that this leads to: a constant share of the cost.
+A track becomes a marking, of the map where it lies on one, as soon as it ends. Map and extrinsics are up to
+date after each (:mod:`v2hdm.adjust.incremental`), under a model that takes poses' errors for noise in the
+image. Whenever the map has grown fourfold, and when the drive ends, all is linked again and solved together
+with the errors of the poses, as the batch does: a constant share of the cost.
 """
 
 from __future__ import annotations

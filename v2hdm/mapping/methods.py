@@ -152,23 +152,12 @@ def run_methods(
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
 ) -> dict[str, MethodResult]:
-    """Map a drive with every method that its IPMs allow.
+    """Map a drive, whose truth is not looked at, with every method that the IPMs of ``cameras`` allow.
 
-    Args:
-        drive: the drive; its truth is not looked at.
-        detections: of its images.
-        cameras: to map with, together.
-        options: settings of the mapping.
-        progress: gets the name of each step as it begins.
-        base: an earlier map that ``Opt`` brings up to date.
-        grey: reads the grey values (H, W) of an image, to look where ``base`` has paint.
-
-    Returns:
-        Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
-
-    Raises:
-        MappingError: there is nothing to map.
-        ConfigError: an option is out of range.
+    ``progress`` gets the name of each step as it begins. ``base`` is an earlier map that ``Opt`` brings up to
+    date; ``grey`` reads the grey values (H, W) of an image, to look where it has paint. Results are by
+    method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError
+    where there is nothing to map, ConfigError for an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)

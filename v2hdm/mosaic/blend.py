@@ -1,13 +1,10 @@
 """All images of a drive on one canvas: the mean of what they show, weighted by how finely they show it.
 
-An image counts with the number of its pixels that a pixel of the canvas covers: the determinant of the
-derivative of the homography ``H`` from canvas to image, which is ``det(H) / w^3``, with ``w`` the third
-coordinate of the mapped point. That is proportional to its depth, so that near views outweigh far ones. What
-the image is trusted for is warped with its colours, in one pass.
-
-The canvas is done in sheets, so that memory does not grow with the drive, and each sheet in tiles of which an
-image touches only those that it shows. kornia maps their pixels by homography and lens, and its ``remap``
-samples the image there.
+An image counts with the number of its pixels that a pixel of the canvas covers: ``det(H) / w^3``, H the
+homography from canvas to image and ``w`` the third coordinate of the mapped point, which is proportional to
+its depth. What the image is trusted for is warped with its colours, in one pass. The canvas is done in
+sheets, so that memory does not grow with the drive, and each in tiles of which an image touches only those
+that it shows.
 """
 
 from __future__ import annotations

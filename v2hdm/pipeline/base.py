@@ -23,7 +23,6 @@ from v2hdm.records import Change, Changes, Drive, Fate, HdMap, Image
 from v2hdm.site.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
-_POSITION_SIGMA_M = 0.02  # sigma of a written pose's height by which its road is laid flat, m
 LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
 
 
@@ -44,7 +43,7 @@ def read_base(path: Path) -> Base:
             f"map.base: {path}: does not say how sure its markings are, as maps of older versions and "
             "naive methods; map its drive anew"
         )
-    poses = [lay_flat(read_tum(one), _POSITION_SIGMA_M).trajectory.map_from_vehicle for one in trajectories]
+    poses = [lay_flat(read_tum(one)).trajectory.map_from_vehicle for one in trajectories]
     left_out = read_exclusions(excluded) if excluded.is_file() else []
     candidates = tuple((one.kind, one.position_map, one.sightings) for one in left_out)
     return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), candidates)

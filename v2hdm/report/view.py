@@ -20,13 +20,7 @@ import numpy as np
 
 from v2hdm.catalogue import SHIPPED
 from v2hdm.errors import MapFileError, V2hdmError, one_line
-from v2hdm.io.maps.corrections import (
-    Correction,
-    correction_of,
-    entry_of,
-    read_corrections,
-    write_corrections,
-)
+from v2hdm.io.maps.corrections import Correction, correction_of, entry_of, read_corrections, write_corrections
 from v2hdm.records import Drive
 from v2hdm.report.page.document import json_text, page_text
 from v2hdm.report.page.facts import Facts, read_facts

@@ -1,9 +1,8 @@
 """Which marking of a new map is which of an old one: the likeliest of all that may have happened to them.
 
-Of a marking of the old map, the new drive may have seen it where it was, seen it elsewhere because it was
-painted anew there, or not seen it: because it is gone, because no image showed its place, or because it was
-missed. A marking of the new map that is none of the old one is new paint, or was missed before. Each has a
-likelihood; how often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
+An old marking was seen where it was, or elsewhere because it was painted anew there, or not: it is gone, no
+image showed its place, or it was missed. A new one that is none of the old is new paint, or was missed
+before. How often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
 prior), and one assignment makes all of it as likely as can be.
 """
 

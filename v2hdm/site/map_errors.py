@@ -1,12 +1,10 @@
 r"""The errors that markings of a map share, how two maps therefore lie to each other, and lines carried over.
 
-A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of
-the receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the
-ground with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markings at the distance d. So the
-markings that two maps have in common tell how the maps are shifted against each other, everywhere near to
-them; and averaging many markings does not average away what they share.
-
-Lane lines and symbols of an earlier map stay where the new drive has none.
+Beside its own error a corner has one that it shares with its surroundings: the receiver's drift, which fades
+along the route, and a survey's. It is a Gaussian process over the ground with the covariance :math:`\sigma_a
+\sigma_b \exp(-d / l)` for two markings at the distance d: common markings tell how two maps are shifted near
+to them, and averaging many does not average it away. Lane lines and symbols of an earlier map stay where the
+new drive has none.
 """
 
 from __future__ import annotations

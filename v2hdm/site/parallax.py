@@ -1,10 +1,9 @@
 """Whether candidates lie on the ground: how much nearer they come as the vehicle goes on.
 
-Laid on the ground, a point of the ground comes nearer by as much as the vehicle moves. A point half as high
-as the camera (one metre up, for a camera two metres up) seems to come twice as much nearer, one that moves
-along with the vehicle, or belongs to it, not at all. With the camera at c, the ray from below it to where a
-point is seen on the ground is r = a - s c, and s = 1 on the ground. Images tell s as far as the vehicle has
-moved between them: a standing one tells nothing.
+Laid on the ground, a point of the ground comes nearer by as much as the vehicle moves, one half as high as
+the camera by twice as much, one that moves along with the vehicle not at all. With the camera at c, the ray
+from below it to where a point is seen on the ground is r = a - s c, and s = 1 on the ground. Images tell s as
+far as the vehicle has moved between them.
 """
 
 from __future__ import annotations

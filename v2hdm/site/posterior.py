@@ -349,12 +349,7 @@ def _hypotheses(
 
 
 def _add_shape(
-    space: _Space,
-    shape: Shape,
-    part: float,
-    weight: FloatArray,
-    other_length: FloatArray,
-    vague: FloatArray,
+    space: _Space, shape: Shape, part: float, weight: FloatArray, other_length: FloatArray, vague: FloatArray
 ) -> FloatArray:
     """Add the hypotheses of one shape, a ``part`` of the class; log likelihood (N,) of as ragged clutter."""
     candidates, share = space.candidates, space.share

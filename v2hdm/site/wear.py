@@ -1,11 +1,10 @@
 """How much of its paint each marking has left, as the nearest images show it.
 
-An image is decoded to linear light, in which a pixel half on paint and half on ground lies half way, and
-divided by the ground beside the marking, so that neither exposure nor light matters. A cell may be lit as the
-ground of either side: the edge of a shadow often lies across a marking. Only images that show all corners of
-a marking count, and each cell takes their median. The cells are then explained as a mixture of full paint,
-bare ground and cells part of each; how bright full paint is over its ground is the marking's own, with a
-prior from all markings of its class: dirt dims paint that is whole.
+An image is decoded to linear light, in which a pixel half on paint lies half way, and divided by the ground
+beside the marking; a cell may be lit as either side's, as the edge of a shadow often lies across. Each cell
+takes the median of the images that show all corners. The cells are then a mixture of full paint, bare ground
+and cells part of each; how bright full paint is over its ground is the marking's own, with a prior from all
+of its class: dirt dims paint that is whole.
 """
 
 from __future__ import annotations
@@ -115,10 +114,8 @@ def with_wear(
     """``hd_map`` with the share of paint that each marking has left, where two images or more show it near.
 
     ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W),
-    ``shown`` are the pairs of an image's index and a marking's that nothing hides there, ``surface`` the
-    ground where it is no plane.
-    A marking that the ``earlier`` map has, by its id, states the change, and keeps what that says where this
-    drive did not look.
+    ``shown`` are the pairs of an image's index and a marking's that nothing hides there. A marking that the
+    ``earlier`` map has, by its id, states the change, and keeps what that says where this drive did not look.
     """
     cells = [Cells.of(one.corners_map) for one in hd_map.markings]
     ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))

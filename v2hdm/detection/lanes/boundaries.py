@@ -4,14 +4,12 @@ A hidden Markov model on rows of the image, from far to near. Its states are *en
 *dash*; the rates at which one becomes another are per metre of ground. The evidence of a row is two log odds
 of the network: of the surest crossing on the line and of the surest paint about it. The forward and backward
 pass (L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each
-state on each row and the likelihood of the line over that of ground without one. Two lines that are painted
-side by side are the strands of one double line: it runs along their middle where both are present, else
-along the one that is.
+state on each row and the likelihood of the line over that of ground without one. Two lines side by side may
+be strands of one double line, along the middle of those present.
 
-How probable it is that a line is one of a lane is a logistic function of its features: first of each line
-alone, then with its span and among the others of its image. A road's lines run beside each other, a lane
-apart: kerbs, joints and edges of shadows run closer. The weights, in ``lane_score.json``, belong to the
-network. ``python -m train.ship`` fits them to renders which no benchmark shows.
+How probable it is that a line is one of a lane is a logistic function of its features: first of each alone,
+then with its span and among the others of its image, which run a lane apart; kerbs, joints and shadows run
+closer. Its weights, in ``lane_score.json``, belong to the network; ``python -m train.ship`` fits them.
 """
 
 from __future__ import annotations

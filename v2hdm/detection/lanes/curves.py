@@ -4,14 +4,12 @@ Below the horizon such an arc is u = a + b v + c / v, u along the horizon and v 
 pinhole px: the image of a straight line (a, b) and, to second order, of its curvature (c); see A. Guiducci,
 "Parametric model of the perspective projection of a road with applications to lane keeping and 3D road
 reconstruction", CVIU 73 (1999). It is linear in a, b and c: what points say of it adds up, and whether two
-groups of points are one line has a closed answer.
+groups of points are one line has a closed answer. Lines along one road share a, their vanishing point, and c.
 
-Crossings are linked from row to row into chains, near ones first: near the vehicle lines are far apart, so
-that each is known by the time they run together. Chains and pieces of paint are then joined as long as they
-are more likely one line than two, the likeliest pair first (Bayesian hierarchical clustering). A far dash
-joins a near one by the curve that both suggest and by the road that they lie along. Lines painted along a
-road are parallel: of u = a + b v + c / v (:mod:`v2hdm.detection.lanes.curves`) they share a, their vanishing
-point, and c; only b, the place beside the camera, is each one's own.
+Crossings are linked from row to row into chains, near ones first, where lines are far apart. Chains and
+pieces of paint are then joined as long as they are more likely one line than two, the likeliest pair first
+(Bayesian hierarchical clustering); a far dash by the curve that both suggest and the road that they lie
+along.
 """
 
 from __future__ import annotations

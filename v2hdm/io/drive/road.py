@@ -1,13 +1,10 @@
-"""The road under a drive, and the drive's poses with that road laid flat into z = 0.
+"""The road under a drive, and the drive's poses with that road laid flat into z = 0, the mapper's ground.
 
-The mapper's ground is the plane z = 0. Grade, cross-fall, ramps and height do not concern the markings' plan,
-but the vehicle's attitude relative to the road does: one degree of pitch moves a ground point at 15 m by 2.4
-m for a camera 1.65 m up.
-
-The recorded up-axis, smoothed over a few metres, gives the road's slope. Integrated along the path it must
-give the heights; where it does not, the sensor is not level or the vehicle squats, and the difference is the
-vehicle's and not the road's. Only this difference is smoothed over a longer way, so that short ramps are not
-blurred.
+Slopes and height do not concern the markings' plan, but the vehicle's attitude relative to the road does: one
+degree of pitch moves a ground point at 15 m by 2.4 m for a camera 1.65 m up. The recorded up-axis, smoothed
+over a few metres, gives the road's slope. Integrated along the path it must give the heights; where it does
+not, the sensor is not level or the vehicle squats, and the difference, smoothed over a longer way so that
+short ramps are not blurred, is the vehicle's.
 """
 
 from __future__ import annotations
@@ -59,10 +56,11 @@ class Laid:
     mount_rad: FloatArray  # (2,) roll (left side up), pitch (nose down) of the sensor, taken off
 
 
-def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
+def lay_flat(recorded: Trajectory, position_sigma_m: float = 0.02) -> Laid:
     """Lay the road under poses ``map_from_vehicle`` flat into z = 0, recorded with ``position_sigma_m``.
 
-    Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road.
+    Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road. The
+    usual sigma is for the poses of a result.
     """
     poses = recorded.map_from_vehicle
     up = poses[:, :3, 2]

@@ -1,12 +1,10 @@
 """Writing an HD map as Lanelet2 OSM in the dialect of Autoware, with its ``map_projector_info.yaml``.
 
-Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation; a
-stop line is a line string as well, with the regulatory element that Autoware's map validator asks for. Lane
-lines are line strings; where two of them bound a lane there is a lanelet.
-
-Lanelet2 has no word for paint without a sign: a stop line's element is a ``traffic_sign``, whose sign is a
-line beside the paint, tagged ``virtual``. The id of a marking or lane line is that of the map; the other ids
-follow from it, so that they stay when the map is written again.
+Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation;
+lane lines are line strings, with a lanelet where two of them bound a lane. A stop line is a line string as
+well, with the regulatory element that Autoware's map validator asks for: a ``traffic_sign``, as Lanelet2 has
+no word for paint alone, whose sign is a line beside the paint, tagged ``virtual``. Other ids follow from the
+map's, so that they stay when it is written again.
 """
 
 from __future__ import annotations

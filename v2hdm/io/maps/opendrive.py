@@ -1,11 +1,10 @@
 """Writing an HD map as OpenDRIVE 1.7, for simulators.
 
-Every lane between two lane lines is a road of its own: its reference line is the left line, straight from
-vertex to vertex, its only lane ``-1`` is as wide as the right line is away, and both lines are road marks.
-Roads have no links and no junctions, for a map of paint does not say how lanes connect. Every marking and
-symbol is an object ``roadMark`` of the nearest road, its outline exact in the object's own axes. Where no two
-lines bound a lane, one road without width runs along the longest line or through the markings and carries
-them.
+Every lane between two lane lines is a road of its own, without links, for a map of paint does not say how
+lanes connect: its reference line is the left line, straight from vertex to vertex, its only lane ``-1`` is as
+wide as the right line is away. Every marking and symbol is an object ``roadMark`` of the nearest road, its
+outline exact in the object's own axes. Where no two lines bound a lane, one road without width runs along the
+longest line or through the markings and carries them.
 """
 
 from __future__ import annotations

@@ -31,6 +31,12 @@ def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
+def jpeg_of(path: Path, widest_px: int, quality: int) -> str | None:
+    """A picture's file as JPEG in base64, at most so wide; None where there is none."""
+    pixels = cv2.imread(str(path)) if path.is_file() else None
+    return None if pixels is None else jpeg(shrunk(pixels, min(1.0, widest_px / pixels.shape[1])), quality)
+
+
 def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
     return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
@@ -39,7 +45,6 @@ EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 
 LARGEST_BYTES = 3_500_000  # budget of the mosaic, as text in the page
 _QUALITY = 72
-_COMPARISON_WIDTH_PX = 1400
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
@@ -135,11 +140,7 @@ def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
 
 def comparison(folder: Path) -> str | None:
     """The same ground before and after the optimisation, JPEG in base64; None where the folder has none."""
-    path = folder / COMPARISON
-    pixels = cv2.imread(str(path)) if path.is_file() else None
-    return (
-        None if pixels is None else jpeg(shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1])), 84)
-    )
+    return jpeg_of(folder / COMPARISON, 1400, 84)
 
 
 SIGMAS_95 = 2.4477

@@ -11,14 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.ground import (
-    GroundEstimate,
-    GroundOptions,
-    GroundStatus,
-    Parameter,
-    Reading,
-    estimate_ground,
-)
+from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading, estimate_ground
 from v2hdm.ground.estimate import STEEP_RAD
 from v2hdm.records import Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path

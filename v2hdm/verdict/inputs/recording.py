@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import filecmp
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -160,7 +160,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
     if not moving:
         says = "the vehicle does not move between the images, so that repeated ones cannot be told"
         return passed("frozen images", name, says)
-    copied = [k for k in moving if _same_file(images[k - 1].path, images[k].path)]
+    copied = [k for k in moving if filecmp.cmp(images[k - 1].path, images[k].path, shallow=False)]
     share, at = len(copied) / len(moving), copied
     if share <= _FROZEN:
         sampled = _spread(moving, _SAMPLES)
@@ -208,17 +208,6 @@ def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Fi
             "camera's exposure for the road",
             status=Status.WARN,
         )  # fmt: skip
-
-
-def _same_file(first: Path, second: Path) -> bool:
-    """Whether two files are one, or hold the same bytes; files of other sizes are not opened."""
-    if first == second:
-        return True
-    return first.stat().st_size == second.stat().st_size and _digest(first) == _digest(second)
-
-
-def _digest(path: Path) -> bytes:
-    return hashlib.blake2b(path.read_bytes()).digest()
 
 
 def _alike(first: Path, second: Path) -> bool:

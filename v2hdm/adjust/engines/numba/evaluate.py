@@ -90,13 +90,7 @@ def _carry(
 
 @kernel
 def carry(
-    begin: int,
-    end: int,
-    layout: Layout,
-    base: Base,
-    by_corner: FloatArray,
-    scratch: Scratch,
-    out: Evaluation,
+    begin: int, end: int, layout: Layout, base: Base, by_corner: FloatArray, scratch: Scratch, out: Evaluation
 ) -> None:
     """Whiten a gradient (N, 2) by the corners of chunks ``begin`` to ``end``; see :func:`evaluate`."""
     for q in range(begin, end):

@@ -16,14 +16,7 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.model import (
-    Estimate,
-    Gradient,
-    clock_residual,
-    frame_tangent,
-    moved,
-    state_residual,
-)
+from v2hdm.adjust.model import Estimate, Gradient, clock_residual, frame_tangent, moved, state_residual
 from v2hdm.adjust.reduced import PriorBlocks, Spread
 from v2hdm.compiled import exact_kernel, inlined, kernel
 from v2hdm.geometry import rigid
