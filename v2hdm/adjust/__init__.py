@@ -27,6 +27,5 @@ __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
     "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
     "height_information", "line_variance_factor", "observability", "pose_innovations", "predicts_better",
-    "score_faults",
-    "select_model", "sigmas_of", "solve", "with_model",
+    "score_faults", "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

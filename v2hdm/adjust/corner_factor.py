@@ -10,11 +10,9 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.errors import AdjustError
 
-CORNER_FLOOR = 1e-10
-"""Information, 1 / m^2, that keeps a corner factorable which runs off to the horizon."""
+CORNER_FLOOR = 1e-10  # information, 1 / m^2, that keeps a corner factorable which runs off to the horizon
 
-PIVOT_FLOOR = 1e-12
-"""Least pivot of a corner's second coordinate, as a share of its own information."""
+PIVOT_FLOOR = 1e-12  # least pivot of a corner's second coordinate, as a share of its own information
 
 INSEPARABLE = "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
 """The error of a block that has no factor."""

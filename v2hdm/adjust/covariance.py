@@ -19,8 +19,7 @@ from v2hdm.records import FloatArray
 # these may consist.
 _CORNERS_AT_ONCE = 256
 _NUMBERS_AT_ONCE = 1 << 25
-# Frames whose right-hand sides are solved for together.
-_FRAMES_AT_ONCE = 64
+_FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved for together
 
 
 @dataclass(frozen=True)

@@ -20,15 +20,12 @@ from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.reduced import Plan
 from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient
 
-Evaluate = Callable[[Tensor], tuple[float, Tensor]]
-"""Cost and gradient at whitened variables y."""
+Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
 
 _HISTORY = 20
 _LINE_SEARCH_EVALUATIONS = 25
-# Steps that a whitening near the optimum takes to the end.
-_STEPS_FROM_NEARBY = 2
-# A relative decrease below this is rounding.
-_NO_PROGRESS = 1e-15
+_STEPS_FROM_NEARBY = 2  # steps that a whitening near the optimum takes to the end
+_NO_PROGRESS = 1e-15  # a relative decrease below this is rounding
 
 
 def predicted_gap(cost: float, gradient: Tensor) -> float:

@@ -48,11 +48,9 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     )
 
 
-MIN_STEP = 1e-4
-"""Least step between frames, as a fraction of the distance over which a drift fades."""
+MIN_STEP = 1e-4  # least step between frames, as a fraction of the distance over which a drift fades
 
-# Below this share of an error its white part is rounding left over from the drift.
-_MIN_WHITE_SHARE = 1e-3
+_MIN_WHITE_SHARE = 1e-3  # below this share of an error its white part is rounding left over from the drift
 
 
 def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -90,8 +88,7 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     return columns, transition, 1 / (sigma[visit] * np.sqrt(1 - memory**2))
 
 
-# Corners that known lengths may join; time and memory grow with the square and the cube.
-_MOST_JOINED = 256
+_MOST_JOINED = 256  # corners that known lengths may join; time and memory grow with the square and the cube
 
 
 def make_arrays(

@@ -39,26 +39,21 @@ from v2hdm.records import FloatArray
 _LEAST_OBSERVABLE = 1e-9
 """Share of a fault's own information, left by all else, below which rounding alone is left of it."""
 
-_LEAST_P = 1e-300
-"""Below it a p-value is zero for floating-point numbers."""
+_LEAST_P = 1e-300  # below it a p-value is zero for floating-point numbers
 
-_STRETCHES_PER_CHANGE = 2
-"""Stretches from one frame at which inputs may change to the next."""
+_STRETCHES_PER_CHANGE = 2  # stretches from one frame at which inputs may change to the next
 
 _MOST_CHANGES = 12
 """Frames at which inputs may change, of all sessions together: each costs a test of every camera and axis."""
 
-_DRIFTS = 3
-"""Shapes of a clock that drifts: evenly, in two half waves and in three."""
+_DRIFTS = 3  # shapes of a clock that drifts: evenly, in two half waves and in three
 
 _STEPS = ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5), (-(0.5**0.5), 0.5**0.5))
 """Directions in the map in which positions may step: none is farther than 22.5 deg from one of them."""
 
-_LEAST_SPEED_MPS = 0.5
-"""Below it a vehicle has no course."""
+_LEAST_SPEED_MPS = 0.5  # below it a vehicle has no course
 
-_LAGS = 1
-"""Neighbours of a stretch that err along with it."""
+_LAGS = 1  # neighbours of a stretch that err along with it
 
 _PRIOR_FREEDOM = 15.0
 """Degrees of freedom that the usual disagreement of a drive's stretches counts for in each test."""
@@ -106,8 +101,7 @@ def sigmas_of(p_value: float) -> float:
     return float(stats.norm.isf(max(p_value, _LEAST_P) / 2))
 
 
-CHANGES = (Fault.STEP, Fault.KNOCK)
-"""Faults that begin at some time, which is unknown."""
+CHANGES = (Fault.STEP, Fault.KNOCK)  # faults that begin at some time, which is unknown
 
 
 @dataclass(frozen=True)

@@ -74,8 +74,7 @@ MODELS: Mapping[str, Model] = {
 # Frames of the stretch that models are compared on, and the share of its observations held out.
 _STRETCH_FRAMES = 120
 _HELD_OUT_SHARE = 0.2
-# With fewer than these the residuals cannot tell one model from another.
-_MIN_HELD_OUT = 40
+_MIN_HELD_OUT = 40  # with fewer than these the residuals cannot tell one model from another
 # By how much what can take up errors of other inputs, such as a clock offset, must predict better than what
 # does without.
 _SURE_STANDARD_ERRORS = 3.0

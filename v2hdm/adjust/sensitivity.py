@@ -23,8 +23,7 @@ _STEP = 1e-3
 STRETCHES = 24
 """Stretches that the route is divided into: several metres each, longer than most errors go together."""
 
-_DRAWS = 16
-"""Draws of the model's own noise: what the stretches would disagree by is known to a tenth."""
+_DRAWS = 16  # draws of the model's own noise: what the stretches would disagree by is known to a tenth
 
 Rows = dict[str, Tensor]
 """Whitened residuals, or their derivatives by one number, by kind: ``observations`` (2, K), and the priors'

@@ -22,8 +22,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
-TIP = -1
-"""The row of the tiles that border the others, and row and column of the last one."""
+TIP = -1  # the row of the tiles that border the others, and row and column of the last one
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ VerdictArray = NDArray[np.int8]
 
 # The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
 _MEDIAN_SQUARED = 2 * float(np.log(2))
-# Observations that are judged at once.
-_ROWS = 1 << 18
+_ROWS = 1 << 18  # observations that are judged at once
 
 
 class Verdict(IntEnum):

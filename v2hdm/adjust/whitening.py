@@ -28,8 +28,7 @@ from v2hdm.adjust.reduced import Coupled, Plan, ReducedSystem, Spread, from_tile
 from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.errors import AdjustError
 
-# Below this a pivot is what rounding left of zero.
-SINGULAR_PIVOT = 1e-13
+SINGULAR_PIVOT = 1e-13  # below this a pivot is what rounding left of zero
 # What is added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any.
 # A pivot is what elimination has left of it, and where that is rounding it says nothing of the size needed.
 JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)

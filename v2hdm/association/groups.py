@@ -26,8 +26,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
 
-LEAST_TOLERANCE_M = 0.05
-"""How far corners of one shape may deviate, m, however small the marking is."""
+LEAST_TOLERANCE_M = 0.05  # how far corners of one shape may deviate, m, however small the marking is
 
 _CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
 _HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls

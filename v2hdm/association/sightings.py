@@ -13,8 +13,7 @@ from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
 
-LEAST_HEIGHT_M = 0.1
-"""Least height of a camera, m, for what divides by it."""
+LEAST_HEIGHT_M = 0.1  # least height of a camera, m, for what divides by it
 
 
 @dataclass(frozen=True)

@@ -64,8 +64,7 @@ CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "sy
 median; log odds of paint; the network's shares of the quadrilateral's own class, lane lines and symbols;
 whether it is outside the image."""
 
-SIZE = 20
-"""Rows and columns of a picture."""
+SIZE = 20  # rows and columns of a picture
 
 _AROUND = 0.6
 _BEFORE, _BESIDE = 0.3, 1.0
@@ -227,8 +226,7 @@ its line after a gap; 0 for other classes.
 AMONG = ("alone", *COMPANY)
 """The features of a reading among others: its own log odds, and the company of the others."""
 
-SHAPES = (DIAMOND, LANE_DASH, "bar")
-"""Diamonds, lane dashes, and whatever else has four corners."""
+SHAPES = (DIAMOND, LANE_DASH, "bar")  # diamonds, lane dashes, and whatever else has four corners
 
 COMPANIES = (STOP_LINE, *SHAPES)
 """Whose company is weighed apart: the bars of a crosswalk are many and alike, a stop line keeps none."""

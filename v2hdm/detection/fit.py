@@ -34,8 +34,7 @@ from v2hdm.detection.patch import LensFrames, Patches
 from v2hdm.geometry.quadrilateral import Quad, following, is_convex_px
 from v2hdm.records import BoolArray, FloatArray
 
-TYPICAL_BLUR_PX = 0.75
-"""Point spread of a focused camera, px, pixel aperture included."""
+TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture included
 
 _BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
 _BLUR_LIMITS_PX = (0.35, 3.0)
@@ -51,9 +50,8 @@ _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
 Stencils are true to 5 mm; a guess of the mounting that is 2 degrees off makes 3 % of a parallelogram.
 """
 
+# Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the paint.
 _BLOOM, _MUCH_CLIPPED = 1.2, 0.15
-"""Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the
-paint."""
 
 _MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
 """A fit that moves its middle by more of its size, or grows or shrinks by more, follows something else."""
@@ -72,9 +70,8 @@ _MOST_CONTRAST = 4.0  # log contrast of white paint on the blackest ground
 _LIGHT_STEP = 0.4
 """By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
 
+# Least scatter at the first step of search and fit, halved at each: the next may explain what one rejects.
 _WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1
-"""Least scatter at the first step of search and fit, halved at each: the next may explain what one
-rejects."""
 
 _MODEL_SIGMA_PX = 0.04
 """Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's

@@ -30,8 +30,7 @@ from v2hdm.detection.patch import LensFrames, Patches
 from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-KNOTS = 6
-"""Knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs."""
+KNOTS = 6  # knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs
 
 _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0

@@ -30,9 +30,8 @@ _LEAST_EDGE_PX, _EDGE_SIGMA_PX = 6.0, 0.45
 """Least length of a paint's edge, and the standard deviation of its ends, in elements of the paint."""
 
 _FLAT = 0.12  # edges that rise less than this are of stop lines and of shadows across the road
+# Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is known.
 _PARALLEL_SIGMA_RAD = 0.015
-"""Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is
-known."""
 
 _SHARE = 0.4  # share of the lines that keep to the road: kerbs, arrows, letters and façades need not
 _POINT_SIGMA_PX = 1.5  # a vanishing point is a point to no more than this

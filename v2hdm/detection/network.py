@@ -24,8 +24,7 @@ from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.io.safe.texts import parse_json
 from v2hdm.records import SEEN_ACROSS, FloatArray
 
-METADATA_KEY = "v2hdm"
-"""Key of the file's ``metadata_props`` that holds its label, as JSON."""
+METADATA_KEY = "v2hdm"  # key of the file's ``metadata_props`` that holds its label, as JSON
 
 _OUTPUTS = ["paint", "kinds", "lanes"]
 

@@ -62,8 +62,7 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     return geodetic
 
 
-LOCAL = "local"
-"""The name of the map's own frame where a coordinate system is asked for."""
+LOCAL = "local"  # the name of the map's own frame where a coordinate system is asked for
 
 _GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # .1 mm on the ground
 _BESIDE_DEG = 1.0  # surveyors use a zone's grid a little beyond its edges

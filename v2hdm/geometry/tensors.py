@@ -16,8 +16,7 @@ from torch import Tensor
 
 from v2hdm.records import CameraInfo
 
-NEAR_M = 0.1
-"""Depth below which :func:`inverse_depth` leaves 1 / z: nothing a vehicle maps is that close."""
+NEAR_M = 0.1  # depth below which :func:`inverse_depth` leaves 1 / z: nothing a vehicle maps is that close
 
 
 def inverse_depth(depth_m: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,17 +13,14 @@ from v2hdm.association.sightings import Sightings
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import Camera, FloatArray
 
-_ENDS = 60
-"""Places along a session where a stretch may begin or end."""
+_ENDS = 60  # places along a session where a stretch may begin or end
 
 _PSEUDO_VIEWS = 2.0
 """Views that the drive's share of found markings counts for in that of one: some are worn or half hidden."""
 
-_BY_MISTAKE = 0.05
-"""Share of its views in which a marking of one place is taken for one of the other."""
+_BY_MISTAKE = 0.05  # share of its views in which a marking of one place is taken for one of the other
 
-_CONFUSED = 0.3
-"""Share of the markings that are a mixture of two, one of either place."""
+_CONFUSED = 0.3  # share of the markings that are a mixture of two, one of either place
 
 _HIDDEN = 0.08
 """Share of the markings that a vehicle or a post hides in some of their views, one after the other: the

@@ -37,16 +37,14 @@ from v2hdm.site.options import LaneOptions
 
 _log = logging.getLogger(__name__)
 
-_SPACING_M = 2.0
-"""Distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle."""
+_SPACING_M = 2.0  # distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle
 
 _HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
 _OPEN_END_PX = 1000.0  # sigma along the line of where an image shows it: anywhere
 _SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
 
-_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-"""Directions (N, 2) times it are turned to their left."""
+_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # directions (N, 2) times it are turned to their left
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,11 @@ from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
 BATCH = "batch"
 INCREMENTAL = "incremental"
 AUTO = "auto"
-MODES = (BATCH, INCREMENTAL)
-"""Values of ``mapping.mode``."""
+MODES = (BATCH, INCREMENTAL)  # values of ``mapping.mode``
 
 PLANE = "plane"
 SURFACE = "surface"
-GROUNDS = (PLANE, SURFACE, AUTO)
-"""Values of ``mapping.ground``."""
+GROUNDS = (PLANE, SURFACE, AUTO)  # values of ``mapping.ground``
 
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """Values of ``mapping.pose_model``: the models of :data:`v2hdm.adjust.MODELS`, or ``auto``."""

@@ -42,8 +42,7 @@ CLEAR_SIGMAS = 4.0
 _PRIOR_ODDS = 1 / 400
 """That an input is wrong: one drive in ten of a new vehicle, say, has a wrong one of forty."""
 
-_DOUBT = 0.05
-"""Probability of a wrong input that a PASS leaves, which speaks of 95 %."""
+_DOUBT = 0.05  # probability of a wrong input that a PASS leaves, which speaks of 95 %
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 _UNSEEN_M2 = 1e4
 """Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
 
+# Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too small.
 CORRELATION = 0.2
-"""Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
-small."""
 
 _KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
 

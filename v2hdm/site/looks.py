@@ -27,8 +27,7 @@ from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 
-Grey = Callable[[int], NDArray[np.float32]]
-"""The grey values (H, W) of an image, by its number in the drive."""
+Grey = Callable[[int], NDArray[np.float32]]  # the grey values (H, W) of an image, by its number in the drive
 
 _INSIDE = np.linspace(0.2, 0.8, 7)
 """Where along either side an outline's inside is sampled: off its edges, which a pose's error blurs."""

@@ -24,8 +24,7 @@ _UNKNOWN_SIGMA_M = 0.02
 
 _LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
 
-SHIFT = np.tile(np.eye(2), (4, 1))
-"""How the stacked corners (8,) move with a shift (2,)."""
+SHIFT = np.tile(np.eye(2), (4, 1))  # how the stacked corners (8,) move with a shift (2,)
 
 
 @dataclass(frozen=True)

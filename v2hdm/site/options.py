@@ -22,8 +22,7 @@ class AcceptanceOptions:
     corrections: list[Correction] = field(default_factory=list)
 
 
-AFTER, JOINT = "after", "joint"
-"""Values of ``mapping.lanes.model``."""
+AFTER, JOINT = "after", "joint"  # values of ``mapping.lanes.model``
 
 
 @dataclass(kw_only=True)

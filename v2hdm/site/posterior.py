@@ -84,8 +84,7 @@ _CLUTTER_REPEATS = 0.7  # probability that clutter which some images have shown 
 _AGREEING = (0.93, 0.6)
 """Share of the observations of a marking, and of clutter, that agree with the joint solution."""
 
-CORNERS_OF_IMAGE = 4.0
-"""Observations that err together: those of one image."""
+CORNERS_OF_IMAGE = 4.0  # observations that err together: those of one image
 
 _UNDER_SYMBOL = (0.02, 0.5)
 """Share of the images of a marking, and of part of a symbol, in which a symbol lies on it.

@@ -35,8 +35,7 @@ _VIEWS = (2, 6)  # fewest and most images of a marking: the errors of more repea
 _GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
 """Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
 
-_INDEPENDENT = 12.0
-"""Cells that count as independent: flakes, stains and the blur of images span many."""
+_INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the blur of images span many
 
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
 _ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part

@@ -24,8 +24,7 @@ from v2hdm.detection.camera import Horizon, RoadCamera
 from v2hdm.detection.network import AnchorRow, NetworkOutput
 from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 
-NEIGHBOURS = 3.0
-"""Points of one line err together: that many are worth as much as one."""
+NEIGHBOURS = 3.0  # points of one line err together: that many are worth as much as one
 
 _MODEL_SIGMA_M = 0.02  # by how much painted lines leave the curve
 

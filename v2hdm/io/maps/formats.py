@@ -132,8 +132,7 @@ class Format:
     needs: str | None = None
     takes_crs: bool = True
     states_verdict: bool = False
-    metres: str = ""
-    """The format's name where it holds nothing but metres."""
+    metres: str = ""  # the format's name where it holds nothing but metres
 
 
 FORMATS: Mapping[str, Format] = {

@@ -26,8 +26,7 @@ _FASTEST_MPS = 40.0  # no vehicle maps markings faster (144 km/h): its images wo
 _HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
 # A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance.
 _EXTREME = 12.0
-# Stamps that scatter less are as good as a drive needs them.
-_LEAST_JITTER_MS = 5.0
+_LEAST_JITTER_MS = 5.0  # stamps that scatter less are as good as a drive needs them
 # Four standard errors of the logarithm of a ratio of two robust sigmas of one offset: half the offsets count,
 # as neighbours share poses, and a median absolute deviation is worth .37 of a standard deviation.
 _SURE_JITTER = 4 / (0.5 * 0.37) ** 0.5

@@ -54,8 +54,7 @@ _REJECTED_LIMIT = 0.06
 _VARIANCE_LIMIT = 3.0
 # Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
 _POSE_NOISE_LIMIT = 3.0
-# Log odds from which a cause is named that no score test looks for.
-_ODDS_LIMIT = CLEAR_SIGMAS**2 / 2
+_ODDS_LIMIT = CLEAR_SIGMAS**2 / 2  # log odds from which a cause is named that no score test looks for
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
 _LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
@@ -106,8 +105,7 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
 # How an input was corrected, where it was not just left out.
 _CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no known size was used"}
 
-# Faults that a constant clock offset may stand for.
-_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)
+_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
 
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))

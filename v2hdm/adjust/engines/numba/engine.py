@@ -27,8 +27,7 @@ from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-# Ranges of columns that threads take in turn.
-_COLUMN_RANGES = 8
+_COLUMN_RANGES = 8  # ranges of columns that threads take in turn
 # Multiplications of a factorisation above which other orders of elimination are tried, and the share of
 # them from which another order pays.
 _WORTH_ANOTHER_ORDER = 1e9

@@ -10,8 +10,7 @@ from functools import lru_cache
 
 import torch
 
-# Below this many observations starting threads costs more than they save.
-_WORTH_THREADS = 50_000
+_WORTH_THREADS = 50_000  # below this many observations starting threads costs more than they save
 
 _granted: int | None = None
 
