@@ -69,7 +69,6 @@ _LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell
 _MOST_RECORDED = 500  # places of the path whose records are taken, evenly
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
 
-
 FILE = "ground.json"  # in a result folder
 
 _STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")

@@ -87,7 +87,6 @@ _STEEP_SINE = 0.15
 _LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
-
 _GROUND_ROUNDS = 6  # solves over better and better ground, at most: four are enough for a crown of 4 %
 
 _LANE_ROUNDS = 3

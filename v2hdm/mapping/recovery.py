@@ -38,7 +38,6 @@ _log = logging.getLogger(__name__)
 CLEAR_SIGMAS = 4.0
 """An error of so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
 
-
 _PRIOR_ODDS = 1 / 400
 """That an input is wrong: one drive in ten of a new vehicle, say, has a wrong one of forty."""
 
@@ -96,7 +95,6 @@ _CENTRE_OBSERVABLE_M = 0.1
 
 _MOST_CORRECTIONS = 4
 """Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
-
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
 """Faults that bend what a plane looks like: one that a surface leaves is the likelier cause."""

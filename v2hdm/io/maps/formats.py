@@ -146,7 +146,6 @@ FORMATS: Mapping[str, Format] = {
     "landxml": Format("{name}.xml", write_landxml, metres="LandXML"),
 }
 
-
 GROUND_FORMATS: Mapping[str, Format] = {
     "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio", takes_crs=False),
     "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg", takes_crs=False),

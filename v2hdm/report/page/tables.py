@@ -74,7 +74,6 @@ def _plain(value: object) -> str:
 
 _LEAST_FOR_SHARE = 20  # corners from which a share of them is stated
 
-
 _Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
 
 

@@ -22,7 +22,6 @@ IMAGE_KINDS = (RAW, COMPRESSED)
 
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
-
 # Channels, and OpenCV's conversion to BGR.
 _ENCODINGS: Mapping[str, tuple[int, int | None]] = {
     "mono8": (1, None),
