@@ -18,8 +18,7 @@ from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread
 from v2hdm.records import BoolArray, FloatArray
 
-WEIGHT_FLOOR = 1e-6
-"""Least weight of an observation in the Hessian: a corner of outliers alone stays factorable."""
+WEIGHT_FLOOR = 1e-6  # least weight of an observation in the Hessian: a corner of outliers stays factorable
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_NEAR_M = 10_000.0
-"""Coordinates of this size are known to a picometre, and moving them would cost memory for nothing."""
+_NEAR_M = 10_000.0  # coordinates of this size are known to a picometre; moving them would only cost memory
 
 
 def nearby_origin(problem: Problem) -> FloatArray:

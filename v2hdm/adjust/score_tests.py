@@ -36,8 +36,7 @@ from v2hdm.adjust.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray
 
-_LEAST_OBSERVABLE = 1e-9
-"""Share of a fault's own information, left by all else, below which rounding alone is left of it."""
+_LEAST_OBSERVABLE = 1e-9  # share of a fault's own information, left by all else, below which it is rounding
 
 _LEAST_P = 1e-300  # below it a p-value is zero for floating-point numbers
 
@@ -55,8 +54,7 @@ _LEAST_SPEED_MPS = 0.5  # below it a vehicle has no course
 
 _LAGS = 1  # neighbours of a stretch that err along with it
 
-_PRIOR_FREEDOM = 15.0
-"""Degrees of freedom that the usual disagreement of a drive's stretches counts for in each test."""
+_PRIOR_FREEDOM = 15.0  # degrees of freedom that the usual disagreement of stretches counts for in each test
 
 
 class Fault(Enum):

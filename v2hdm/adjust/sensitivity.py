@@ -17,11 +17,9 @@ from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray
 
-_STEP = 1e-3
-"""Step of the priors' central differences, in the unit of the fault (s or rad): millimetres of motion."""
+_STEP = 1e-3  # step of the priors' central differences, in the fault's unit (s or rad): millimetres of motion
 
-STRETCHES = 24
-"""Stretches that the route is divided into: several metres each, longer than most errors go together."""
+STRETCHES = 24  # stretches that the route is divided into: metres each, longer than most errors go together
 
 _DRAWS = 16  # draws of the model's own noise: what the stretches would disagree by is known to a tenth
 

@@ -23,8 +23,7 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
 from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
 
-_HORIZON_M2 = 1e4
-"""Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2."""
+_HORIZON_M2 = 1e4  # variance of a ground point, in its better direction, from which it is on the horizon, m^2
 
 OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the edge of paint, px: measured on renders, where it is 1 to 3."""

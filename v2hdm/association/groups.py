@@ -31,8 +31,7 @@ LEAST_TOLERANCE_M = 0.05  # how far corners of one shape may deviate, m, however
 _CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
 _HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls
 
-_OPEN_END_M = 10.0
-"""Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
+_OPEN_END_M = 10.0  # sigma, m, of where along its side a corner is that is no point: markings may be so long
 
 
 @dataclass(frozen=True)
@@ -235,8 +234,7 @@ def _mean_covariance(fused: FusedGroups, groups: IntArray) -> FloatArray:
     return np.asarray(covariance.sum(axis=1) / np.maximum(valid.sum(axis=1), 1))
 
 
-_REACH_M = 4.0
-"""How far, m, the middle of a sighting may be from the centre of its marking: dashes are up to 6 m long."""
+_REACH_M = 4.0  # how far, m, a sighting's middle may be from its marking's centre: dashes are up to 6 m long
 
 _MOST_SQUARED = 16.0
 """Squared distance, in sigmas, up to which a sighting fits: four corners on lines have as many freedoms."""

@@ -45,8 +45,7 @@ _SLOPE_SIGMA = 0.03
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
 _HINGES = 1 + 2 * len(KNOTS_M)
-_ALONG_M, _ACROSS_M = 6.0, 5.0
-"""Between knots of the spline: a third of a camera's reach, and a lane with its margins."""
+_ALONG_M, _ACROSS_M = 6.0, 5.0  # between the spline's knots: a third of a camera's reach, a lane with margins
 
 _GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and how far to either side it goes
 _SIDE_M = 10.0  # ground farther beside the path is as high as there, but for the cross-section
@@ -54,8 +53,7 @@ _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
 _WHEELS_M = (1.4, 0.8)  # half of wheelbase and track, over which the slope is the vehicle's
 
-_CURVATURE = 1e-3
-"""Usual size of the second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m."""
+_CURVATURE = 1e-3  # usual second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
 
 _STATION_M = 1.0  # nearer frames are one place of the path: a vehicle that stands drives none in its noise

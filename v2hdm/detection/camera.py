@@ -24,8 +24,7 @@ from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camer
 _LUT_STEP_PX = 4
 _HORIZON_MARGIN_PX = 16
 
-FARTHEST_M = 60.0
-"""Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
+FARTHEST_M = 60.0  # neither markings nor lines are looked for beyond: networks are shown none beyond 50 m
 
 _SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
@@ -37,8 +36,7 @@ ASIDE_RAD = np.deg2rad(60)
 
 _LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
 
-_CURVE_UNIT_PX = 100.0
-"""Unit of the distance below the horizon in the basis of lanes' curves: their parameters are alike."""
+_CURVE_UNIT_PX = 100.0  # unit of the distance below the horizon in lanes' curves: their parameters are alike
 
 _PROBE_PX = 50.0
 

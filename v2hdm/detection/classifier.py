@@ -223,8 +223,7 @@ many are not, and how probable is the surest. Of dashes also: how probable is th
 its line after a gap; 0 for other classes.
 """
 
-AMONG = ("alone", *COMPANY)
-"""The features of a reading among others: its own log odds, and the company of the others."""
+AMONG = ("alone", *COMPANY)  # features of a reading among others: its own log odds, and their company
 
 SHAPES = (DIAMOND, LANE_DASH, "bar")  # diamonds, lane dashes, and whatever else has four corners
 
@@ -239,8 +238,7 @@ _BEND_RADIUS_M = 20.0  # and by the angle that a bend of this radius turns by be
 _MOST = 3.0  # more company than this adds nothing
 _APART_M = 0.3  # nearer quadrilaterals are readings of the same paint
 _LEAST_GAP = 0.5
-_LONGEST_GAP_M = 15.0
-"""Dashes of a line are at least so many times their own length apart, and at most so far."""
+_LONGEST_GAP_M = 15.0  # dashes of a line are at least so many of their lengths apart, and at most so far
 
 _BESIDE_M = 0.3
 _BESIDE_SHARE = 0.02

@@ -41,8 +41,7 @@ _BLUR_LIMITS_PX = (0.35, 3.0)
 _SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
 """Blur of the first steps, in distances of the grid's points and px: a wide one sees sides from far away."""
 
-_SEARCH_SIGMA = 0.1
-"""How far the network's outline is from the end of a side before the search, in lengths of the marking."""
+_SEARCH_SIGMA = 0.1  # how far the network's outline is from a side's end before the search, marking lengths
 
 _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
 """Standard deviation of the sum of opposite corners, in parts of the root of the area and at least in m.
@@ -60,15 +59,13 @@ _OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
 
 OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
-_BEYOND_PX = 6.0
-"""How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
+_BEYOND_PX = 6.0  # how far beyond the border a side that it cuts is started, px: farther than blur reaches
 
 _CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
 """Log contrast of paint over ground, as measured on asphalt, widened for worn and for fresh paint."""
 
 _MOST_CONTRAST = 4.0  # log contrast of white paint on the blackest ground
-_LIGHT_STEP = 0.4
-"""By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
+_LIGHT_STEP = 0.4  # by how much the log light differs between knots: a shadow's border is a few of that
 
 # Least scatter at the first step of search and fit, halved at each: the next may explain what one rejects.
 _WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1

@@ -43,11 +43,9 @@ _MOST_ENDS = 1 / 3
 """Ends of at most this share of the length make a quadrilateral slim; they reach that far past corners."""
 
 _SEARCH_ALONG, _SEARCH_ACROSS = 40, 12  # rows and columns of the coarse grid on which a fit begins
-_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
-"""How far it reaches beyond a quadrilateral, in its lengths and widths."""
+_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4  # how far it reaches beyond a quadrilateral, in lengths and widths
 
-_GREY_FIRST = 1.2
-"""By how many times clearer red or blue must be for grey to be left: grey has the least noise."""
+_GREY_FIRST = 1.2  # how many times clearer red or blue must be for grey to be left: it has the least noise
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from v2hdm.records import BoolArray, FloatArray
 
 _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)  # weights of ITU-R BT.601
 _CLIPPED = 250  # codes from here on are those of a sensor at its limit, noise and white balance allowed for
-_DARK = 0.01
-"""Added to radiance before taking logarithms: in shade a step is as large as in the sun, noise is not."""
+_DARK = 0.01  # added to radiance before logarithms: in shade a step is as large as in the sun, noise is not
 
 _CODED = np.arange(256) / 255
 _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)

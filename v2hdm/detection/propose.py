@@ -59,8 +59,7 @@ Shares of 39 arrows and 62 lines of 24 px and more, on photographs.
 """
 
 _LEAST_FILL = 0.5  # least share of a quadrilateral that its piece of paint fills: a triangle fills half
-_BORDER_PX = 3.0
-"""A side this near to the image's border is cut by it: the network's outline is coarser than this."""
+_BORDER_PX = 3.0  # a side this near to the image's border is cut by it: outlines are coarser than this
 
 
 @dataclass(frozen=True)

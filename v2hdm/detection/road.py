@@ -42,8 +42,7 @@ from v2hdm.records import (
     MarkingDetection,
 )
 
-_LANE_SIGMA_PX = 1.0
-"""Standard deviation of a point of a lane's paint; points of whole lines have a sigma of their own."""
+_LANE_SIGMA_PX = 1.0  # standard deviation of a point of a lane's paint; points of whole lines have their own
 
 _PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
 

@@ -20,8 +20,7 @@ from v2hdm.records import FloatArray
 X = TypeVar("X")
 N = TypeVar("N", bound="Normal")
 
-_RANK = 1e-12
-"""Relative size below which an eigenvalue of the scaled information is rounding: nothing observes it."""
+_RANK = 1e-12  # relative size below which an eigenvalue of the scaled information is rounding
 
 _GIVE_UP = 1e8  # damping from which a cost that still grows is at its minimum but for rounding
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from v2hdm.records import FloatArray
 
-SERIES_TERMS = 15
-"""Terms of the power series of theta^2, enough for float64 up to theta = pi: pi^(2 * 15) / 31! < 1e-18."""
+SERIES_TERMS = 15  # terms of the power series of theta^2: for float64, up to pi, as pi^(2 * 15) / 31! < 1e-18
 
 EXP_SERIES = tuple(tuple(1 / factorial(2 * n + offset) for offset in (1, 2, 3)) for n in range(SERIES_TERMS))
 """Coefficients (terms, 3) of (-theta^2)^n in sin(theta) / theta, (1 - cos(theta)) / theta^2 and

@@ -81,19 +81,16 @@ _log = logging.getLogger(__name__)
 _SETTLED_MODEL = "heave"
 """Pose model of the solves between which associations still change: it leaves no error of a pose out."""
 
-_STEEP_SINE = 0.15
-"""Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
+_STEEP_SINE = 0.15  # sine of a ray's depression from which the coarse stage uses it, unless most are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 _GROUND_ROUNDS = 6  # solves over better and better ground, at most: four are enough for a crown of 4 %
 
-_LANE_ROUNDS = 3
-"""Solves with lanes: the stated variance of their points may be thirty times as large as the true one."""
+_LANE_ROUNDS = 3  # solves with lanes: the stated variance of points may be thirty times the true one
 
-_SETTLED_M = 2e-3
-"""Change of the heights that are seen, root mean square, from which on the ground is settled."""
+_SETTLED_M = 2e-3  # change of the seen heights, root mean square, from which on the ground is settled
 
 
 def silent(step: str) -> None:

@@ -35,11 +35,9 @@ from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
-CLEAR_SIGMAS = 4.0
-"""An error of so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
+CLEAR_SIGMAS = 4.0  # an error so large is seen; in one of 400 right drives one of its forty tests exceeds it
 
-_PRIOR_ODDS = 1 / 400
-"""That an input is wrong: one drive in ten of a new vehicle, say, has a wrong one of forty."""
+_PRIOR_ODDS = 1 / 400  # that an input is wrong: one drive in ten of a new vehicle has a wrong one of forty
 
 _DOUBT = 0.05  # probability of a wrong input that a PASS leaves, which speaks of 95 %
 
@@ -84,17 +82,14 @@ _AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_OBSERVABLE_S = 0.004
-"""Sigma of a clock offset, s, up to which a drive observes it: two of them are 8 ms."""
+CLOCK_OBSERVABLE_S = 0.004  # sigma of a clock offset, s, up to which a drive observes it: two are 8 ms
 
 _CLOCK_CORRECTABLE_S = 0.006
 """Sigma, s, up to which a contradicted clock is put right: a late clock scatters what tells of it."""
 
-_CENTRE_OBSERVABLE_M = 0.1
-"""Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
+_CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, from which a drive needs its survey: it moves the map
 
-_MOST_CORRECTIONS = 4
-"""Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
+_MOST_CORRECTIONS = 4  # inputs that may be dropped one by one; with more of them wrong nothing is reliable
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
 """Faults that bend what a plane looks like: one that a surface leaves is the likelier cause."""

@@ -12,8 +12,7 @@ from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.quadrilateral import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_UNSEEN_M2 = 1e4
-"""Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
+_UNSEEN_M2 = 1e4  # variance of a corner that was not seen, m^2: infinite beside the size of a site
 
 # Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too small.
 CORRELATION = 0.2
@@ -134,8 +133,7 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: Floa
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
 
 
-_LARGEST = 1e9
-"""Variance of residuals, in squared sigmas, beyond which (and below whose inverse) all are alike."""
+_LARGEST = 1e9  # variance of residuals, squared sigmas, beyond which (and below whose inverse) all are alike
 
 _PRIOR_FREEDOM = (1.0, 1e4)
 """Between these is the freedom of the prior of a variance: from tails as heavy as Cauchy's to none."""

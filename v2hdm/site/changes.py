@@ -87,14 +87,11 @@ def fused_markings(
     return by_old, by_new
 
 
-_DRIFT_OVER_M = 30.0
-"""Distance over which the error that a map's markings share fades, m, where the map does not say."""
+_DRIFT_OVER_M = 30.0  # distance over which the error that markings share fades, m, where the map does not say
 
-_LIKELY = 0.5
-"""Probability from which a marking is reported as moved, gone or new paint: the likelier of the two."""
+_LIKELY = 0.5  # probability from which a marking is reported as moved, gone or new: the likelier of two
 
-_LEAST_PAIRED = 0.3
-"""Share of the markings that a drive looked at which it finds again at least, if the site is the same."""
+_LEAST_PAIRED = 0.3  # least share of the markings looked at that a drive finds again, if the site is the same
 
 _LOOKED = 3  # easy views from which a drive has looked at a place for that share
 

@@ -13,8 +13,7 @@ from v2hdm.records import Exclusion, FloatArray, HdMap, IntArray
 from v2hdm.site.candidates import Candidates
 
 _SAME_M = 0.4  # how far the middle of a candidate may be from that which a person saw, m
-MAX_OVERLAP = 0.2
-"""Share of the smaller one's area from which two outlines are of the same paint: markings never overlap."""
+MAX_OVERLAP = 0.2  # share of the smaller area from which two outlines are of one paint: none overlap
 
 
 @dataclass(frozen=True)

@@ -22,16 +22,14 @@ from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions
 
-_MOVED_SIGMA_M = 0.5
-"""Sigma of how far a marking is painted from where it was, m a coordinate: a new line of the same bay."""
+_MOVED_SIGMA_M = 0.5  # sigma of how far a marking is painted from its old place, m a coordinate: a new line
 
 _TURNED_SIGMA_RAD = 0.2  # sigma of how far it is turned then, rad
 _REACH_M = 4 * _MOVED_SIGMA_M  # markings farther apart are never one, m
 _OTHER_SHAPE_M = 0.1
 """Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
 
-_MISREAD_M = 0.3
-"""Sigma of an end or corner that one of two drives has taken from another edge, m, as in the site model."""
+_MISREAD_M = 0.3  # sigma of an end or corner that one of two drives took from another edge, m
 
 _MISREAD_SHARE = 0.05  # share of markings of which one of two drives has misread an end or a corner
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])

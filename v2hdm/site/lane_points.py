@@ -33,15 +33,12 @@ from v2hdm.records import (
 NODE_SPACING_M = 0.5  # between the vertices of a polyline
 HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # across and along a line, of the neighbourhood that is averaged
 
-CENTRE_SIGMA_PX = 1.0
-"""Noise of a detected centre point across its line: about a cell of the network's output."""
+CENTRE_SIGMA_PX = 1.0  # noise of a detected centre point across its line: a cell of the network's output
 
-OWN_SIGMA_M = 0.01
-"""Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
+OWN_SIGMA_M = 0.01  # sigma of a point beyond its pixel's, m: the nearest image must not outvote all others
 
 _TANGENT_REACH = 2  # points to either side whose difference gives a point's direction
-_GUIDE_RANGE = 1.8
-"""Whole lines are followed so many times farther than paint is mapped: they only say what is one line."""
+_GUIDE_RANGE = 1.8  # whole lines are followed so many times farther than paint: they only say what is one
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,9 @@ _MOST_LEARNED = 40  # markings of a drive that its paint and its ground are lear
 _ASIDE_M = 1.3  # how far beside a marking bare ground is looked for, m
 _CLEAR_M = 1.0  # distance from all known paint that makes ground bare, m
 _LEAST_LEARNED = 8  # places from which the drive's own paint or ground is known; with fewer nothing is said
-_HIDDEN_SIGMA = 0.5
-"""Sigma of the contrast, log ratio of grey values, of whatever else stands before the ground."""
+_HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of whatever else hides the ground
 
-_HIDDEN_SHARE = 0.5
-"""Share of the markings which are there and not found that are hidden; the others are worn."""
+_HIDDEN_SHARE = 0.5  # share of the markings there and not found that are hidden; the others are worn
 
 _STRANGE_SHARE = 0.05  # share of bare places that are not: a stain, the edge of a shadow
 _LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
@@ -117,12 +115,10 @@ def _robust(values: FloatArray) -> tuple[float, float]:
 _MOST_SQUARED = 25.0
 """Squared distance of a sighting's corners from a place, in sigmas, up to which it shows what is there."""
 
-_NEAR_M = 12.0
-"""Distance from the camera, m, within which markings are found at about one rate, as those of a map say."""
+_NEAR_M = 12.0  # distance from the camera, m, within which markings are found at about one rate
 
 _SAME_PLACE_M = 0.05  # a marking that has one of its class nearer than this is there, m
-_REACH_M = 2.0
-"""How far the middle of a sighting may be from a place's centre, m: of a dash one may see an end only."""
+_REACH_M = 2.0  # how far a sighting's middle may be from a place's centre, m: one may see a dash's end only
 
 
 @dataclass(frozen=True)

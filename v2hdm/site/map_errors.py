@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
-_UNKNOWN_SIGMA_M = 0.02
-"""Sigma of a corner of a map that states none, m a coordinate: a marking drawn by hand over an image."""
+_UNKNOWN_SIGMA_M = 0.02  # sigma of a corner whose map states none, m a coordinate: drawn over an image
 
 _LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
 
@@ -148,8 +147,7 @@ class Shift:
         return gain @ self._weighed.ravel(), (covariance + covariance.T) / 2
 
 
-_SAME_LINE_M = 0.3
-"""Distance of two maps' lines up to which they are one, m: two lines side by side lie twice as far apart."""
+_SAME_LINE_M = 0.3  # distance up to which two maps' lines are one, m: two side by side are twice as far
 
 _LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier line, from which it is that line
 

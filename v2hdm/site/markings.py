@@ -151,8 +151,7 @@ def _covered(found: Posterior, standing: IntArray) -> IntArray:
 JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""
 
-_NEIGHBOUR_M = 10.0
-"""How far apart markings are compared, m: about a vehicle's length, over which it manoeuvres."""
+_NEIGHBOUR_M = 10.0  # how far apart markings are compared, m: a vehicle's length, over which it manoeuvres
 
 _FARTHEST_M = 15.0  # a marking without another one within so many metres has no relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))

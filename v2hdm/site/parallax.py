@@ -26,11 +26,9 @@ NOT_ON_GROUND = "stands above the ground, or moves"
 _ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
 """Mean and sigma of s of what is no marking: half as high as the camera, or moving along with the vehicle."""
 
-_UNEVEN = 0.1
-"""Sigma of s on the ground: a bump of a tenth of the camera's height, or edges fitted worse from afar."""
+_UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poorer fits from afar
 
-_ONE_VIEW_M = 0.1
-"""Way, m, within which images show one view, so that they err alike: the same texture lies along an edge."""
+_ONE_VIEW_M = 0.1  # way, m, within which images show one view and err alike: the same texture by an edge
 
 _POSE_SIGMAS = 4.0  # how far apart, in sigmas, the recorded positions of one place may be
 _LEVEL_RAD = 1e-5  # sigma, rad, of the attitude where it is taken for exact

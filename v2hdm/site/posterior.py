@@ -40,11 +40,9 @@ _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 
 _KINDS = len(_PRIOR_COUNT)
 
-_SIZE_SIGMA_M = 1.0
-"""Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
+_SIZE_SIGMA_M = 1.0  # sigma of a side, m, of a marking of its own size: any paint on a road is within it
 
-_LENGTH_SIGMA_M = 0.3
-"""Sigma, m, of the length of paint rolled by the metre, before the drive says: a tenth of a dash's."""
+_LENGTH_SIGMA_M = 0.3  # sigma, m, of the length of paint by the metre before the drive says: a tenth of it
 
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
@@ -57,14 +55,11 @@ _UNCLEAR_SHARE, _CLEAR_SHARE = 0.05, 0.1
 """Share of the sound ends that are as uncertain as worn ones, being far off, and of the worn ones that all
 images show alike (5 of 229 and 1 of 11 ends there)."""
 
-_MISPLACED_M = 0.3
-"""Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
+_MISPLACED_M = 0.3  # sigma, m, of a worn end or a corner from another edge (17 worn ends: .08 to .74 m)
 
-_WORN_SHARE = 0.5
-"""The same as a share of the length, where a whole stretch is worn away: any part of a marking may be."""
+_WORN_SHARE = 0.5  # the same as a share of the length, where a stretch is worn away: any part may be
 
-_CUT_SHARE = 0.1
-"""Share of the breadth, one sigma, by which a corner of a piece lies off its sides: cuts are not parallel."""
+_CUT_SHARE = 0.1  # share of the breadth, sigma, by which a corner of a piece lies off its sides: cuts slant
 
 _RUN_ON_M = 1.0  # sigma, m, of an end that runs on into other paint: letters and lines are about as long
 
@@ -81,8 +76,7 @@ _BARE_FOUND = (0.05, 10.0)
 
 _CLUTTER_REPEATS = 0.7  # probability that clutter which some images have shown is shown by one more
 
-_AGREEING = (0.93, 0.6)
-"""Share of the observations of a marking, and of clutter, that agree with the joint solution."""
+_AGREEING = (0.93, 0.6)  # share of the observations of a marking, and of clutter, that agree with the solve
 
 CORNERS_OF_IMAGE = 4.0  # observations that err together: those of one image
 
@@ -97,8 +91,7 @@ _ODDS, _ODDS_SIGMA, _ODDS_FREEDOM = (5.0, 2.5), 1.2, 4.0
 port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members' about it (1.0 of the
 diamonds) and their degrees of freedom in Student's t distribution, since worn ones are among them."""
 
-_OTHER_ODDS = (1.5, 1.5)
-"""Mean and sigma of the same of anything else (fourteen candidates of a rendered port)."""
+_OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same of anything else (14 candidates of a rendered port)
 
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 

@@ -29,8 +29,7 @@ from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, FloatArray, IntAr
 
 _DRAWN_STEP_PX = 8.0  # rows of the image from one point of a line to the next, px
 _ENDED, _GAP, _SOLID, _DASH = range(4)
-_DASH_STAGES = 3
-"""Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
+_DASH_STAGES = 3  # stages of a dash: its length is Erlang's distribution, scattered by 58 % of the mean
 
 _STATES = _DASH + _DASH_STAGES
 _DASH_M, _GAP_M = 3.6, 5.1
@@ -51,11 +50,9 @@ _HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
 _ACROSS = np.linspace(-1.0, 1.0, 7)
 """Paint of a line is looked for so far to either side of its curve, at so many places."""
 
-_CROSSING_M = 0.3
-"""Lines that lie so far to the left of another one here and so far to its right there cross it."""
+_CROSSING_M = 0.3  # lines that lie so far left of another one here and so far to its right there cross it
 
-_DOUBLE_M = 0.75
-"""Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
+_DOUBLE_M = 0.75  # lines nearer than this are one boundary: two strands if both show paint abreast, else one
 
 _LEAST_ABREAST_M = 1.0  # both strands of a double line show paint on so much ground abreast
 _ONE_LINE_M = 0.12  # lines nearer to each other than this are one

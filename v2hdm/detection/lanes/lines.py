@@ -131,8 +131,7 @@ LEAST_LOG_ODDS = -0.5
 """Lines less sure are not given. A bound of -1.4 gives .7 points more of TuSimple's accuracy and 40 % more
 false lines on renders."""
 
-_DOUBTFUL = 1.5
-"""Lines by so much in log odds less sure than is asked for alone may be sure enough among the others."""
+_DOUBTFUL = 1.5  # lines so much less sure, in log odds, than is asked for alone may be sure among the others
 
 _SIGMA_PX = (0.4, 2.7)
 """Crossings err by s + t / exp(log odds), in px of the resolution looked at; measured on renders."""

@@ -21,8 +21,7 @@ _POSES = (
     "a log of poses, with the antenna's place, m forward, left, up of the ground under the rear axle: "
     "{nmea: route.nmea, lever_arm_m: [1.2, 0, 1.8]}"
 )
-_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""Least times of this century, by their unit; smaller ones are s."""
+_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # least times of this century, by their unit; smaller: s
 
 
 def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str, str]:
