@@ -12,7 +12,7 @@ from export.config import ExportConfig
 from tests.faults.cases import SIGNED, measures
 from train.config import TrainConfig
 from v2hdm.cli import compose as config
-from v2hdm.cli.keys_help import help_text, keys_of
+from v2hdm.cli.compose import help_text, keys_of
 from v2hdm.cli.main import run
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.config import PortConfig, RunConfig, admit

@@ -24,20 +24,15 @@ CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER = "quadrilateral", "stripe", "line", "symbol", "other"
 FAMILIES = (QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER)
 
-_SOFTNESS = 0.25
-"""Standard deviation of a log size about its range, where the catalogue gives none."""
+_SOFTNESS = 0.25  # standard deviation of a log size about its range, where the catalogue gives none
 
-_TINY_M = 1e-3
-"""Least size that differs from nothing, m."""
+_TINY_M = 1e-3  # least size that differs from nothing, m
 
-NOT_PAINT = "none"
-"""The label of everything that is no marking; no class may have this name."""
+NOT_PAINT = "none"  # the label of everything that is no marking; no class may have this name
 
-_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
-"""Names of classes stand in file formats, log lines and label files."""
+_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")  # names of classes stand in file formats, log lines and label files
 
-_MOST_CLASSES = 254
-"""Labels are bytes: 0 is no paint, 255 is unknown."""
+_MOST_CLASSES = 254  # labels are bytes: 0 is no paint, 255 is unknown
 
 _KEYS = frozenset({"family", "length_m", "width_m", "softness", "group"})
 
@@ -113,11 +108,7 @@ class Catalogue:
         return tuple(name for name, one in self.classes.items() if one.family in families)
 
     def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
-        """This catalogue and a user's classes after it, by name as ``catalogue.yaml`` has them.
-
-        Raises ConfigError, which says ``where`` they come from, where an entry is wrong, or its name is
-        taken.
-        """
+        """This catalogue and a user's classes after it; ConfigError, from ``where``, if one is wrong."""
         taken = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
         for name in entries:
             if not (isinstance(name, str) and _NAME.fullmatch(name)):
@@ -200,5 +191,4 @@ PAINT_CLASSES = SHIPPED.names
 """The classes of the shipped detector, in the order of its class channels. Chevrons are the bars and angles
 that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
 
-CORNERED_CLASSES = SHIPPED.cornered
-"""Shipped classes that are mapped as quadrilaterals by their four corners."""
+CORNERED_CLASSES = SHIPPED.cornered  # shipped classes that are mapped as quadrilaterals by their four corners

@@ -46,10 +46,7 @@ def exactly_inlined(function: _Function) -> _Function:
 
 
 def kernel(function: _Function) -> _Function:
-    """A kernel: compiled at its first call, or read from where an earlier process has left it.
-
-    Where nothing can be kept, or what was kept cannot be read, every process compiles anew.
-    """
+    """A kernel: compiled at its first call, or read from where an earlier process has left it, if it has."""
     return _kept(function, _OPTIONS)
 
 
@@ -88,11 +85,7 @@ def folder_of(module: ModuleType) -> Path | None:
 
 @cache
 def _folder(sources: Path) -> Path | None:
-    """The first of :data:`PLACES` that can be written to, or None.
-
-    The folder is named by the ``sources`` beside the kernel: numba itself sees neither a change in a part of
-    a kernel nor one that leaves a file's size and time as they were, as another wheel's may be.
-    """
+    """The first of :data:`PLACES` that can be written to, or None; by a digest of a kernel's ``sources``."""
     digest = hashlib.sha256(numba.__version__.encode())
     for source in (Path(__file__), *sorted(sources.glob("*.py"))):
         digest.update(source.read_bytes())

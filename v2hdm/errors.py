@@ -5,6 +5,11 @@ wrong, where, and what to do about it. Commands print that line and exit with co
 else that is raised is a bug of ours and keeps its traceback.
 """
 
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
 
 class V2hdmError(Exception):
     """Root of all errors that a user can cause and mend."""
@@ -62,3 +67,15 @@ def one_line(message: str) -> str:
     """A message whose words come from files of strangers: none ends the line or moves the cursor."""
     line = " ".join(message.split())
     return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
+
+
+def need(module: str, extra: str, purpose: str, error: type[V2hdmError]) -> ModuleType:
+    """The optional ``module``, imported; where it is absent, ``error`` names the ``extra`` that brings it."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as missing:
+        if missing.name is None or missing.name.split(".")[0] != module.split(".")[0]:
+            raise
+    raise error(
+        f"{purpose} needs {module.split('.')[0]}: install the {extra} extra, pip install 'v2hdm[{extra}]'"
+    )

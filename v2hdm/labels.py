@@ -31,8 +31,8 @@ from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
-from v2hdm.report.outputs import write_json
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
+from v2hdm.store.files import write_json
 
 FILE = "instances.json"
 RANGE_M = 16.0  # how far from a camera markings are labelled: farther ones need not be in the map
@@ -47,8 +47,7 @@ _DETECTED = np.array([0.98, 0.005, 0.015])  # the same where it was detected
 _FAINT_SHARE, _HIDDEN_SIGMA = 0.1, 0.5
 """Share of the sides that are faint where shown; sigma of the contrast of what stands before them."""
 
-_ALIKE = 0.5
-"""Power of the likelihood of one side: the four of one image err alike."""
+_ALIKE = 0.5  # power of the likelihood of one side: the four of one image err alike
 
 _PAIRS_OF_BIN = 100  # detected sides by which contrasts of one size in the image are learned
 _LEAST_PAIRS = 8  # detected sides below which nothing is said of images without a detection
@@ -61,10 +60,7 @@ _CLEAR_M = 1.0  # radius about a candidate that was left out of which nothing is
 
 @dataclass(frozen=True)
 class _Outline:
-    """One marking or symbol, counter-clockwise, and where paint and ground beside its sides are sampled.
-
-    ``side`` numbers each sample's side, 0 to 3; an outline of more edges has four runs of them.
-    """
+    """One marking or symbol, counter-clockwise, and the samples beside its four sides or runs of edges."""
 
     id: int
     kind: str
@@ -92,10 +88,7 @@ class _Outline:
 
 @dataclass(frozen=True)
 class _View:
-    """One outline in one image: its polygon (N, 2), recorded px, the contrast of each side, nan if unseen.
-
-    ``px_per_m`` is the size of the image of a metre there.
-    """
+    """One outline in one image: its polygon (N, 2), recorded px, and the contrast of each side, or nan."""
 
     outline: int
     image: int
@@ -173,22 +166,12 @@ class _Eye:
 def write_labels(
     folder: Path, drive: Drive, output: Path, range_m: float = RANGE_M, progress: Steps | None = None
 ) -> dict[str, int]:
-    """Write ``instances.json`` (COCO) of a run's map in all images of its drive into the folder ``output``.
+    """Write ``instances.json`` (COCO) of a result's map in all images of its drive into ``output``.
 
-    Args:
-        folder: result of a run.
-        drive: what it has mapped.
-        output: where the file is written; its ``file_name`` entries start from the drive's folder.
-        range_m: how far from a camera markings are labelled.
-        progress: counts images.
-
-    Returns:
-        How many labels are whole and shown ("shown"), of unsure visibility ("unsure"), and how many markings
-        in view are hidden ("hidden").
-
-    Raises:
-        MapFileError: the folder is no result, or its verdict is FAIL.
-        DriveError: an image cannot be read.
+    Its ``file_name`` entries start from the drive's folder; markings are labelled up to ``range_m`` from a
+    camera. Returns how many are whole and shown ("shown"), of unsure visibility ("unsure"), and in view but
+    hidden ("hidden"). Raises MapFileError where the folder is no result or its verdict is FAIL, DriveError
+    where an image cannot be read.
     """
     facts = read_facts(folder, drive)
     status = (facts.metrics.get("verdict") or {}).get("status")
@@ -301,10 +284,7 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
 
 
 def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray, count: int) -> FloatArray:
-    """The contrast of the sides of each outline (count, 4), by the images that it was detected in.
-
-    One that was detected in fewer than three, such as a symbol, takes the median of all images.
-    """
+    """The contrast of sides (count, 4) by the images that an outline was detected in, if three, else all."""
     out = np.full((count, 4), np.nan)
     for number in range(count):
         own = outline == number
@@ -320,10 +300,7 @@ def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray,
 def _expected(
     contrast: FloatArray, own: FloatArray, size: FloatArray, detected: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image.
-
-    Detected sides say it: a far one is blurred. Of too few nothing is known: the sigma is that of anything.
-    """
+    """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image."""
     used = np.isfinite(contrast) & np.isfinite(own) & detected[:, None]
     if used.sum() < _LEAST_PAIRS:
         return own, np.full_like(own, _HIDDEN_SIGMA)

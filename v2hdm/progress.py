@@ -14,7 +14,6 @@ if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
 
 _EVERY_S = 10.0  # between two lines on one task
 
-
 Steps = Callable[[int, int], None]  # called with how many steps of one task are done, and of how many
 
 

@@ -39,28 +39,20 @@ its view."""
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 
-DISTORTION_COEFFICIENTS: Mapping[str, int] = {
-    "plumb_bob": 5,
-    "rational_polynomial": 8,
-    "equidistant": 4,
-}
+DISTORTION_COEFFICIENTS: Mapping[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Distortion models by their ROS ``camera_info`` name, with their number of coefficients."""
 
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """Intrinsics of one camera, as in a ROS ``camera_info``.
-
-    ``intrinsic`` is K (3 x 3, px); ``distortion`` holds the coefficients of ``distortion_model``
-    in OpenCV's order (see :data:`DISTORTION_COEFFICIENTS`).
-    """
+    """Intrinsics of one camera, as in a ROS ``camera_info``."""
 
     name: str
     width: int
     height: int
-    intrinsic: FloatArray
+    intrinsic: FloatArray  # K (3 x 3), px
     distortion_model: str = "plumb_bob"
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # by :data:`DISTORTION_COEFFICIENTS`
 
 
 @dataclass(frozen=True)
@@ -73,27 +65,18 @@ class CentrePrior:
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera of a drive: its intrinsics and what is roughly known of its mounting.
-
-    ``ipm`` maps a name (``calibrated``: from a manual calibration of this vehicle; ``estimated``: borrowed
-    from another one) to a coarse IPM homography ``vehicle_from_pinhole_px`` (3 x 3); the mapping starts from
-    ``initial_ipm``. ``roi_vehicle`` (N x 2, m) is the convex polygon on the ground within which the IPM is
-    trusted. ``linear_response``: grey values are proportional to radiance; otherwise sRGB coding is assumed.
-    ``own_vehicle`` (height, width) says which pixels show the vehicle itself, None if unknown.
-    ``mounting_sigma`` are the standard deviations of its horizon, rad, and of the logarithm of its focal
-    length where these are guessed from its images. ``read_out_s`` is the time from the first row of an image
-    to the last, 0 for a global shutter; an image's stamp is that of its middle row.
-    """
+    """One camera of a drive: its intrinsics and what is roughly known of its mounting."""
 
     info: CameraInfo
+    # ``vehicle_from_pinhole_px`` (3 x 3): ``calibrated``, this vehicle's own, ``estimated``, borrowed
     ipm: Mapping[str, FloatArray]
-    initial_ipm: str
-    roi_vehicle: FloatArray
+    initial_ipm: str  # that the mapping starts from
+    roi_vehicle: FloatArray  # (N, 2) m, convex polygon of ground in which the IPM is trusted
     centre_prior: CentrePrior | None = None
-    linear_response: bool = False
-    own_vehicle: BoolArray | None = None
-    mounting_sigma: tuple[float, float] = (0.0, 0.0)
-    read_out_s: float = 0.0
+    linear_response: bool = False  # grey proportional to radiance, else sRGB
+    own_vehicle: BoolArray | None = None  # (height, width) pixels that show the vehicle
+    mounting_sigma: tuple[float, float] = (0.0, 0.0)  # of a guessed horizon (rad) and log focal length
+    read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps are of the middle row
 
 
 @dataclass(frozen=True)
@@ -177,31 +160,23 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Road:
-    """The recorded ground along the route, which the drive's poses have laid flat into z = 0.
+    """The recorded ground along the route, which the drive's poses have laid flat into z = 0."""
 
-    ``points_map`` (P, 2) m along the route in driving order, the ground's ``height_m`` (P,) and ``slope`` (P,
-    2) by x and y there.
-    """
-
-    points_map: FloatArray
-    height_m: FloatArray
-    slope: FloatArray
+    points_map: FloatArray  # (P, 2) m in driving order
+    height_m: FloatArray  # (P,)
+    slope: FloatArray  # (P, 2) by x and y
 
 
 @dataclass(frozen=True)
 class Image:
-    """One image of a drive and the vehicle's pose (4 x 4) when it was taken.
-
-    ``stamp_s`` is its recorded time, ``clock_offset_s`` how much later it was taken as far as known,
-    ``visit`` an index into ``Drive.visits``.
-    """
+    """One image of a drive."""
 
     camera: str
     stamp_s: float
     path: Path
-    map_from_vehicle: FloatArray
-    clock_offset_s: float = 0.0
-    visit: int = 0
+    map_from_vehicle: FloatArray  # (4, 4) when it was taken
+    clock_offset_s: float = 0.0  # how much later than stamped, as far as known
+    visit: int = 0  # an index into ``Drive.visits``
 
     @property
     def taken_s(self) -> float:
@@ -211,10 +186,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Visit:
-    """One of the drives that a :class:`Drive` was joined of: what is its own, as :class:`Drive` has it.
-
-    ``cameras`` says what the joined drive calls each of its own cameras.
-    """
+    """One of the drives that a :class:`Drive` was joined of; ``cameras`` are by its own names."""
 
     name: str
     root: Path
@@ -227,27 +199,20 @@ class Visit:
 
 @dataclass(frozen=True)
 class Drive:
-    """Everything the mapper may know of a drive; images are sorted by visit, time, then camera.
-
-    ``truth_dir`` only shows the report where ground truth lies. ``trajectory`` holds the poses at the
-    receiver's rate that those of the images were interpolated from, with the road laid flat; ``recorded`` the
-    same as recorded. ``road`` is the recorded ground, None for the plane z = 0. ``unposed`` counts, by
-    camera, the images left out for want of a pose. ``joined`` are the drives that it was made of
-    (:func:`v2hdm.io.drive.join.join_drives`), if any: a joined drive has no trajectory of its own, and the
-    largest of each noise.
-    """
+    """Everything the mapper may know of a drive."""
 
     name: str
     root: Path
     cameras: Mapping[str, Camera]
-    images: Sequence[Image]
+    images: Sequence[Image]  # sorted by visit, time, then camera
     pose_noise: PoseNoise = field(default_factory=PoseNoise)
     origin: GeodeticOrigin | None = None
-    truth_dir: Path | None = None
-    trajectory: Trajectory | None = None
-    recorded: Trajectory | None = None
-    road: Road | None = None
-    unposed: Mapping[str, int] = field(default_factory=dict)
+    truth_dir: Path | None = None  # for the report alone
+    trajectory: Trajectory | None = None  # at the receiver's rate, the road laid flat
+    recorded: Trajectory | None = None  # the same as recorded
+    road: Road | None = None  # as recorded, None for the plane z = 0
+    unposed: Mapping[str, int] = field(default_factory=dict)  # images left out for want of a pose
+    # drives that it was made of, if any: then without trajectory, and of the largest noise
     joined: tuple[Visit, ...] = ()
 
     def name_of(self, path: Path) -> str:
@@ -274,16 +239,13 @@ class Drive:
 
 @dataclass(frozen=True)
 class MarkingDetection:
-    """One quadrilateral marking in one image.
+    """One quadrilateral marking, or symbol, in one image.
 
-    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, which is also how they run on
-    the screen (their shoelace area in (u, v) is negative, since v points down); which comes first is
-    arbitrary. ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is large in a
-    direction that the image hides, as along a dash whose end lies beyond the border. ``corner_valid`` (4,)
-    says which corners are points: known well in every direction.
-
-    Symbols, as arrows and chevrons, are no quadrilaterals: their corners are nan and not valid, and
-    ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals.
+    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, and so on the screen; which
+    comes first is arbitrary. ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is
+    large in a direction that the image hides, as along a dash whose end lies beyond the border.
+    ``corner_valid`` (4,) says which are known well in every direction. Symbols, as arrows and chevrons, have
+    corners of nan, not valid, and a polygon ``outline_px`` (N, 2); it is empty for quadrilaterals.
     """
 
     kind: str
@@ -296,18 +258,13 @@ class MarkingDetection:
 
 @dataclass(frozen=True)
 class LaneDetection:
-    """A centre line in one image: ``points_px`` (N, 2), near to far.
+    """A centre line in one image."""
 
-    ``kind`` is the class of one piece of lane paint, or :data:`LANE_BOUNDARY` for a whole line. The whole
-    lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left, -1, -2, ... to the right.
-    ``sigma_px`` (N,) is each point's standard deviation along its image row, None where it is not known.
-    """
-
-    kind: str
+    kind: str  # of one piece of lane paint, or :data:`LANE_BOUNDARY` for a whole line
     score: float
-    points_px: FloatArray
-    identity: int | None = None
-    sigma_px: FloatArray | None = None
+    points_px: FloatArray  # (N, 2), near to far
+    identity: int | None = None  # of whole lines: 1, 2, ... to the left, -1, -2, ... to the right
+    sigma_px: FloatArray | None = None  # (N,) along the image row
 
 
 @dataclass(frozen=True)
@@ -321,10 +278,7 @@ class ImageDetections:
 
 @dataclass(frozen=True)
 class PaintLeft:
-    """The ``share`` of a marking's paint that is left, 0 to 1, with its ``sigma``.
-
-    ``change`` and ``change_sigma`` compare it to the earlier map's, None where there was none.
-    """
+    """The ``share`` of a marking's paint that is left, 0 to 1; its change since an earlier map, if any."""
 
     share: float
     sigma: float
@@ -342,83 +296,58 @@ class PaintLeft:
 
 @dataclass(frozen=True)
 class Marking:
-    """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
-
-    ``covariance_m2`` (8, 8) is that of the stacked corners, None if unknown. ``relative_sigma_m`` is what the
-    marking contributes to the error of a distance to one about 10 m away, one standard deviation a
-    coordinate: without the drift and the survey that both share. ``heights_m`` (4,) are the heights of the
-    ground, None where it was recorded as z = 0, ``heights_sigma_m`` (4,) their standard deviations where it
-    was estimated. ``id`` is positive and no other feature's of its map; None until the map is written.
-    ``paint`` is what is left of it, None where no image shows that.
-    """
+    """One mapped marking."""
 
     kind: str
-    corners_map: FloatArray
+    corners_map: FloatArray  # (4, 2) m, counter-clockwise from above
     sightings: int
-    covariance_m2: FloatArray | None = None
+    covariance_m2: FloatArray | None = None  # (8, 8) of the stacked corners, if known
+    # of a distance to one about 10 m away, a coordinate: without shared drift and survey
     relative_sigma_m: float | None = None
-    heights_m: FloatArray | None = None
-    id: int | None = None
-    paint: PaintLeft | None = None
-    heights_sigma_m: FloatArray | None = None
+    heights_m: FloatArray | None = None  # (4,) of the ground, None for z = 0
+    id: int | None = None  # positive and unique; None until the map is written
+    paint: PaintLeft | None = None  # what is left of it, if any image shows that
+    heights_sigma_m: FloatArray | None = None  # (4,) where estimated
 
 
 @dataclass(frozen=True)
 class Symbol:
-    """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
-
-    These are the vertices of a polygon, in the same order for all symbols of one template, with the joint
-    covariance ``covariance_m2`` (2N, 2N); None where sightings share an outline that no polygon explains.
-    ``sigma_m`` is the standard deviation a coordinate; ``heights_m`` (N,), their sigmas and ``id`` are as a
-    :class:`Marking` has them.
-    """
+    """One mapped symbol; heights and id as of a :class:`Marking`."""
 
     kind: str
-    outline_map: FloatArray
+    outline_map: FloatArray  # (N, 2) m, counter-clockwise from above, in one order for all of a template
     sightings: int
-    sigma_m: float | None = None
+    sigma_m: float | None = None  # of a coordinate
     heights_m: FloatArray | None = None
     id: int | None = None
     heights_sigma_m: FloatArray | None = None
+    # (2N, 2N), None where sightings share an outline that no polygon explains
     covariance_m2: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
-
-    ``sigma_m`` (N,) is the standard deviation of each vertex across the line, of extrinsics and poses too,
-    None where lanes take no part in the adjustment. ``heights_m`` (N,), their sigmas and ``id`` are as a
-    :class:`Marking` has them.
-    """
+    """One mapped lane line: a polyline along its centre; heights and id as of a :class:`Marking`."""
 
     kind: str
-    points_map: FloatArray
+    points_map: FloatArray  # (N, 2) m
     sightings: int
     heights_m: FloatArray | None = None
     id: int | None = None
-    sigma_m: FloatArray | None = None
+    sigma_m: FloatArray | None = None  # (N,) of each vertex across, None unless adjusted
     heights_sigma_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class GroundStrip:
-    """The estimated ground along a path, a grid of heights.
+    """The estimated ground along a path, a grid of heights."""
 
-    Attributes:
-        points_map: (N, 2) m of the path, ``step_m`` apart.
-        ahead: (N, 2) unit vectors along it.
-        left_m: (M,) to its left, evenly rising.
-        heights_m: (N, M) of the ground.
-        sigma_m: (N, M) their standard deviations.
-    """
-
-    points_map: FloatArray
-    ahead: FloatArray
+    points_map: FloatArray  # (N, 2) m of the path, ``step_m`` apart
+    ahead: FloatArray  # (N, 2) unit vectors along it
     step_m: float
-    left_m: FloatArray
-    heights_m: FloatArray
-    sigma_m: FloatArray
+    left_m: FloatArray  # (M,) to its left, evenly rising
+    heights_m: FloatArray  # (N, M) of the ground
+    sigma_m: FloatArray  # (N, M) their standard deviations
 
     def points(self, left_m: float) -> FloatArray:
         """Points (N, 2) so far to the left of the path."""
@@ -494,6 +423,17 @@ class HdMap:
         return frame.set_geometry(geometry, crs="EPSG:4326")
 
 
+@dataclass(frozen=True)
+class Exclusion:
+    """A candidate that the map of the set ``cameras`` left out: what, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+    cameras: str = ""
+
+
 class Fate(Enum):
     """The fate of a marking between an earlier map and a new drive."""
 
@@ -508,34 +448,24 @@ class Fate(Enum):
 
 @dataclass(frozen=True)
 class Change:
-    """One marking that is not what the earlier map says, and the evidence.
-
-    ``id``, ``kind`` and ``fate`` of the marking; its corners ``before`` and ``after`` (4, 2), None where
-    there was or is none; how far its centre moved, ``shift_m`` (2,), beyond what the maps are apart there,
-    and that shift's sigma. ``probability`` is that of its fate; ``views`` images of the drive (of a new one,
-    of the earlier drive) had its place in near view and ``found`` of them showed it; ``sightings`` are of the
-    map that has it.
-    """
+    """One marking that is not what the earlier map says, and the evidence."""
 
     id: int
     kind: str
     fate: Fate
-    before: FloatArray | None
-    after: FloatArray | None
-    shift_m: FloatArray | None
+    before: FloatArray | None  # (4, 2) corners, if any
+    after: FloatArray | None  # (4, 2) corners, if any
+    shift_m: FloatArray | None  # (2,) of its centre, beyond what the maps are apart there
     shift_sigma_m: FloatArray | None
-    probability: float
-    views: int
-    found: int
-    sightings: int
+    probability: float  # of its fate
+    views: int  # images that had its place in near view (of a new one, the earlier drive's)
+    found: int  # of them showed it
+    sightings: int  # of the map that has it
 
 
 @dataclass(frozen=True)
 class Changes:
-    """An earlier map against a new drive: the ``changes``, and how many markings are the ``same``.
-
-    ``shift_m`` (2,) is how far the drive's own map lay from the earlier one, as a mean.
-    """
+    """An earlier map against a new drive: the ``changes``, how many are the ``same``, its mean shift (2,)."""
 
     changes: tuple[Change, ...]
     same: int
@@ -548,18 +478,13 @@ class Changes:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth of a rendered drive. Only the report reads it; the mapper never does.
-
-    ``map_from_vehicle`` (I, 4, 4) are the true poses, one per ``Drive.images``. ``visibility`` (I, J) is the
-    fraction of marking j of ``map.markings`` that image i shows, unoccluded. ``lane_visible`` flags, per
-    lane, the vertices seen by some camera of the drive.
-    """
+    """Ground truth of a rendered drive. Only the report reads it; the mapper never does."""
 
     map: HdMap
     cam_from_vehicle: Mapping[str, FloatArray]
-    map_from_vehicle: FloatArray
-    visibility: FloatArray
-    lane_visible: tuple[BoolArray, ...]
+    map_from_vehicle: FloatArray  # (I, 4, 4) one per ``Drive.images``
+    visibility: FloatArray  # (I, J) fraction of marking j that image i shows, unoccluded
+    lane_visible: tuple[BoolArray, ...]  # per lane, the vertices seen by some camera
     disturbances: Mapping[str, float]
 
 

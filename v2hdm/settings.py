@@ -50,10 +50,9 @@ def check_workers(workers: int) -> None:
 
 
 def check_settings(config: object, ranges: Mapping[str, Within], prefix: str = "") -> None:
-    """Refuse numbers that are not finite or out of range.
+    """Refuse numbers that are not finite or out of range, with ConfigError that names ``prefix`` and key.
 
-    ``ranges`` are by dotted key; ``*`` stands for the entries of a mapping. Raises ConfigError, which puts
-    ``prefix`` before the key and names its value and the range.
+    ``ranges`` are by dotted key; ``*`` stands for the entries of a mapping.
     """
     for key, pattern, value in _numbers(config, "", ""):
         if not math.isfinite(value):

@@ -40,8 +40,8 @@ def share_out(
 ) -> None:
     """Do short jobs in several processes and take their results in the order of the jobs.
 
-    Each process calls ``start`` with ``arguments`` first; an exception of either is raised here. Raises
-    WorkerError where a job's process died, twice.
+    Each process calls ``start`` first; an exception of either is raised here, WorkerError where one died,
+    twice.
     """
     found: dict[int, _Result] = {}
     taken, ready = 0, _Prepared(work, start, arguments)
@@ -78,12 +78,9 @@ def side_by_side(
 ) -> Iterator[tuple[int, _Result | WorkerError]]:
     """Do long jobs in several processes; yields each job's number and result as it is done.
 
-    ``work`` reports its steps to the progress that it is given, and ``progress`` is called with them here. A
-    job whose process dies is begun once more, and a WorkerError is its result where that dies, too. An
-    exception of ``work`` is raised here, caused by one with the traceback there.
-
-    Processes are spawned: a fork would inherit the locks of other libraries' threads. Messages go through a
-    pipe per process: one that is killed takes no other's with it, and nobody else could reach them.
+    ``work`` reports its steps to the progress that it is given. A job whose process dies is begun once more,
+    and a WorkerError is its result where that dies, too. An exception of ``work`` is raised here. Processes
+    are spawned, as a fork would inherit the locks of threads; a pipe each takes no other's messages with it.
     """
     left, died = list(range(len(jobs)))[::-1], set[int]()
     others = set(multiprocessing.active_children())

@@ -13,7 +13,7 @@ import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import KnownLengths, PoseSigma, SolveOptions, arrays, solve
-from v2hdm.adjust.lbfgs import minimise
+from v2hdm.adjust.descent import minimise
 from v2hdm.adjust.problem import POSE_STATES
 
 
@@ -121,7 +121,7 @@ def test_torch_does_not_import_its_compiler_but_where_it_has_another_mark_than_w
     """The mark is private: one that cannot be set stands for what a later torch may have."""
     before = """
 import torch
-from v2hdm.adjust import lbfgs
+from v2hdm.adjust import descent
 class Shut:
     __slots__ = ()
     def __call__(self, *arguments): raise AssertionError

@@ -30,7 +30,7 @@ from tests.ports import short_port
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
 from v2hdm.simulate import render_drive
-from v2hdm.store.pruning import items_of
+from v2hdm.store.cache import items_of
 
 Start = Callable[[Path, DriveConfig], int]
 """Starts a run of a drive within a folder; returns its process."""

@@ -40,7 +40,7 @@ from tests.drive.example import make_drive
 from v2hdm.cli.main import run
 from v2hdm.detection.frames import video_frames
 from v2hdm.errors import DriveError
-from v2hdm.geometry.mounting import mounting_angles
+from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
 from v2hdm.io.drive.sources import _import_video

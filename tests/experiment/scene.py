@@ -38,7 +38,6 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
         "route": np.column_stack([np.linspace(0, 25, 26), np.zeros(26)]).tolist(),
         "expected": {name: [True] * 5 for name in maps},
         "maps": maps,
-        "lanes": {"Opt": [[[0.0, 1.01], [20.0, 1.01]]]},
         "failures": [],
     }
 

@@ -622,7 +622,7 @@ def _plainly(lines: str) -> dict[str, str]:
 
 SETTINGS = _plainly(
     "workers=-1 device=tpu mode=x mapping.max_range_m=nan mapping.max_range_m=inf mapping.max_range_m=0 "
-    "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_length_m=-1 detector.threads=0 "
+    "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_images=-1 detector.threads=0 "
     "detector.blur_px=99 detector.max_range_m=-1 detector.min_score=nan detector.border_px=-3 "
     "drive.max_gap_s=-1 drive.max_gap_s=nan"
 ) | {
@@ -683,7 +683,7 @@ def measures(options: object, below: str = "") -> Iterator[str]:
             yield below + one.name
 
 
-SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "roi_near_m", "roi_far_m", "moving_offset_m")
+SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "moving_offset_m")
 
 
 def numbers() -> Iterator[Case]:

@@ -162,13 +162,10 @@ def _calibrated(name: str, text: str | None, says: str, *options: str) -> Case:
     return Case(f"calibrate: {name}", "v2hdm calibrate points", line, prepare, says)
 
 
-LANES = ("lanes.node_spacing_m", "lanes.half_width_m", "lanes.half_length_m")
 SIGMAS = (
-    "known_sizes.sigma_m", "survey.sigma_m", "survey.reach_m", "association.ipm_sigma_rad",
-    "association.refined_sigma_rad", "association.gate_sigmas", "loss_scale",
+    "known_sizes.sigma_m", "survey.sigma_m", "survey.reach_m", "loss_scale",
 )  # fmt: skip
 OPTIONS = [
-    *(f"mapping.{key}={value}" for key in LANES for value in ("1e-9", "0.01", "0", "-1", "nan")),
     *(f"mapping.{key}={value}" for key in SIGMAS for value in ("0", "-1", "nan", "inf")),
     *(
         f"mapping.survey.points=[{{id:a,position_map:[1,2],sigma_m:[{sigma},0.01]}}]"

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from v2hdm.cli.main import run as command
-from v2hdm.fleet.plan import Row, exit_code, plan
-from v2hdm.fleet.run import FleetOptions, run_fleet
+from v2hdm.fleet import FleetOptions, Row, exit_code, plan, run_fleet
 from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.run import run, take_or_run
 

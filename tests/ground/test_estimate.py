@@ -8,7 +8,7 @@ import pytest
 
 from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, with_trajectory
 from v2hdm.cli.main import run
-from v2hdm.geometry.mounting import mounting_angles
+from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
 from v2hdm.ground.adjust import _by_stretch

@@ -15,7 +15,6 @@ from v2hdm.association.groups import (
     merge_groups,
     same_groups,
 )
-from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.tracks import build_tracks
 from v2hdm.geometry.quadrilateral import align
@@ -66,9 +65,7 @@ def tracks_under(rig, sightings, sigma_rad):
     located = locate(sightings, rig)
     near = located.range_m <= MAX_RANGE_M
     located = replace(located, valid=located.valid & near, informs=located.informs & near)
-    return build_tracks(
-        sightings, located, rig, sigma_rad, PoseNoise(0.01, roll_pitch_rad=0.0017), AssociationOptions()
-    ), located
+    return build_tracks(sightings, located, rig, sigma_rad, PoseNoise(0.01, roll_pitch_rad=0.0017)), located
 
 
 @pytest.fixture(scope="module")

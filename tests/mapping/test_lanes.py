@@ -13,7 +13,7 @@ from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
 from v2hdm.records import CameraInfo, Marking
-from v2hdm.site.lane_points import Guides, LaneCloud
+from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
@@ -70,7 +70,7 @@ def test_a_straight_line_becomes_one_polyline_on_its_centre():
     assert length(lane) > 38
     assert np.abs(lane.points_map[:, 1]).max() < 0.03
     steps = np.linalg.norm(np.diff(lane.points_map, axis=0), axis=1)
-    np.testing.assert_allclose(steps, OPTIONS.node_spacing_m, rtol=0.1)
+    np.testing.assert_allclose(steps, NODE_SPACING_M, rtol=0.1)
 
 
 def test_a_turn_of_twelve_metres_radius_stays_one_line():

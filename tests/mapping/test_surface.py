@@ -21,8 +21,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import HdMap, PoseNoise, Road
-from v2hdm.report.outputs import write_json
-from v2hdm.store.files import load_json
+from v2hdm.store.files import load_json, write_json
 
 FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])

@@ -15,7 +15,6 @@ from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.evidence import (
-    ExcludedMarking,
     Residuals,
     read_exclusions,
     read_residuals,
@@ -26,7 +25,17 @@ from v2hdm.io.maps.features import with_heights
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_verdict
-from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
+from v2hdm.records import (
+    Calibration,
+    CameraInfo,
+    Exclusion,
+    GeodeticOrigin,
+    HdMap,
+    Lane,
+    Marking,
+    Road,
+    Symbol,
+)
 from v2hdm.store.files import load_yaml
 
 LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)
@@ -314,7 +323,7 @@ def test_a_damaged_line_is_named(line, tmp_path):
 
 @pytest.mark.parametrize("origin", [None, GeodeticOrigin(53.5, 9.9, 40.0)])
 def test_exclusions_are_read_back_as_written(origin, tmp_path):
-    written = [ExcludedMarking("diamond", np.array([1.25, -3.5]), 4, "its position is too uncertain", "both")]
+    written = [Exclusion("diamond", np.array([1.25, -3.5]), 4, "its position is too uncertain", "both")]
     write_exclusions(written, tmp_path / "excluded.geojson", origin, None)
     (read,) = read_exclusions(tmp_path / "excluded.geojson")
     np.testing.assert_array_equal(read.position_map, written[0].position_map)
@@ -368,7 +377,7 @@ def test_a_calibration_says_an_estimated_read_out_time(tmp_path):
 
 
 def test_what_was_left_out_is_a_point_with_its_reason(tmp_path):
-    one = ExcludedMarking("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
+    one = Exclusion("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
     road = Road(np.array([[3.0, 4.0]]), np.array([46.2]), np.zeros((1, 2)))
     write_exclusions([one], tmp_path / "excluded.geojson", None, road)
     (feature,) = json.loads((tmp_path / "excluded.geojson").read_text())["features"]

@@ -31,7 +31,7 @@ from v2hdm.records import (
     Marking,
     Trajectory,
 )
-from v2hdm.report.outputs import write_json
+from v2hdm.store.files import write_json
 from v2hdm.store.results import result_folder
 
 INFO = CameraInfo(

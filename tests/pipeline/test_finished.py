@@ -9,8 +9,7 @@ from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError
 from v2hdm.io.drive import read_drive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline.config import DriveConfig, RunConfig, run_name
-from v2hdm.pipeline.keys import Contents, result_key
+from v2hdm.pipeline.config import Contents, DriveConfig, RunConfig, result_key, run_name
 from v2hdm.pipeline.run import RunResult, note_finished, take_or_make
 from v2hdm.store import remote
 from v2hdm.store.cache import code_key, key_of

@@ -19,8 +19,8 @@ from v2hdm.pipeline import inspect as inspection
 from v2hdm.pipeline import run as running
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import RunResult, run
+from v2hdm.store.cache import items_of
 from v2hdm.store.files import replace_text
-from v2hdm.store.pruning import items_of
 from v2hdm.store.results import added_to
 
 SAME = ("map.geojson", "calibration_front.yaml", "trajectory.tum", "excluded.geojson", "residuals.csv")

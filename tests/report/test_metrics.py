@@ -13,9 +13,8 @@ from tests.report.scene import diamond_at, make_truth
 from tests.report.yard import OWN_M, SHARED_M, SURVEY_M, checked, point, yard
 from v2hdm.geometry.ipm import apply_in_front, ipm_from_extrinsic
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
-from v2hdm.report import figures, style
+from v2hdm.report import style
 from v2hdm.report.check_points import COLUMNS, write_check_points
-from v2hdm.report.figures import save_birdseye
 from v2hdm.report.metrics import (
     corner_errors,
     driven_past,
@@ -104,15 +103,6 @@ def test_a_lane_where_there_is_none_is_false_length():
     assert np.isnan(result.mean_lateral_error_m)
 
 
-def test_the_birds_eye_view_is_drawn(tmp_path):
-    _, truth = make_truth()
-    maps = {"CNI": HdMap((diamond_at(10.1, 0),)), "Opt": HdMap((diamond_at(10, 0),), truth.map.lanes)}
-    route = truth.map_from_vehicle[:, :2, 3]
-    save_birdseye(tmp_path / "map.png", maps, "Opt", route, truth)
-    assert cv2.imread(str(tmp_path / "map.png")).std() > 5.0
-    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]  # no unfinished one stays
-
-
 def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path):
     drive, _ = make_truth()
     info = drive.cameras["front"].info
@@ -144,16 +134,10 @@ def test_before_and_after_differ_in_dashes_and_not_in_colour_alone(tmp_path):
     assert 0.3 < covered["ENI"] / covered["Opt"] < 0.85
 
 
-def test_every_method_has_a_line_style_and_a_marker_of_its_own():
-    for look in (style.LINE, style.WORDS, style.METHOD):
+def test_every_method_has_a_colour_of_its_own():
+    for look in (style.WORDS, style.METHOD):
         assert set(look) == set(METHODS)
         assert len({str(one) for one in look.values()}) == len(METHODS)
-
-
-def test_the_close_up_cuts_no_marking_off():
-    centre = np.zeros(2)
-    inside, across = diamond_at(3, 0), diamond_at(5.3, 0)
-    assert len(figures._wholly_near(HdMap((inside, across)), centre)) == 1
 
 
 def test_the_table_shows_every_method_and_camera_set_once():

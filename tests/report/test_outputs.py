@@ -12,9 +12,8 @@ import pytest
 
 from tests.faults.judge import full_disk
 from v2hdm.errors import ConfigError
-from v2hdm.report.outputs import write_json
 from v2hdm.store import results
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_text, write_json
 from v2hdm.store.inputs import LIST, note_input, protected_inputs
 from v2hdm.store.results import added_to, files_of_result, growing_folder, listed_files, result_folder
 

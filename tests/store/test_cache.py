@@ -33,10 +33,9 @@ from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
-from v2hdm.store.cache import CodecError, StageCache, decode, encode
+from v2hdm.store.cache import DRIVES, CodecError, StageCache, decode, encode, items_of, prune
 from v2hdm.store.folders import LIST, is_whole, new_entry, note_use
 from v2hdm.store.lock import IN_USE, in_use, take_lock
-from v2hdm.store.pruning import DRIVES, items_of, prune
 from v2hdm.store.results import result_folder
 
 KEY = "ab" * 32

@@ -5,7 +5,6 @@ inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hd
 residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
 """
 
-from v2hdm.adjust.bench import height_information
 from v2hdm.adjust.noise import estimate_noise
 from v2hdm.adjust.observability import observability, pose_innovations
 from v2hdm.adjust.problem import (
@@ -19,6 +18,7 @@ from v2hdm.adjust.problem import (
 )  # fmt: skip
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
+from v2hdm.adjust.sensitivity import height_information
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.validation import Verdict, line_variance_factor
@@ -27,6 +27,5 @@ __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
     "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
     "height_information", "line_variance_factor", "observability", "pose_innovations", "predicts_better",
-    "score_faults",
-    "select_model", "sigmas_of", "solve", "with_model",
+    "score_faults", "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

@@ -10,8 +10,7 @@ from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOpt
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-# How symmetric a covariance must be, as a share of its diagonal: float32 is.
-_SYMMETRIC_TO = 1e-5
+_SYMMETRIC_TO = 1e-5  # how symmetric a covariance must be, as a share of its diagonal: float32 is
 # Tangent of the angle from a camera's axis beyond which nothing is seen on its plane: 89.9 degrees.
 _MAX_SLOPE = 573.0
 

@@ -10,11 +10,9 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.errors import AdjustError
 
-CORNER_FLOOR = 1e-10
-"""Information, 1 / m^2, that keeps a corner factorable which runs off to the horizon."""
+CORNER_FLOOR = 1e-10  # information, 1 / m^2, that keeps a corner factorable which runs off to the horizon
 
-PIVOT_FLOOR = 1e-12
-"""Least pivot of a corner's second coordinate, as a share of its own information."""
+PIVOT_FLOOR = 1e-12  # least pivot of a corner's second coordinate, as a share of its own information
 
 INSEPARABLE = "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
 """The error of a block that has no factor."""
@@ -84,15 +82,9 @@ class CornerFactor:
 
 
 def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, Tensor]) -> CornerFactor:
-    """Factorise V.
+    """Factorise V of (N, 2, 2) J'J by corner, and derivatives (M, 2) of the lengths by both their corners.
 
-    Args:
-        arrays: the problem.
-        blocks: (N, 2, 2) J'J of the observations and the survey by corner.
-        by_length: derivatives (M, 2) of the lengths' residuals by their first and their second corners.
-
-    Raises:
-        AdjustError: corners that lengths join cannot be solved for together.
+    Raises AdjustError where corners that lengths join cannot be solved for together.
     """
     xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
     lower = cholesky_2x2(xx + CORNER_FLOOR, yx, yy + CORNER_FLOOR)

@@ -19,8 +19,7 @@ from v2hdm.records import FloatArray
 # these may consist.
 _CORNERS_AT_ONCE = 256
 _NUMBERS_AT_ONCE = 1 << 25
-# Frames whose right-hand sides are solved for together.
-_FRAMES_AT_ONCE = 64
+_FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved for together
 
 
 @dataclass(frozen=True)
@@ -131,10 +130,7 @@ def _at_once(whitening: Whitening) -> int:
 
 
 def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
-    """Groups (M, n) of corners, and all that known lengths join to them (M, m).
-
-    Shorter rows are filled up with their last corner.
-    """
+    """Groups (M, n) of corners, and all that lengths join to them (M, m); the last fills up shorter rows."""
     if not bool(arrays.joined.any()):
         return chosen
     unit = (~arrays.joined).cumsum(0)

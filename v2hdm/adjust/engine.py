@@ -18,41 +18,30 @@ from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread
 from v2hdm.records import BoolArray, FloatArray
 
-WEIGHT_FLOOR = 1e-6
-"""Least weight of an observation in the Hessian: a corner of outliers alone stays factorable."""
+WEIGHT_FLOOR = 1e-6  # least weight of an observation in the Hessian: a corner of outliers stays factorable
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Cost and gradient after a step.
+    """Cost and gradient after a step."""
 
-    Attributes:
-        estimate: where the step led.
-        terms: the cost there, by name.
-        gradient: by the step.
-        whitened, coupled: what :meth:`Linearised.carry` makes of the corners' part.
-    """
-
-    estimate: Estimate
-    terms: dict[str, float]
-    gradient: Gradient
+    estimate: Estimate  # where the step led
+    terms: dict[str, float]  # the cost there, by name
+    gradient: Gradient  # by the step
+    # what :meth:`Linearised.carry` makes of the corners' part
     whitened: Tensor
     coupled: Coupled
 
 
 @dataclass(frozen=True)
 class Linearised(ABC):
-    """A problem linearised at an estimate, its corners eliminated.
+    """A problem linearised at an estimate, its corners eliminated."""
 
-    Attributes:
-        terms, gradient: the cost at the estimate, by name, and its gradient.
-        corner_factor: L, the factor of the corners' own block.
-        whitened, coupled: what :meth:`carry` makes of the gradient's corner part.
-    """
-
+    # the cost at the estimate, by name, and its gradient
     terms: dict[str, float]
     gradient: Gradient
-    corner_factor: CornerFactor
+    corner_factor: CornerFactor  # L, the factor of the corners' own block
+    # what :meth:`carry` makes of the gradient's corner part
     whitened: Tensor
     coupled: Coupled
 
@@ -60,10 +49,8 @@ class Linearised(ABC):
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, with which the corners move.
 
-        Args:
-            step: of the reduced unknowns; its corners are not looked at.
-            tangents: (C, M, 6) left tangents of the pairs under the step.
-            own: (N, 2) whitened variables of the corners.
+        ``tangents`` (C, M, 6) are those of the pairs under the step, ``own`` (N, 2) whitened variables of
+        corners.
         """
 
     @abstractmethod
@@ -126,8 +113,4 @@ class Engine(ABC):
 
     @abstractmethod
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> Linearised:
-        """Linearise, and subtract the eliminated corners from the reduced system.
-
-        Raises:
-            AdjustError: corners that lengths join cannot be solved for together.
-        """
+        """Linearise and eliminate the corners; raises AdjustError where joined ones cannot be solved for."""

@@ -26,7 +26,7 @@ from v2hdm.adjust.checks import check_observations
 from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.descent import narrowed
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.numba.motion import move
+from v2hdm.adjust.engines.numba.tables import move
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
@@ -49,10 +49,7 @@ class UndeterminedError(AdjustError):
 
 @dataclass(frozen=True)
 class Sighted:
-    """All that is known of one marking; its corners are numbered from 0.
-
-    ``lengths`` and ``control`` are what a standard and a survey say of them, None if nothing.
-    """
+    """All that is known of one marking, its corners numbered from 0; lengths and control None if unknown."""
 
     observations: Observations
     lengths: KnownLengths | None = None
@@ -85,7 +82,7 @@ class _Own:
 class _Settled:
     """Corners (n, 2) at the unknowns ``at`` (D,) of all cameras; ``gain`` (n, 2, D) how they follow these.
 
-    ``own`` is what the marking says of the cameras, None where it was solved for together with others.
+    ``own`` is its share of what is known of the cameras, None where others were solved for together with it.
     """
 
     at: FloatArray
@@ -96,10 +93,7 @@ class _Settled:
 
 @dataclass(frozen=True)
 class _Quadratic:
-    """Half xi' ``information`` xi less ``vector`` xi, in the unknowns (D,) of ``cameras`` around ``base``.
-
-    Its least value is at ``mean`` (D,).
-    """
+    """Half xi' ``information`` xi less ``vector`` xi, around ``base``; least where xi is ``mean`` (D,)."""
 
     cameras: IntArray
     base: FloatArray
@@ -128,13 +122,7 @@ class IncrementalMap:
     """Extrinsics and corners, up to date after every marking."""
 
     def __init__(self, drive: Problem, options: SolveOptions | None = None) -> None:
-        """Begin with an empty map.
-
-        Args:
-            drive: its cameras, frames and priors; its observations and what it knows of corners are not
-                looked at.
-            options: how to solve; the model is theirs and ``drive``'s.
-        """
+        """Begin with an empty map of a ``drive``, of whose problem cameras, frames and priors are taken."""
         self._drive = drive
         self._options = options or SolveOptions()
         self._sighted: dict[int, Sighted] = {}
@@ -160,11 +148,7 @@ class IncrementalMap:
         return marking in self._settled and self._earlier is not None
 
     def preview(self, sighted: Sighted) -> FloatArray:
-        """Where the corners (n, 2) lie by back-projection under the present extrinsics, nan if nowhere.
-
-        Raises:
-            AdjustError: it has two sightings of a corner in one image.
-        """
+        """Back-projected corners (n, 2), nan if nowhere; AdjustError for two sightings of one in an image."""
         problem, _ = self._problem([sighted])
         arrays = make_arrays(problem, (), "cpu")
         engine = make_engine(self._options.engine, arrays)
@@ -175,11 +159,7 @@ class IncrementalMap:
         return out
 
     def corners_map(self, marking: int) -> FloatArray:
-        """Corners (n, 2) of a marking under the present extrinsics.
-
-        Raises:
-            AdjustError: it is not in the map, or waits for others or for :meth:`adjust`.
-        """
+        """Corners (n, 2) of a marking by the present extrinsics; AdjustError where they are not known yet."""
         if not self.is_solved(marking) or self._earlier is None:
             raise AdjustError(f"marking {marking} is not in the map")
         settled = self._settled[marking]
@@ -193,10 +173,8 @@ class IncrementalMap:
     def observe(self, marking: int, sighted: Sighted) -> None:
         """Take a marking into the map; one that is in it already is re-estimated from all its sightings.
 
-        The first ones of a camera wait until there are enough to fix its extrinsic.
-
-        Raises:
-            AdjustError: it cannot be solved for; the map is as it was.
+        The first ones of a camera wait until there are enough to fix its extrinsic. Raises AdjustError where
+        it cannot be solved for; the map is as it was.
         """
         before = self._sighted.get(marking)
         earlier = self._earlier if before is None else self._without(marking, before)
@@ -219,10 +197,7 @@ class IncrementalMap:
             raise
 
     def _without(self, marking: int, sighted: Sighted) -> _Quadratic | None:
-        """The quadratic without a marking; None where that takes a solve of all others.
-
-        So it does where little is left, for what a marking shared with others is then much of it.
-        """
+        """The quadratic without a marking; None where so little is left that all others are solved anew."""
         if self._earlier is None or marking not in self._settled:
             return self._earlier
         own = self._settled[marking].own or self._linearised(self._earlier, marking, sighted)[1]
@@ -233,10 +208,8 @@ class IncrementalMap:
     def adjust(self) -> Solution:
         """Solve for all markings together; happens by itself whenever the map has doubled.
 
-        The solution's corners are those of :attr:`markings`, one after the other.
-
-        Raises:
-            AdjustError: there is no marking, or they cannot be solved for.
+        The solution's corners are those of :attr:`markings`, one after the other. Raises AdjustError where
+        there is none, or they cannot be solved for.
         """
         if not self._sighted:
             raise AdjustError("there is no marking to adjust")
@@ -258,10 +231,7 @@ class IncrementalMap:
     def _linearised(
         self, earlier: _Quadratic, marking: int, sighted: Sighted
     ) -> tuple[_Quadratic, _Own, _Settled]:
-        """The information of ``earlier`` and a marking on cameras, its share, and itself where they agree.
-
-        Gauss-Newton steps: frames and corners are eliminated, and what is left of the cameras is added up.
-        """
+        """The information of ``earlier`` and a marking, its share, and itself where both agree."""
         # All that priors say of the cameras is part of the quadratic.
         without = {"centre_vehicle": None, "clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
         problem, cameras = self._problem([sighted], **without)

@@ -22,15 +22,11 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_NEAR_M = 10_000.0
-"""Coordinates of this size are known to a picometre, and moving them would cost memory for nothing."""
+_NEAR_M = 10_000.0  # coordinates of this size are known to a picometre; moving them would only cost memory
 
 
 def nearby_origin(problem: Problem) -> FloatArray:
-    """A point (2,) of the map by the recorded poses: its origin, or their middle where that is far from it.
-
-    It is in whole metres, so that shifts are exact.
-    """
+    """A point (2,) in whole metres near the recorded poses: the origin, or their middle if that is far."""
     position = problem.map_from_vehicle[:, :2, 3]
     middle = np.round((position.min(0) + position.max(0)) / 2)
     return np.asarray(middle if np.abs(middle).max() > _NEAR_M else np.zeros(2))
@@ -51,23 +47,18 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     )
 
 
-MIN_STEP = 1e-4
-"""Least step between frames, as a fraction of the distance over which a drift fades."""
+MIN_STEP = 1e-4  # least step between frames, as a fraction of the distance over which a drift fades
 
-# Below this share of an error its white part is rounding left over from the drift.
-_MIN_WHITE_SHARE = 1e-3
+_MIN_WHITE_SHARE = 1e-3  # below this share of an error its white part is rounding left over from the drift
 
 
 def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
     """The states of a frame: for each error its white part, then its drift, where there are any.
 
-    All visits have the same states; what only others have is rounding in a visit's own, and none outlasts its
-    visit. A drift is a first-order Gauss-Markov process along the driven distance d: memory
-    m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section
-    3.8).
-
-    Returns the tangent's column (S,) of each, the transition (J, S, S) and the inverse sigma (J, S) of what
-    is new in a frame's.
+    All visits have the same; none outlasts its visit. A drift is a first-order Gauss-Markov process along the
+    driven distance d: memory m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied
+    Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition (J, S, S) and
+    the inverse sigma (J, S) of what is new in a frame's.
     """
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
@@ -96,8 +87,7 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     return columns, transition, 1 / (sigma[visit] * np.sqrt(1 - memory**2))
 
 
-# Corners that known lengths may join; time and memory grow with the square and the cube.
-_MOST_JOINED = 256
+_MOST_JOINED = 256  # corners that known lengths may join; time and memory grow with the square and the cube
 
 
 def make_arrays(
@@ -109,9 +99,8 @@ def make_arrays(
 ) -> Arrays:
     """Lay a checked problem out for the solver.
 
-    Raises:
-        AdjustError: two observations are the same corner in the same image, or known lengths join too
-            many corners.
+    Raises AdjustError where an image has two observations of a corner, or known lengths join too many
+    corners.
     """
 
     def real(values: FloatArray) -> Tensor:
@@ -175,10 +164,7 @@ def make_arrays(
 
 
 def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
-    """Corners (N,) by the frame that first saw them, and which (N,) are joined to the one before.
-
-    Corners that known lengths join come side by side, where the first of them belongs.
-    """
+    """Corners (N,) by the frame that first saw them, joined ones side by side, and which follow such (N,)."""
     count, lengths = problem.corner_count, problem.lengths
     seen, frames = problem.observations, len(problem.map_from_vehicle)
     first_frame = np.full(count, frames)

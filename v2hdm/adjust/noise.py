@@ -1,16 +1,15 @@
-r"""How far the recorded poses err, and over which distance, as the drive itself shows.
+"""How far the recorded poses err, and over which distance, as the drive itself shows.
 
-Receivers state their errors badly, and a road moves the vehicle in ways that nobody states. Yet a drive shows
-them: markings that were seen again and again have to lie still. The errors of the poses are drawn from their
-posterior at the solution, where it is Gaussian, by the factors of :mod:`v2hdm.adjust.whitening`; their mean
-square gives a sigma, and the distance after which their autocorrelation has fallen to 1 / e the distance over
-which they fade. Under these the posterior is another one, so the two take turns, as in expectation and
-maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977). Moments are used in place of the likelihood of the
-Gauss-Markov process: real roads are smoother than it from image to image, and its likelihood, which hangs on
-these steps, makes far too long distances of that.
+Receivers state their errors badly. Yet markings that were seen again and again have to lie still. The errors
+of the poses are drawn from their posterior at the solution, where it is Gaussian, by the factors of
+:mod:`v2hdm.adjust.whitening`; their mean square gives a sigma, and the distance after which their
+autocorrelation has fallen to 1 / e that over which they fade. Under these the posterior is another one, so
+the two take turns, as in expectation and maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977). The
+likelihood of the Gauss-Markov process would make far too long distances of roads smoother than it from image
+to image.
 
-What was stated is the prior. A route much longer than the distance over which errors fade overrules it; what
-images cannot see, such as an offset of the whole map, stays as stated.
+What was stated is the prior: a long route overrules it; what images cannot see, such as an offset of the
+whole map, stays as stated.
 """
 
 from __future__ import annotations
@@ -54,11 +53,7 @@ class _Scales:
 def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...]:
     """The sigmas of each visit's poses that the drive shows; as stated where nothing is estimated.
 
-    All visits' sigmas of a kind are scaled alike.
-
-    Args:
-        problem: the drive, with the stated sigmas.
-        solution: of it, under sigmas that are not far off.
+    The solution is under sigmas that are not far off. All visits' sigmas of a kind are scaled alike.
     """
     descent = solution.covariance.descent
     arrays, stated = descent.engine.arrays, problem.pose_sigmas

@@ -21,15 +21,10 @@ _RESTS_ON_PRIOR = 0.25
 
 @dataclass(frozen=True)
 class Observability:
-    """Of one camera's extrinsic, along and about the vehicle's axes in the order of :data:`AXES`.
+    """How well a drive knows one camera's extrinsic, along and about the vehicle's axes :data:`AXES`."""
 
-    ``sigma`` (6,) is the standard deviation after the adjustment, m and rad. ``prior_share`` (3,) is how
-    much of what is known of the camera's centre comes from its prior: 0, the drive alone
-    determines it; 1, only the prior does. (For a normal variable the prior's share of the
-    information is the ratio of the variances after and before.)
-    """
-
-    sigma: FloatArray
+    sigma: FloatArray  # (6,) m and rad, after the adjustment
+    # (3,) of the variance of the centre after and before: 0, the drive alone determines it; 1, only the prior
     prior_share: FloatArray
 
     @property
@@ -67,15 +62,11 @@ def observability(problem: Problem, solution: Solution) -> Sequence[Observabilit
 
 @dataclass(frozen=True)
 class PoseInnovations:
-    """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift.
+    """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift."""
 
-    Attributes:
-        state: (S,) which of :data:`v2hdm.adjust.problem.POSE_STATES` each is; a state with a drift has two.
-        normalised: (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
-    """
-
+    # (S,) which of :data:`v2hdm.adjust.problem.POSE_STATES` each is; a state with a drift has two
     state: IntArray
-    normalised: FloatArray
+    normalised: FloatArray  # (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
 
     @property
     def along_over_across(self) -> float:

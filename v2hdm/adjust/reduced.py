@@ -23,23 +23,14 @@ _TILE_ROWS = 96
 
 @dataclass(frozen=True)
 class Plan:
-    """How a problem's reduced system is cut into tiles; depends on who observed what, not on numbers.
+    """How a problem's reduced system is cut into tiles; depends on who observed what, not on numbers."""
 
-    Attributes:
-        frames_per_tile: frames of a tile.
-        size: rows of a tile.
-        frame_tiles: how many tiles are of frames; those of kept corners follow.
-        pattern: which tiles are not zero, and their order of elimination.
-        kept: (n,) the corners that are not eliminated before the frames, ascending.
-        most_tiles: tiles that the observations of a unit of corners touch at most.
-    """
-
-    frames_per_tile: int
-    size: int
-    frame_tiles: int
-    pattern: Pattern
-    kept: Tensor
-    most_tiles: int = 0
+    frames_per_tile: int  # frames of a tile
+    size: int  # rows of a tile
+    frame_tiles: int  # how many tiles are of frames; those of kept corners follow
+    pattern: Pattern  # which tiles are not zero, and their order of elimination
+    kept: Tensor  # (n,) the corners that are not eliminated before the frames, ascending
+    most_tiles: int = 0  # tiles that the observations of a unit of corners touch at most
 
     @property
     def tile_count(self) -> int:
@@ -101,15 +92,11 @@ class Coupled:
 
 @dataclass(frozen=True)
 class Spread:
-    """How pairs move with what they belong to: derivatives of their left tangents.
-
-    ``state`` (C, M, 6, S) by the states of the frame; ``clock`` (C, M, 6, Q) by the camera's clock offset. By
-    the camera's extrinsic it is the identity.
-    """
+    """How pairs move: derivatives of their left tangents; by the camera's extrinsic it is the identity."""
 
     arrays: Arrays
-    state: Tensor
-    clock: Tensor
+    state: Tensor  # (C, M, 6, S) by the states of the frame
+    clock: Tensor  # (C, M, 6, Q) by the camera's clock offset
 
     @property
     def camera(self) -> Tensor:
@@ -143,12 +130,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class PriorBlocks:
-    """The priors' part of the Hessian.
+    """The priors' part of the Hessian, of cameras (C (6 + Q), C (6 + Q)) and of frames' states (J, S, S).
 
-    Attributes:
-        camera: (C (6 + Q), C (6 + Q)) of the cameras' unknowns.
-        frame: (J, S, S) of each frame's states.
-        across: (J, S, S) between each frame's states and those of the frame before.
+    ``across`` (J, S, S) stands between each frame's states and those of the frame before.
     """
 
     camera: Tensor
@@ -175,13 +159,10 @@ class ReducedSystem:
         self.matrix.tiles[TIP, TIP].sub_(cameras)
 
     def add_kept(self, run: Run, coupling: Tensor, index: Tensor, blocks: Tensor) -> None:
-        """Add what is known of the kept corners.
+        """Add what is known of the kept corners, whose observations are ``run``.
 
-        Args:
-            run: their observations; its corners are the kept ones.
-            coupling: (k, 2, 6) W' of these.
-            index: (2, m) numbers of kept corners, of which the first is not the lower.
-            blocks: (m, 2, 2) their part of V.
+        ``coupling`` (k, 2, 6) is W' of these, ``blocks`` (m, 2, 2) the part of V at ``index`` (2, m), the
+        first not the lower.
         """
         plan, axes = self.plan, torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
@@ -222,10 +203,9 @@ class ReducedSystem:
     def factorise(
         self, priors: PriorBlocks, jitter: float, hold_cameras: bool
     ) -> tuple[TiledCholesky, float] | None:
-        """Put it together and factorise; the factor takes its place.
+        """Factorise in place; the factor and its least pivot as a share of U's diagonal, None where it fails.
 
-        ``jitter`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
-        share of U's diagonal; None where S cannot be factorised.
+        ``jitter`` is added to U's diagonal, relative to it.
         """
         self._add_frames(priors)
         diagonal = [*self._diagonal.view(self.plan.tile_count, self.plan.size), self._add_cameras(priors)]

@@ -31,37 +31,30 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.bench import Bench, Rows, raised, stretches
 from v2hdm.adjust.problem import Problem
+from v2hdm.adjust.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray
 
-_LEAST_OBSERVABLE = 1e-9
-"""Share of a fault's own information, left by all else, below which rounding alone is left of it."""
+_LEAST_OBSERVABLE = 1e-9  # share of a fault's own information, left by all else, below which it is rounding
 
-_LEAST_P = 1e-300
-"""Below it a p-value is zero for floating-point numbers."""
+_LEAST_P = 1e-300  # below it a p-value is zero for floating-point numbers
 
-_STRETCHES_PER_CHANGE = 2
-"""Stretches from one frame at which inputs may change to the next."""
+_STRETCHES_PER_CHANGE = 2  # stretches from one frame at which inputs may change to the next
 
 _MOST_CHANGES = 12
 """Frames at which inputs may change, of all sessions together: each costs a test of every camera and axis."""
 
-_DRIFTS = 3
-"""Shapes of a clock that drifts: evenly, in two half waves and in three."""
+_DRIFTS = 3  # shapes of a clock that drifts: evenly, in two half waves and in three
 
 _STEPS = ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5), (-(0.5**0.5), 0.5**0.5))
 """Directions in the map in which positions may step: none is farther than 22.5 deg from one of them."""
 
-_LEAST_SPEED_MPS = 0.5
-"""Below it a vehicle has no course."""
+_LEAST_SPEED_MPS = 0.5  # below it a vehicle has no course
 
-_LAGS = 1
-"""Neighbours of a stretch that err along with it."""
+_LAGS = 1  # neighbours of a stretch that err along with it
 
-_PRIOR_FREEDOM = 15.0
-"""Degrees of freedom that the usual disagreement of a drive's stretches counts for in each test."""
+_PRIOR_FREEDOM = 15.0  # degrees of freedom that the usual disagreement of stretches counts for in each test
 
 
 class Fault(Enum):
@@ -106,38 +99,30 @@ def sigmas_of(p_value: float) -> float:
     return float(stats.norm.isf(max(p_value, _LEAST_P) / 2))
 
 
-CHANGES = (Fault.STEP, Fault.KNOCK)
-"""Faults that begin at some time, which is unknown."""
+CHANGES = (Fault.STEP, Fault.KNOCK)  # faults that begin at some time, which is unknown
 
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """One fault, as the residuals see it.
+    """One fault, as the residuals see it."""
 
-    Attributes:
-        fault: what would be wrong.
-        camera: of which camera of the problem; -1 for all together.
-        axis: along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope,
-            datum; step: east, north, north-east, north-west), of the image (principal); the side (crown:
-            both, left, right), the shape of a drift.
-        item: which of the problem's control points, known lengths or (clock) visits, or the frame from which
-            on inputs are wrong (step, knock); -1 for none or all.
-        value: by how much, true minus stated.
-        sigma: how well the drive observes it, by what its stretches disagree; inf where it cannot.
-        model_sigma: how well it would, were all noise as the model has it.
-        p_value: how often a drive without the fault would show as large a value, 1 where it is unobservable.
-        gain: by how much the fault raises the log likelihood of each stretch as the others predict it, summed
-            over all; negative where the stretches do not agree on it.
-    """
-
-    fault: Fault
-    camera: int
+    fault: Fault  # what would be wrong
+    camera: int  # of which camera of the problem; -1 for all together
+    # along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope, datum;
+    # step: east, north, north-east, north-west), of the image (principal); the side (crown: both, left,
+    # right), the shape of a drift
     axis: int
+    # which of the problem's control points, known lengths or (clock) visits, or the frame from which on
+    # inputs are wrong (step, knock); -1 for none or all
     item: int
-    value: float = 0.0
+    value: float = 0.0  # by how much, true minus stated
+    # how well the drive observes it, by what its stretches disagree; inf where it cannot
     sigma: float = float("inf")
-    model_sigma: float = float("inf")
+    model_sigma: float = float("inf")  # how well it would, were all noise as the model has it
+    # how often a drive without the fault would show as large a value, 1 where it is unobservable
     p_value: float = 1.0
+    # by how much the fault raises the log likelihood of each stretch as the others predict it, summed over
+    # all; negative where the stretches do not agree on it
     gain: float = 0.0
 
     @property
@@ -151,7 +136,7 @@ class _Hypothesis:
     """One fault, and how to get its column."""
 
     fault: Fault
-    column: Callable[[Bench], Rows]
+    column: Callable[[Sensitivity], Rows]
     camera: int = -1
     axis: int = 0
     item: int = -1
@@ -159,33 +144,27 @@ class _Hypothesis:
 
 @dataclass(frozen=True)
 class _Answer:
-    """The scores and the information that the stretches of the route hold on one fault.
+    """The scores and the information that the stretches of the route hold on one fault."""
 
-    Attributes:
-        hypothesis: the fault.
-        score, information: (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch.
-        drawn: (D, G + 1) scores of noise as the model has it.
-        own: the fault's information if all else were known.
-    """
-
-    hypothesis: _Hypothesis
+    hypothesis: _Hypothesis  # the fault
+    # (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch
     score: FloatArray
     information: FloatArray
-    drawn: FloatArray
-    own: float
+    drawn: FloatArray  # (D, G + 1) scores of noise as the model has it
+    own: float  # the fault's information if all else were known
 
     @classmethod
-    def to(cls, hypothesis: _Hypothesis, bench: Bench) -> _Answer:
+    def to(cls, hypothesis: _Hypothesis, solved: Sensitivity) -> _Answer:
         """The answer at a solution."""
-        column = hypothesis.column(bench)
-        efficient = bench.flat(bench.efficient(column))
-        information = bench.by_stretch(efficient, efficient)
+        column = hypothesis.column(solved)
+        efficient = solved.flat(solved.efficient(column))
+        information = solved.by_stretch(efficient, efficient)
         own = sum(float(row.square().sum()) for row in column.values())
         return cls(
             hypothesis,
-            -bench.by_stretch(efficient, bench.flat(bench.residuals)),
+            -solved.by_stretch(efficient, solved.flat(solved.residuals)),
             information,
-            bench.by_stretch(efficient, bench.noise).T,
+            solved.by_stretch(efficient, solved.noise).T,
             own,
         )
 
@@ -243,8 +222,8 @@ class _Answer:
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Every fault that ``problem`` can have, each tested at its ``solution``; largest gain first."""
-    bench = Bench.at(solution.covariance.whitening)
-    answers = [_Answer.to(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
+    solved = Sensitivity.at(solution.covariance.whitening)
+    answers = [_Answer.to(hypothesis, solved) for hypothesis in _hypotheses(problem, solved.arrays)]
     said = [one.disagreement for one in answers if one.is_observable]
     usual = float(np.median(said)) if said else 1.0
     found = _likeliest_changes([(one, one.test(usual)) for one in answers])
@@ -308,10 +287,9 @@ def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest
 
 
 def _chances(changes: list[tuple[_Answer, ScoreTest]]) -> float:
-    """How many independent changes are as many chances as these: neighbours hang together by their noise.
+    """How many independent changes are as many chances as these, whose noise hangs together.
 
-    The squared trace of the correlation over that of its square (Galwey, Genetic Epidemiology 33, 2009, has
-    this among others).
+    The squared trace of the correlation over that of its square (Galwey, Genetic Epidemiology 33, 2009).
     """
     drawn = np.array([answer.drawn.ravel() for answer, one in changes if np.isfinite(one.sigma)])
     if not len(drawn):
@@ -342,39 +320,33 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, sigma, p_value, squared / 2)
 
 
-def _lens(camera: int, power: int, bench: Bench) -> Rows:
-    """Points seen farther out by the share p, times the squared radius to the ``power``, than they are.
-
-    A focal length longer than stated by the share p, or a first radial coefficient larger by p.
-    """
+def _lens(camera: int, power: int, solved: Sensitivity) -> Rows:
+    """A focal length longer by the share p or, with ``power`` 1, a first radial coefficient larger by p."""
     # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
-    projected, mine = bench.projected, (bench.camera == camera) | (camera < 0)
-    return {"observations": bench.whiten(projected * projected.square().sum(0) ** power * mine)}
+    projected, mine = solved.projected, (solved.camera == camera) | (camera < 0)
+    return {"observations": solved.whiten(projected * projected.square().sum(0) ** power * mine)}
 
 
-def _principal(problem: Problem, camera: int, axis: int, bench: Bench) -> Rows:
+def _principal(problem: Problem, camera: int, axis: int, solved: Sensitivity) -> Rows:
     """A principal point that lies farther right, or down, by one pixel."""
-    seen_by, focal_px = bench.camera, torch.as_tensor(problem.intrinsic[:, axis])
+    seen_by, focal_px = solved.camera, torch.as_tensor(problem.intrinsic[:, axis])
     off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
     none = torch.zeros_like(off)
-    return {"observations": bench.whiten(torch.stack([off, none] if axis == 0 else [none, off]))}
+    return {"observations": solved.whiten(torch.stack([off, none] if axis == 0 else [none, off]))}
 
 
-def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Bench], Rows]:
-    """The column of a motion (C, J, 6) of the vehicle in its own frame.
+def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Sensitivity], Rows]:
+    """The column of a ``motion`` (C, J, 6) of the vehicle in its own frame, which is written into zeros."""
 
-    ``motion`` is given what it is ``about``, the problem's arrays and a motion of zeros to write into.
-    """
-
-    def column(bench: Bench) -> Rows:
-        extrinsic, arrays = bench.whitening.estimate.cam_from_vehicle[:, None], bench.arrays
+    def column(solved: Sensitivity) -> Rows:
+        extrinsic, arrays = solved.whitening.estimate.cam_from_vehicle[:, None], solved.arrays
         still = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
         tangent = arrays.at_moments(motion(*about, arrays, still), axis=1)
         shift, turn = (
             (extrinsic[..., :3, :3] @ one[..., None])[..., 0] for one in (tangent[..., :3], tangent[..., 3:])
         )
         shift = shift + torch.linalg.cross(extrinsic[..., :3, 3].expand_as(turn), turn)
-        return {"observations": bench.seen(bench.turned(-torch.cat([shift, turn], dim=-1)))}
+        return {"observations": solved.seen(solved.turned(-torch.cat([shift, turn], dim=-1)))}
 
     return column
 
@@ -431,15 +403,15 @@ def _since(arrays: Arrays, frame: int) -> Tensor:
     return (later & (arrays.visit == arrays.visit[frame])).to(arrays.centre.dtype)[:, None]
 
 
-def _crown(axis: int, bench: Bench) -> Rows:
+def _crown(axis: int, solved: Sensitivity) -> Rows:
     """Corners that lie lower by the value times their distance from the route, all or on one side alone."""
-    arrays, estimate = bench.arrays, bench.whitening.estimate
+    arrays, estimate = solved.arrays, solved.whitening.estimate
     frames = arrays.vehicle_from_map.inverse()
     route = KDTree(frames[:, :2, 3].cpu().numpy())
     nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
     left = ((estimate.corners_map - frames[nearest, :2, 3]) * frames[nearest, :2, 1]).sum(1)
     lower = (left.abs(), left.clamp(min=0), -left.clamp(max=0))[axis]
-    return raised(bench, -lower[arrays.corner.long()])
+    return raised(solved, -lower[arrays.corner.long()])
 
 
 def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:
@@ -449,17 +421,17 @@ def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:
     return out
 
 
-def _survey(camera: int, axis: int, bench: Bench) -> Rows:
-    out, which = torch.zeros_like(bench.arrays.centre), slice(None) if camera < 0 else camera
-    out[which, axis] = -bench.arrays.centre_information_root[which, axis]
+def _survey(camera: int, axis: int, solved: Sensitivity) -> Rows:
+    out, which = torch.zeros_like(solved.arrays.centre), slice(None) if camera < 0 else camera
+    out[which, axis] = -solved.arrays.centre_information_root[which, axis]
     return {"camera_centre": out}
 
 
-def _datum(axis: int, bench: Bench) -> Rows:
-    out = torch.zeros_like(bench.arrays.control)
-    out[:, axis:] = -bench.arrays.control_root[:, 2 * axis : 2 + axis]
+def _datum(axis: int, solved: Sensitivity) -> Rows:
+    out = torch.zeros_like(solved.arrays.control)
+    out[:, axis:] = -solved.arrays.control_root[:, 2 * axis : 2 + axis]
     return {"control_points": out}
 
 
-def _size(which: Tensor, bench: Bench) -> Rows:
-    return {"known_lengths": -bench.arrays.lengths.information_root * which}
+def _size(which: Tensor, solved: Sensitivity) -> Rows:
+    return {"known_lengths": -solved.arrays.lengths.information_root * which}

@@ -21,13 +21,10 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
-    """``problem`` with the observations ``keep`` (K,) only, and the corners and frames between them.
+    """``problem`` with the observations ``keep`` (K,) only, and which corners of it the part still has.
 
-    Every camera must keep an observation. Frames are cut off before the first and after the last that
-    is used, so that a drift still runs through the others.
-
-    Returns:
-        The part, and the corners of ``problem`` that its corners are.
+    Every camera must keep an observation. Frames are cut off before the first and after the last that is
+    used, so that a drift still runs through the others.
     """
     seen = problem.observations
     corners, corner = np.unique(seen.corner[keep], return_inverse=True)
@@ -77,8 +74,7 @@ MODELS: Mapping[str, Model] = {
 # Frames of the stretch that models are compared on, and the share of its observations held out.
 _STRETCH_FRAMES = 120
 _HELD_OUT_SHARE = 0.2
-# With fewer than these the residuals cannot tell one model from another.
-_MIN_HELD_OUT = 40
+_MIN_HELD_OUT = 40  # with fewer than these the residuals cannot tell one model from another
 # By how much what can take up errors of other inputs, such as a clock offset, must predict better than what
 # does without.
 _SURE_STANDARD_ERRORS = 3.0
@@ -115,18 +111,11 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
     """Choose the richest of the models ``names`` that predicts as well as the best.
 
     As well means: within one standard error of the paired difference, by frames, since errors within a frame
-    go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). Of
-    equals the richest, since its priors keep it from fitting noise, and an error that is not estimated is
-    missing from the stated accuracy, too. A clock offset trades against the camera's forward offset, so it
-    is taken only where it predicts better than all others by more than three standard errors.
-
-    Args:
-        problem: the drive; its extrinsics are the start, and had better be near already.
-        options: how to solve.
-        names: of :data:`MODELS`, the simplest first; ``clock`` is left out where twists are not known.
-
-    Raises:
-        AdjustError: a name is unknown, or a model's problem cannot be solved.
+    go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). A clock
+    offset trades against the camera's forward offset, so it is taken only where it predicts better than all
+    others by more than three standard errors. The extrinsics of ``problem`` had better be near already;
+    ``names`` begin with the simplest, and ``clock`` is left out where twists are not known. Raises
+    AdjustError where a model's problem cannot be solved.
     """
     unknown = [name for name in names if name not in MODELS]
     if unknown:
@@ -154,11 +143,6 @@ def predicts_better(problem: Problem, rival: Problem, options: SolveOptions) -> 
     """Whether ``problem`` surely predicts held-out observations better than ``rival``, which moves them.
 
     Surely means by more than three standard errors of the paired difference, as in :func:`select_model`.
-
-    Args:
-        problem: the drive; its extrinsics are near already.
-        rival: the same observations of the same corners, but for where in the image they are.
-        options: how to solve.
     """
     chosen = _stretch(problem)
     held_out = _held_out(restrict(problem, chosen)[0].observations)
@@ -180,10 +164,7 @@ def _losses(whole: Problem, held_out: BoolArray, options: SolveOptions) -> Float
 def predicted_squared(
     whole: Problem, held_out: BoolArray, fitted: Problem, solution: Solution, corners: np.ndarray
 ) -> FloatArray:
-    """Squared residuals, in standard deviations, of the ``held_out`` observations of ``whole``.
-
-    ``solution`` is that of ``fitted``, the rest of ``whole``, whose corners are ``corners`` of ``whole``.
-    """
+    """Squared residuals, in sigmas, of the ``held_out`` observations by the solution of the others."""
     seen = whole.observations
     camera, frame = seen.camera[held_out], seen.frame[held_out]
     first = int(whole.observations.frame[~held_out].min())

@@ -43,45 +43,31 @@ _ADVICE = {
 
 @dataclass(frozen=True)
 class Solution:
-    """The adjusted extrinsics, poses and corners, and the evidence that they are the optimum.
+    """The adjusted extrinsics, poses and corners, and the evidence that they are the optimum."""
 
-    Attributes:
-        status: how it ended.
-        cam_from_vehicle: adjusted extrinsics (C, 4, 4).
-        map_from_vehicle: adjusted poses (J, 4, 4); the recorded ones where no state is estimated.
-        corners_map: (N, 2) m.
-        residual_px: projected minus observed, (K, 2).
-        mahalanobis2: squared residual in standard deviations (K,), chi-square with 2 degrees of
-            freedom where model and covariances are right (what was seen of a line is scaled to that).
-        verdict: a :class:`v2hdm.adjust.Verdict` on each observation (K,).
-        clock_offset_s: (C, V) how much later than stated each camera's images of each visit were taken; 0
-            where that is not estimated.
-        read_out_s: (C,) the time from the first row of each camera's images to the last; as stated where that
-            is not estimated.
-        cost_terms: the parts of the cost by name; they add up to :attr:`cost`.
-        evaluations: of cost and gradient, all stages together.
-        gap: predicted decrease still possible, as a fraction of the cost (the certificate).
-        chi2_per_dof: about 1 where the noise model is right; outliers are left out.
-        observation_factor: how many times as large as stated the observations' variances are, if the priors'
-            are right; outliers are left out.
-        covariance: of everything estimated, on demand.
-    """
-
-    status: Status
-    cam_from_vehicle: FloatArray
-    map_from_vehicle: FloatArray
-    corners_map: FloatArray
-    residual_px: FloatArray
+    status: Status  # how it ended
+    cam_from_vehicle: FloatArray  # adjusted extrinsics (C, 4, 4)
+    map_from_vehicle: FloatArray  # adjusted poses (J, 4, 4); the recorded ones where no state is estimated
+    corners_map: FloatArray  # (N, 2) m
+    residual_px: FloatArray  # projected minus observed, (K, 2)
+    # squared residual in standard deviations (K,), chi-square with 2 degrees of freedom where model and
+    # covariances are right (what was seen of a line is scaled to that)
     mahalanobis2: FloatArray
-    verdict: VerdictArray
+    verdict: VerdictArray  # a :class:`v2hdm.adjust.Verdict` on each observation (K,)
+    # (C, V) how much later than stated each camera's images of each visit were taken; 0 where that is not
+    # estimated
     clock_offset_s: FloatArray
+    # (C,) the time from the first row of each camera's images to the last; as stated where that is not
+    # estimated
     read_out_s: FloatArray
-    cost_terms: Mapping[str, float]
-    evaluations: int
-    gap: float
-    chi2_per_dof: float
+    cost_terms: Mapping[str, float]  # the parts of the cost by name; they add up to :attr:`cost`
+    evaluations: int  # of cost and gradient, all stages together
+    gap: float  # predicted decrease still possible, as a fraction of the cost (the certificate)
+    chi2_per_dof: float  # about 1 where the noise model is right; outliers are left out
+    # how many times as large as stated the observations' variances are, if the priors' are right; outliers
+    # are left out
     observation_factor: float
-    covariance: Covariance = field(repr=False)
+    covariance: Covariance = field(repr=False)  # of everything estimated, on demand
 
     @property
     def cost(self) -> float:
@@ -99,10 +85,7 @@ class Solution:
         return self.covariance.extrinsic()
 
     def corner_covariance(self, indices: IntArray) -> FloatArray:
-        """Joint covariance (2n, 2n), m^2, of the corners ``indices`` (n,), stacked x0, y0, x1, ...
-
-        For groups (M, n), such as the corners of all markings, one each: (M, 2n, 2n).
-        """
+        """Joint covariance (2n, 2n), m^2, x0, y0, x1, ..., of corners (n,); of groups (M, n), one each."""
         groups = np.atleast_2d(indices)
         covariance = self.covariance.corners(groups)
         return covariance if np.ndim(indices) == 2 else covariance[0]

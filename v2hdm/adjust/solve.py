@@ -57,13 +57,7 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
     start, opening, spent = _start(near, engine, robust, options)
     del near
     descent = descend(
-        engine,
-        start,
-        robust,
-        options.gap_tolerance,
-        options.max_refreshes,
-        options.max_evaluations,
-        opening,
+        engine, start, robust, options.gap_tolerance, options.max_refreshes, options.max_evaluations, opening
     )
     del opening
     return _report(problem, origin_map, options, descent, spent)
@@ -74,10 +68,8 @@ def _start(
 ) -> tuple[Estimate, Whitening | None, int]:
     """Where the descent starts, its first whitening if that is known, and the evaluations spent.
 
-    A coarse stage comes before it where the start is far from the optimum, or the problem large.
-
-    Raises:
-        AdjustError: none of a corner's rays fixes it.
+    A coarse stage comes first where the start is far off, or the problem large. Raises AdjustError where none
+    of a corner's rays fixes it.
     """
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
     if options.coarse and not is_worth_a_look(engine.arrays):
@@ -111,11 +103,7 @@ def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tup
 
 
 def _report(
-    problem: Problem,
-    origin_map: FloatArray,
-    options: SolveOptions,
-    descent: Descent,
-    spent: int,
+    problem: Problem, origin_map: FloatArray, options: SolveOptions, descent: Descent, spent: int
 ) -> Solution:
     """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
     robust = Loss(options.loss, options.loss_scale)

@@ -1,11 +1,10 @@
 """Sparse Cholesky factorisation in dense tiles, for a matrix with an arrow's shape.
 
-The frames of a drive, cut into tiles along the route, couple to their neighbours and, where the
-route is driven again, to the tiles of earlier laps; the extrinsics couple to everything and come last,
-as the *tip*. Tiles are ordered by reverse Cuthill-McKee or, where many couple, by least degree, and their
-fill is found beforehand (the elimination tree: George and Liu, Computer Solution of Large Sparse Positive
-Definite Systems, 1981), so time and memory grow with the length of the route. Everything inside a tile is a
-dense product.
+Frames, cut into tiles along the route, couple to their neighbours and to tiles of earlier laps; the
+extrinsics couple to everything and come last, as the *tip*. Tiles are ordered by reverse Cuthill-McKee or,
+where many couple, by least degree, and their fill is found beforehand (the elimination tree: George and Liu,
+Computer Solution of Large Sparse Positive Definite Systems, 1981), so time and memory grow with the route's
+length.
 """
 
 from __future__ import annotations
@@ -27,20 +26,15 @@ from torch import Tensor
 from v2hdm.compiled import kernel
 from v2hdm.records import FloatArray, IntArray
 
-TIP = -1
-"""The row of the tiles that border the others, and row and column of the last one."""
+TIP = -1  # the row of the tiles that border the others, and row and column of the last one
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Which tiles are not zero.
+    """Which tiles are not zero."""
 
-    Attributes:
-        position: where each tile along the route stands in the elimination order.
-        below: for each column in that order, the rows below its diagonal, fill included, ascending.
-    """
-
-    position: tuple[int, ...]
+    position: tuple[int, ...]  # where each tile along the route stands in the elimination order
+    # for each column in that order, the rows below its diagonal, fill included, ascending
     below: tuple[tuple[int, ...], ...]
 
     def multiplications(self, size: int, tip: int) -> float:
@@ -50,10 +44,7 @@ class Pattern:
 
 
 def find_pattern(tile_count: int, cliques: Iterable[Sequence[int]], least_degree: bool = False) -> Pattern:
-    """The pattern of a factor whose matrix couples all tiles of each clique with one another.
-
-    The order is reverse Cuthill-McKee, or ``least_degree``: next comes the tile that couples to the fewest.
-    """
+    """The pattern of a factor whose matrix couples all tiles of each clique with one another."""
     edges = {pair for clique in cliques for pair in combinations(sorted(clique), 2)}
     position = np.arange(tile_count)
     if edges:
@@ -102,23 +93,17 @@ def _least_degree(tile_count: int, edges: set[tuple[int, int]]) -> list[int]:
 
 @dataclass(frozen=True)
 class TiledMatrix:
-    """The lower tiles of a symmetric matrix, laid out as those of its factor, which takes their place.
+    """The lower tiles of a symmetric matrix, laid out as those of its factor, which takes their place."""
 
-    Attributes:
-        pattern: which there are.
-        values: all numbers. What follows are views of them.
-        columns: the tiles of each column but the tip's, stacked, in elimination order, the tip's rows last.
-        tip: the last tile on the diagonal.
-        tiles: all of them by (row, column) in elimination order, or :data:`TIP`.
-        keys, at: of those in columns, ascending, the column times G + 1 plus the row, the tip's being G; and
-            where each begins among the values.
-    """
-
-    pattern: Pattern
-    values: Tensor
+    pattern: Pattern  # which there are
+    values: Tensor  # all numbers. What follows are views of them.
+    # the tiles of each column but the tip's, stacked, in elimination order, the tip's rows last
     columns: tuple[Tensor, ...]
-    tip: Tensor
+    tip: Tensor  # the last tile on the diagonal
+    # all of them by (row, column) in elimination order, or :data:`TIP`
     tiles: Mapping[tuple[int, int], Tensor]
+    # of those in columns, ascending, the column times G + 1 plus the row, the tip's being G; and where each
+    # begins among the values
     keys: NDArray[np.int64]
     at: NDArray[np.int64]
 
@@ -143,23 +128,14 @@ class TiledMatrix:
 
 @dataclass(frozen=True)
 class TiledCholesky:
-    """L of a positive definite matrix in tiles of ``size``, the tip last.
+    """L of a positive definite matrix in tiles of ``size``, the tip last."""
 
-    Attributes:
-        diagonal: lower factors of the diagonal tiles (G, size, size).
-        panels: what stands below each, stacked, the tip's rows last.
-        rows: which rows of the vector each panel acts on.
-        tip: lower factor of the tip, the identity where that is held.
-        values: what all of these but the tip are views of.
-        held: what is left of a tip that is held, the others eliminated.
-    """
-
-    diagonal: tuple[Tensor, ...]
-    panels: tuple[Tensor, ...]
-    rows: tuple[Tensor, ...]
-    tip: Tensor
-    values: Tensor
-    held: Tensor | None = None
+    diagonal: tuple[Tensor, ...]  # lower factors of the diagonal tiles (G, size, size)
+    panels: tuple[Tensor, ...]  # what stands below each, stacked, the tip's rows last
+    rows: tuple[Tensor, ...]  # which rows of the vector each panel acts on
+    tip: Tensor  # lower factor of the tip, the identity where that is held
+    values: Tensor  # what all of these but the tip are views of
+    held: Tensor | None = None  # what is left of a tip that is held, the others eliminated
 
     @property
     def size(self) -> int:
@@ -217,10 +193,7 @@ class TiledCholesky:
 
 
 def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesky | None:
-    """Factorise, the tip too unless it is held, overwriting the matrix; None where it is not definite.
-
-    Right-looking: each column, once factorised, is subtracted from those it couples to.
-    """
+    """Factorise in place, right-looking, the tip too unless it is held; None where it is not definite."""
     diagonal, panels, rows = [], [], []
     tip = matrix.tip
     size = matrix.columns[0].shape[1] if matrix.columns else 0

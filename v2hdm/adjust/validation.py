@@ -17,15 +17,11 @@ VerdictArray = NDArray[np.int8]
 
 # The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
 _MEDIAN_SQUARED = 2 * float(np.log(2))
-# Observations that are judged at once.
-_ROWS = 1 << 18
+_ROWS = 1 << 18  # observations that are judged at once
 
 
 class Verdict(IntEnum):
-    """The verdict on an observation.
-
-    One is unconfirmed where all others of its corner contradict it and one another.
-    """
+    """The verdict on an observation; unconfirmed: all others of its corner contradict it and one another."""
 
     ACCEPTED = 0
     CONTRADICTS = 1
@@ -45,11 +41,9 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
 
 
 def line_variance_factor(squared: FloatArray, taken: float) -> float:
-    """How many times as large as stated the variance of lines is, by the median.
+    """How many times as large as stated the variance of lines is, by the median of ``squared`` (K,).
 
-    Args:
-        squared: (K,) squared residuals of lines, :func:`as_of_point`.
-        taken: share of their degrees of freedom that unknowns take.
+    ``taken`` is the share of their degrees of freedom that unknowns take.
     """
     if not len(squared):
         return 1.0
@@ -58,25 +52,14 @@ def line_variance_factor(squared: FloatArray, taken: float) -> float:
 
 
 def classify(
-    observations: Observations,
-    mahalanobis2: FloatArray,
-    behind: BoolArray,
-    probability: float,
-    scale: float,
+    observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float, scale: float
 ) -> VerdictArray:
-    """A :class:`Verdict` (K,) for every observation.
+    """A :class:`Verdict` (K,) for every observation, by its squared residual in sigmas ``mahalanobis2`` (K,).
 
-    The gate is the squared distance that a sound observation exceeds with ``probability`` (chi-square,
-    two degrees of freedom: -2 ln p). Where the stated covariances are too small overall, the gate
-    widens with the median, so that a wrong noise model does not empty the map. An observation is
-    unconfirmed when the gate leaves it alone with a corner that had others.
-
-    Args:
-        observations: what was seen.
-        mahalanobis2: squared residuals in standard deviations (K,).
-        behind: corners (K,) that lie behind their camera.
-        probability: share of sound observations that one is ready to lose.
-        scale: of the noise's variance, :func:`noise_scale`.
+    The gate is the squared distance that a sound observation exceeds with ``probability`` (chi-square, two
+    degrees of freedom: -2 ln p), widened by the noise's ``scale`` so that covariances that are too small do
+    not empty the map. An observation is unconfirmed when the gate leaves it alone with a corner that had
+    others.
     """
     gate = -2 * np.log(probability) * scale
     verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
@@ -113,15 +96,10 @@ def variance_factors(
 ) -> VarianceFactors:
     """Chi-square per degree of freedom, of good observations and priors together and of the former.
 
-    What the priors have left of their own degrees of freedom is what the observations have taken of them:
-    the expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric
-    Computer Vision, section 4.2.4, on variance components).
-
-    Args:
-        squared: (K,) squared residuals of the observations, in standard deviations.
-        of_priors: chi-square of the priors.
-        free: unknowns less those that priors other than the poses' hold.
-        scale: :func:`~v2hdm.adjust.validation.noise_scale` of ``squared``, where it is known already.
+    What the priors have left of their own degrees of freedom is what the observations have taken of them: the
+    expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric Computer
+    Vision, section 4.2.4, on variance components). ``free`` are the unknowns less those that priors other
+    than the poses' hold.
     """
     good = squared <= _OUTLIER_SQUARED * (noise_scale(squared) if scale is None else scale)
     of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN

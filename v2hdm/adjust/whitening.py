@@ -29,8 +29,7 @@ from v2hdm.adjust.reduced import Coupled, Plan, ReducedSystem, Spread, from_tile
 from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.errors import AdjustError
 
-# Below this a pivot is what rounding left of zero.
-SINGULAR_PIVOT = 1e-13
+SINGULAR_PIVOT = 1e-13  # below this a pivot is what rounding left of zero
 # What is added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any.
 # A pivot is what elimination has left of it, and where that is rounding it says nothing of the size needed.
 JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
@@ -38,30 +37,19 @@ JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 
 @dataclass(frozen=True)
 class Whitening:
-    """The factorised Hessian at one estimate.
+    """The factorised Hessian at one estimate."""
 
-    Attributes:
-        engine: of the problem that it belongs to.
-        plan: the tiles of its reduced system.
-        estimate, robust: where, and under which loss, it was linearised.
-        linearised: the problem there, the corners eliminated.
-        gradient: of the cost there by y.
-        spread: how the pairs move with frames and cameras.
-        reduced_factor: L_S.
-        smallest_pivot: least share of an unknown's own information that the others leave it.
-        jitter: share of U's diagonal that had to be added to it for there to be an L_S.
-    """
-
-    engine: Engine
-    plan: Plan
+    engine: Engine  # of the problem that it belongs to
+    plan: Plan  # the tiles of its reduced system
+    # where, and under which loss, it was linearised
     estimate: Estimate
     robust: Loss
-    linearised: Linearised
-    gradient: Tensor
-    spread: Spread
-    reduced_factor: TiledCholesky
-    smallest_pivot: float
-    jitter: float
+    linearised: Linearised  # the problem there, the corners eliminated
+    gradient: Tensor  # of the cost there by y
+    spread: Spread  # how the pairs move with frames and cameras
+    reduced_factor: TiledCholesky  # L_S
+    smallest_pivot: float  # least share of an unknown's own information that the others leave it
+    jitter: float  # share of U's diagonal that had to be added to it for there to be an L_S
 
     @property
     def terms(self) -> dict[str, float]:
@@ -94,10 +82,9 @@ class Whitening:
         return torch.cat([reduced.mT, own.flatten(1)], dim=1)
 
     def step(self, whitened: Tensor) -> tuple[Gradient, Tensor, Tensor]:
-        """The step x that whitened variables stand for, but for its corners.
+        """The step x of whitened variables but for its corners, the pairs' left tangents (C, M, 6) under it.
 
-        Returns it, the pairs' left tangents (C, M, 6) under it, and the whitened variables (N, 2) of the
-        corners, of kept ones the step itself.
+        The third are the corners' whitened variables (N, 2), of kept ones the step itself.
         """
         arrays = self.engine.arrays
         tip = len(self.reduced_factor.tip)
@@ -140,12 +127,9 @@ def _less_kept(plan: Plan, corners: Tensor) -> Tensor:
 def factorise(
     engine: Engine, plan: Plan, estimate: Estimate, robust: Loss, hold_cameras: bool = False
 ) -> Whitening:
-    """Whitening at ``estimate``, under the weights that the loss gives there.
+    """Whitening at ``estimate``, under the weights that the loss gives there; held cameras' unknowns stay.
 
-    The cameras' unknowns, where they are held, stay as they are: the last of the whitened variables.
-
-    Raises:
-        AdjustError: the normal equations cannot be factorised.
+    Raises AdjustError where the normal equations cannot be factorised.
     """
     spread, priors = engine.spread(estimate), engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:

@@ -23,8 +23,7 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
 from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
 
-_HORIZON_M2 = 1e4
-"""Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2."""
+_HORIZON_M2 = 1e4  # variance of a ground point, in its better direction, from which it is on the horizon, m^2
 
 OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the edge of paint, px: measured on renders, where it is 1 to 3."""
@@ -34,20 +33,14 @@ BORDER_PX = 10.0  # width of the image's border, px, within which a marking may 
 
 @dataclass(frozen=True)
 class Located:
-    """Ground positions of S sightings.
+    """Ground positions of S sightings."""
 
-    ``corners_map`` (S, 4, 2) m with the covariance ``covariance_m2`` (S, 4, 2, 2) that the pixel
-    noise alone gives them; ``ray_map`` (S, 4, 2) from below the camera to the corner; ``height_m``
-    (S,) of the camera. ``valid`` (S, 4) are points and ``informs`` (S, 4) all corners that say something,
-    as :class:`~v2hdm.association.sightings.Sightings` has them, without those that miss the ground.
-    """
-
-    corners_map: FloatArray
-    covariance_m2: FloatArray
-    ray_map: FloatArray
-    height_m: FloatArray
-    valid: BoolArray
-    informs: BoolArray
+    corners_map: FloatArray  # (S, 4, 2) m
+    covariance_m2: FloatArray  # (S, 4, 2, 2) by the pixel noise alone
+    ray_map: FloatArray  # (S, 4, 2) from below the camera to the corner
+    height_m: FloatArray  # (S,) of the camera
+    valid: BoolArray  # (S, 4) points, without those that miss the ground
+    informs: BoolArray  # (S, 4) all corners that say something, as sightings have them
 
     @property
     def range_m(self) -> FloatArray:
@@ -77,10 +70,7 @@ def ground_points_with_jacobian(
 def _on_ground(
     rig: Rig, camera: IntArray, frame: IntArray, pinhole_px: FloatArray, row_share: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`ground_points_with_jacobian` of pixels (N, K, 2) of cameras (N,) at frames (N,).
-
-    Where shutters roll, each by the pose at which its row (N, K) was read.
-    """
+    """:func:`ground_points_with_jacobian` of pixels (N, K, 2), each by the pose at which its row was read."""
     if rig.read_out_s is None:
         ipms = ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
         return ground_points_with_jacobian(ipms, pinhole_px)
@@ -114,11 +104,10 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
 
 
 def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
-    """In how many images a symbol lies along each of the quadrilaterals (G, 4, 2); nan ones have none.
+    """In how many images a symbol mostly covers the middle line of each quadrilateral (G, 4, 2).
 
-    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; other images
-    show the whole arrow there. A symbol lies along a quadrilateral whose middle line it mostly covers: an
-    arrow that crosses a stop line does not.
+    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; others show
+    it whole.
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
     known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
@@ -140,10 +129,7 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
-    """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length.
-
-    The place is known in the image up to :data:`OUTLINE_SIGMA_PX`; towards the horizon that is any length.
-    """
+    """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length."""
     if not len(symbols.camera):
         return []
     length = [len(outline) for outline in symbols.outlines_pinhole_px]

@@ -26,28 +26,21 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
 
-LEAST_TOLERANCE_M = 0.05
-"""How far corners of one shape may deviate, m, however small the marking is."""
+LEAST_TOLERANCE_M = 0.05  # how far corners of one shape may deviate, m, however small the marking is
 
 _CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
 _HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls
 
-_OPEN_END_M = 10.0
-"""Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
+_OPEN_END_M = 10.0  # sigma, m, of where along its side a corner is that is no point: markings may be so long
 
 
 @dataclass(frozen=True)
 class Association:
-    """Groups of sightings: tracks of one camera, or markings of the map.
+    """Groups of sightings: tracks of one camera, or markings of the map."""
 
-    ``group`` (S,) numbers groups from 0, -1 for sightings that belong to none; ``shift`` (S,) turns
-    a sighting's corners into its group's order: corner c of the group is corner (c + shift) mod 4
-    of the sighting. ``count`` is the number of groups.
-    """
-
-    group: IntArray
-    shift: IntArray
-    count: int
+    group: IntArray  # (S,) from 0, -1 for sightings that belong to none
+    shift: IntArray  # (S,) corner c of the group is corner (c + shift) mod 4 of the sighting
+    count: int  # of groups
 
     def corner_order(self) -> IntArray:
         """Which of each sighting's corners is corner c of its group (S, 4)."""
@@ -76,15 +69,11 @@ def same_groups(a: Association, b: Association) -> bool:
 
 @dataclass(frozen=True)
 class FusedGroups:
-    """Where G groups lie: ``corners_map`` (G, 4, 2) m with ``covariance_m2`` (G, 4, 2, 2).
+    """Where G groups lie; corners of which nothing is known are nan."""
 
-    ``seen`` (G, 4) counts the sightings that show a corner as a point. A corner without any may still lie on
-    a known line, and says so by its covariance; if nothing is known of it, it is nan.
-    """
-
-    corners_map: FloatArray
-    covariance_m2: FloatArray
-    seen: IntArray
+    corners_map: FloatArray  # (G, 4, 2) m
+    covariance_m2: FloatArray  # (G, 4, 2, 2), large along a line that a corner is known to lie on
+    seen: IntArray  # (G, 4) sightings that show a corner as a point
 
     @property
     def valid(self) -> BoolArray:
@@ -95,9 +84,8 @@ class FusedGroups:
 def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
     """Corners (S, 4) that a sighting knows only across their side, and others of its group as points.
 
-    Where other paint, a shadow or the image's border cuts a marking, its corner is somewhere on the line of
-    the side, no nearer than the cut. Images that are cut alike are wrong alike: as soon as another image
-    shows the corner, only the line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
+    Images that other paint, a shadow or the border cut alike are wrong alike: as soon as another image shows
+    the corner, only its line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
     """
     grouped = (association.group >= 0)[:, None]
     number = 4 * association.group[:, None] + np.arange(4)
@@ -156,10 +144,10 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
 def in_view(
     association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float
 ) -> BoolArray:
-    """Which corners (S, 4) the adjustment may use: points, and those on lines that the camera can see.
+    """Which corners (S, 4) the adjustment may use: points, and those on lines in front of the camera.
 
-    A dash that passes under the vehicle is cut by the image's border; its side is a line of the image, but
-    where its corner lies behind the camera the line cannot be had by projecting the corner.
+    A dash that passes under the vehicle is cut by the image's border, and its corner behind the camera has no
+    projection.
     """
     fused = fuse_groups(association, located, jitter_rad)
     cam_from_map = rig.cam_from_map(sightings.camera, sightings.frame)
@@ -246,8 +234,7 @@ def _mean_covariance(fused: FusedGroups, groups: IntArray) -> FloatArray:
     return np.asarray(covariance.sum(axis=1) / np.maximum(valid.sum(axis=1), 1))
 
 
-_REACH_M = 4.0
-"""How far, m, the middle of a sighting may be from the centre of its marking: dashes are up to 6 m long."""
+_REACH_M = 4.0  # how far, m, a sighting's middle may be from its marking's centre: dashes are up to 6 m long
 
 _MOST_SQUARED = 16.0
 """Squared distance, in sigmas, up to which a sighting fits: four corners on lines have as many freedoms."""
@@ -265,8 +252,8 @@ def attach(
 ) -> Association:
     """Give each sighting without a group to the one that alone fits it; an image shows a group once.
 
-    ``located`` is under ``rig``; of the groups only those of four known corners in ``fused`` are looked at;
-    ``jitter_rad`` is how far the recorded attitude is off.
+    Of the groups only those of four known corners in ``fused`` are looked at; the recorded attitude is off by
+    ``jitter_rad``.
     """
     rows = np.flatnonzero((association.group < 0) & (located.informs.sum(axis=1) >= 2))
     whole = np.flatnonzero(fused.valid.all(axis=1))

@@ -13,24 +13,18 @@ from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
 
-LEAST_HEIGHT_M = 0.1
-"""Least height of a camera, m, for what divides by it."""
+LEAST_HEIGHT_M = 0.1  # least height of a camera, m, for what divides by it
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras and frames as the mapping currently believes them to be.
+    """Cameras and frames as the mapping currently believes them to be."""
 
-    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4). Where a camera's
-    shutter rolls, ``read_out_s`` (C,) are the cameras' read-out times and ``twist_vehicle`` (F, 6) how the
-    vehicle moves, m/s and rad/s in its own frame; else None.
-    """
-
-    intrinsic: FloatArray
-    cam_from_vehicle: FloatArray
-    map_from_vehicle: FloatArray
-    read_out_s: FloatArray | None = None
-    twist_vehicle: FloatArray | None = None
+    intrinsic: FloatArray  # (C, 3, 3)
+    cam_from_vehicle: FloatArray  # (C, 4, 4)
+    map_from_vehicle: FloatArray  # (F, 4, 4)
+    read_out_s: FloatArray | None = None  # (C,) where a camera's shutter rolls
+    twist_vehicle: FloatArray | None = None  # (F, 6) the vehicle's motion then, m/s, rad/s
 
     def cam_from_map(
         self, camera: IntArray, frame: IntArray, row_share: FloatArray | None = None
@@ -55,10 +49,7 @@ def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Symbols:
-    """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes.
-
-    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them.
-    """
+    """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines and their row shares, classes."""
 
     camera: IntArray
     frame: IntArray
@@ -97,33 +88,23 @@ def collect_symbols(
 
 @dataclass(frozen=True)
 class Sightings:
-    """S quadrilateral detections of a drive, in the order of its images.
-
-    ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
-    F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
-    images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
-    ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
-    says which of them are points, small in every direction. ``row_share`` (S, 4) is when in the read-out
-    their rows were taken (:func:`row_shares`); ``log_odds`` (S,) of being markings are the detector's.
-    ``symbols`` are those of the same images.
-    ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
-    """
+    """S quadrilateral detections of a drive, by image; images taken together share a frame."""
 
     cameras: tuple[str, ...]
-    stamp_s: FloatArray
-    map_from_vehicle: FloatArray
-    image: IntArray
-    camera: IntArray
-    frame: IntArray
-    kind: IntArray
-    corners_pinhole_px: FloatArray
-    covariance_px: FloatArray
-    valid: BoolArray
+    stamp_s: FloatArray  # (F,) distinct times, sorted by visit, then time
+    map_from_vehicle: FloatArray  # (F, 4, 4) as recorded
+    image: IntArray  # (S,) indices into ``Drive.images``
+    camera: IntArray  # (S,) into ``cameras``
+    frame: IntArray  # (S,) into the frames
+    kind: IntArray  # (S,) into ``kinds``, the names of the classes
+    corners_pinhole_px: FloatArray  # (S, 4, 2)
+    covariance_px: FloatArray  # (S, 4, 2, 2), px^2
+    valid: BoolArray  # (S, 4) which are points, small in every direction
     kinds: tuple[str, ...]
-    visit: IntArray
-    row_share: FloatArray
-    log_odds: FloatArray
-    symbols: Symbols = NO_SYMBOLS
+    visit: IntArray  # (F,) as in ``Image.visit``
+    row_share: FloatArray  # (S, 4) when in the read-out their rows were taken
+    log_odds: FloatArray  # (S,) of being markings, by the detector
+    symbols: Symbols = NO_SYMBOLS  # of the same images
 
     def __len__(self) -> int:
         return len(self.image)
@@ -168,8 +149,7 @@ def collect_sightings(
 ) -> Sightings:
     """Put the quadrilateral detections of ``cameras`` into one table, lens distortion removed.
 
-    Raises:
-        MappingError: the drive has no such camera, or its images hold no usable marking.
+    Raises MappingError where the drive has no such camera, or its images hold no usable marking.
     """
     infos = [camera_of(drive, name).info for name in cameras]
     camera_index, frames = {name: c for c, name in enumerate(cameras)}, frames_of(drive)
@@ -223,11 +203,7 @@ def collect_sightings(
 
 
 def camera_of(drive: Drive, name: str) -> Camera:
-    """The camera ``name`` of ``drive``.
-
-    Raises:
-        MappingError: the drive has no such camera.
-    """
+    """The camera ``name`` of ``drive``; raises MappingError where there is none."""
     if name not in drive.cameras:
         known = ", ".join(drive.cameras)
         raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")

@@ -45,8 +45,7 @@ _SLOPE_SIGMA = 0.03
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
 _HINGES = 1 + 2 * len(KNOTS_M)
-_ALONG_M, _ACROSS_M = 6.0, 5.0
-"""Between knots of the spline: a third of a camera's reach, and a lane with its margins."""
+_ALONG_M, _ACROSS_M = 6.0, 5.0  # between the spline's knots: a third of a camera's reach, a lane with margins
 
 _GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and how far to either side it goes
 _SIDE_M = 10.0  # ground farther beside the path is as high as there, but for the cross-section
@@ -54,8 +53,7 @@ _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
 _WHEELS_M = (1.4, 0.8)  # half of wheelbase and track, over which the slope is the vehicle's
 
-_CURVATURE = 1e-3
-"""Usual size of the second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m."""
+_CURVATURE = 1e-3  # usual second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
 
 _STATION_M = 1.0  # nearer frames are one place of the path: a vehicle that stands drives none in its noise
@@ -69,7 +67,6 @@ _LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell
 _MOST_RECORDED = 500  # places of the path whose records are taken, evenly
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
 
-
 FILE = "ground.json"  # in a result folder
 
 _STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")
@@ -78,15 +75,11 @@ _STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")
 
 @dataclass(frozen=True)
 class Recorded:
-    """The heights and slopes that were recorded on the path: the ``road``, None where it is level.
+    """The heights and slopes recorded on the path; errors are sums of processes: sigma, way to fade."""
 
-    Errors of heights, m, and of slopes are sums of processes: standard deviation, and the way in m over which
-    they fade.
-    """
-
-    road: Road | None
-    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)
-    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)
+    road: Road | None  # None where it is level
+    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)  # m, m
+    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)  # 1, m
 
     @classmethod
     def of(cls, road: Road | None, noise: PoseNoise) -> Recorded:
@@ -113,29 +106,17 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Paths:
-    """The paths of a drive's visits through F frames.
+    """The paths of a drive's visits through F frames."""
 
-    Attributes:
-        place: (F,) the place, of N, that each frame is at.
-        points_map: (N, 2) m.
-        ahead: (N, 2) unit vectors of the vehicle's heading.
-        sense: (N,) 1 where it drives that way, -1 backwards.
-        station_m: (N,) the way, rising with it, through one visit after the other.
-        bounds_m: (F, 2) stations between which a frame's ground is looked for.
-        position_map: (F, 2) m, of the vehicle.
-        heading: (F, 2) unit vectors.
-        visit_ends: (V, 2) stations at which each visit begins and ends.
-    """
-
-    place: IntArray
-    points_map: FloatArray
-    ahead: FloatArray
-    sense: FloatArray
-    station_m: FloatArray
-    bounds_m: FloatArray
-    position_map: FloatArray
-    heading: FloatArray
-    visit_ends: FloatArray
+    place: IntArray  # (F,) the place, of N, that each frame is at
+    points_map: FloatArray  # (N, 2) m
+    ahead: FloatArray  # (N, 2) unit vectors of the vehicle's heading
+    sense: FloatArray  # (N,) 1 where it drives that way, -1 backwards
+    station_m: FloatArray  # (N,) the way, rising with it, through one visit after the other
+    bounds_m: FloatArray  # (F, 2) stations between which a frame's ground is looked for
+    position_map: FloatArray  # (F, 2) m, of the vehicle
+    heading: FloatArray  # (F, 2) unit vectors
+    visit_ends: FloatArray  # (V, 2) stations at which each visit begins and ends
 
     @classmethod
     def of(cls, map_from_vehicle: FloatArray, visit: IntArray) -> Paths:
@@ -163,15 +144,7 @@ class Paths:
             map_from_vehicle[:, :2, 0], axis=1, keepdims=True
         )
         return cls(
-            place,
-            at,
-            heading[first],
-            sense,
-            station,
-            bounds,
-            points,
-            heading,
-            np.array(list(span.values())),
+            place, at, heading[first], sense, station, bounds, points, heading, np.array(list(span.values()))
         )
 
     def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -231,21 +204,14 @@ def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntAr
 
 @dataclass(frozen=True)
 class Surface:
-    """The ground along the ``paths``.
+    """The ground along the ``paths``."""
 
-    Attributes:
-        paths: of the visits.
-        parameters: (B,) slopes a of the cross-section, left ones first, then c, across within along.
-        covariance: (B, B) of them.
-        knots: the spline's first along the way, m, the way between two, m, and how many functions they make.
-        datum_m: what is added to all heights.
-    """
-
-    paths: Paths
-    parameters: FloatArray
-    covariance: FloatArray
+    paths: Paths  # of the visits
+    parameters: FloatArray  # (B,) slopes a of the cross-section, left ones first, then c, across within along
+    covariance: FloatArray  # (B, B) of them
+    # the spline's first along the way, m, the way between two, m, and how many functions they make
     knots: tuple[float, float, int]
-    datum_m: float = 0.0
+    datum_m: float = 0.0  # what is added to all heights
     _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -388,14 +354,10 @@ class Surface:
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded
     ) -> tuple[Surface, float]:
-        """The surface that a drive makes likeliest, and its gain: how far the images' cost falls.
+        """The surface that a drive makes likeliest, and its gain: how far the cost falls, less noise's share.
 
-        Args:
-            information: (B, B) on the parameters, all else being estimated with them.
-            score: (B,) the gradient of the cost by them, where they are now.
-            recorded: on the path.
-
-        Of the gain, what noise alone would do is taken off: one for each parameter that they determine.
+        ``information`` (B, B) is on the parameters, all else being estimated with them, ``score`` (B,) the
+        gradient of the cost by them, where they are now.
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score

@@ -14,13 +14,21 @@ from scipy.optimize import linear_sum_assignment
 
 from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
-from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import ray_covariance
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
+IPM_SIGMA_RAD = 0.015  # of the direction of an initial IPM: how far markings may seem to move between images
+REFINED_SIGMA_RAD = 0.002  # of the same once the extrinsic has been optimised
+GATE_SIGMAS, MAX_GATE_M = 4.0, 1.5  # size of every gate, and its limit
+SHAPE_TOLERANCE = 0.25  # of corners, from another sighting of the same shape, as a share of its diameter
+LEAST_SIGHTINGS = 3
+"""Images that must show a marking where nothing else is weighed: in the naive methods, and of a track before
+the incremental map takes it up."""
+
+_MAX_GAP_M = 4.0  # of travel that a track survives without a sighting
 _REFUSED = 1e9  # cost of a pair that the assignment must not make
 _POSITION_FLOOR_M = 0.02
 """Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
@@ -44,23 +52,17 @@ class _Track:
 
 
 def build_tracks(
-    sightings: Sightings,
-    located: Located,
-    rig: Rig,
-    direction_rad: float,
-    noise: PoseNoise,
-    options: AssociationOptions,
+    sightings: Sightings, located: Located, rig: Rig, direction_rad: float, noise: PoseNoise
 ) -> Association:
-    """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
+    """Link the ``sightings``, in image order and ``located`` under ``rig``, by camera and visit.
 
     ``direction_rad`` is how far an extrinsic is off, ``noise`` how far poses are. A sighting continues at
-    most one track and a track takes at most one sighting of an image. A sighting that continues none starts
-    its own. Sightings with fewer than two valid corners on the ground belong to no track. No track outlives
-    its visit.
+    most one track and a track takes at most one sighting of an image; with fewer than two valid corners it
+    has none.
     """
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
-    linker = _Linker(sightings, located, rig.map_from_vehicle, direction_rad, noise, options)
+    linker = _Linker(sightings, located, rig.map_from_vehicle, direction_rad, noise)
     count = 0
     for camera in range(len(sightings.cameras)):
         rows_of_camera = np.flatnonzero((sightings.camera == camera) & (located.valid.sum(axis=1) >= 2))
@@ -93,10 +95,8 @@ class _Linker:
         map_from_vehicle: FloatArray,
         direction_rad: float,
         noise: PoseNoise,
-        options: AssociationOptions,
     ) -> None:
-        self._sightings, self._located = sightings, located
-        self._direction_rad, self._options = direction_rad, options
+        self._sightings, self._located, self._direction_rad = sightings, located, direction_rad
         steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
         self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
@@ -110,9 +110,7 @@ class _Linker:
         """Whether ``track`` may still be continued by the sighting at ``row``."""
         now, last = self._sightings.frame[[row, track.row]]
         gap_m = self._odometer_m[now] - self._odometer_m[last]
-        return bool(
-            self._sightings.visit[now] == self._sightings.visit[last] and gap_m <= self._options.max_gap_m
-        )
+        return bool(self._sightings.visit[now] == self._sightings.visit[last] and gap_m <= _MAX_GAP_M)
 
     def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
         """For each row that continues a track: the track and the shift of the row's corners."""
@@ -124,17 +122,17 @@ class _Linker:
         size_m = diameters(corners, valid)
         # Pairs of one class that are no farther apart than their sizes.
         apart_m = np.linalg.norm(mean_corners(corners, valid)[:, None] - self._centre_map[rows], axis=-1)
-        reach_m = self._options.max_gate_m + size_m[:, None] + self._size_m[rows]
+        reach_m = MAX_GATE_M + size_m[:, None] + self._size_m[rows]
         alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
         t, d = np.argwhere(alike & (apart_m <= reach_m)).T
         own = rows[d]
         found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
         covariance = self._noise_m2[last[t]] + self._noise_m2[own] + self._drift_covariance(last[t], own)
         cost = np.sum(found.offset * np.linalg.solve(covariance, found.offset[..., None])[..., 0], axis=-1)
-        tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], LEAST_TOLERANCE_M)
+        tolerance_m = np.maximum(SHAPE_TOLERANCE * size_m[t], LEAST_TOLERANCE_M)
         shape = found.deformation_m / tolerance_m
-        accepted = (cost <= self._options.gate_sigmas**2) & (shape <= 1.0)
-        accepted &= np.linalg.norm(found.offset, axis=-1) <= self._options.max_gate_m
+        accepted = (cost <= GATE_SIGMAS**2) & (shape <= 1.0)
+        accepted &= np.linalg.norm(found.offset, axis=-1) <= MAX_GATE_M
         costs = np.full((len(tracks), len(rows)), _REFUSED)
         costs[t, d] = np.where(accepted, cost + shape**2, _REFUSED)
         shift = np.zeros(costs.shape, dtype=np.int64)

@@ -24,17 +24,13 @@ _SAME_LENS = 2e-3
 
 @dataclass(frozen=True)
 class Movement:
-    """How a camera has moved along and about the vehicle's axes: forward, left, up.
-
-    ``shift_m`` (3,) and ``turn_rad`` (3,) are the movement, ``covariance`` (6, 6) is that of both.
-    ``probability`` is that of differences at least as large where nothing has moved.
-    """
+    """How a camera has moved along and about the vehicle's axes: forward, left, up."""
 
     camera: str
-    shift_m: FloatArray
-    turn_rad: FloatArray
-    covariance: FloatArray
-    probability: float
+    shift_m: FloatArray  # (3,)
+    turn_rad: FloatArray  # (3,)
+    covariance: FloatArray  # (6, 6) of both
+    probability: float  # of differences at least as large where nothing has moved
 
     @property
     def sigma(self) -> FloatArray:
@@ -57,10 +53,7 @@ class Movement:
 def compare_calibrations(
     before: Mapping[str, Calibration], after: Mapping[str, Calibration]
 ) -> list[Movement]:
-    """The movements of the cameras, by name, that both hold.
-
-    Raises MapFileError where they have no camera in common, or as :func:`movement`.
-    """
+    """The movements of the cameras that both hold; raises MapFileError where none, or as :func:`movement`."""
     common = [name for name in before if name in after]
     if not common:
         raise MapFileError(f"no camera in common: {', '.join(before)} and {', '.join(after)}; compare others")
@@ -68,10 +61,7 @@ def compare_calibrations(
 
 
 def movement(before: Calibration, after: Calibration) -> Movement:
-    """The movement between two calibrations of one camera, whose errors are independent.
-
-    Raises MapFileError where they are of two cameras or lenses, or one has no covariance.
-    """
+    """The movement between two independent calibrations of one camera and lens; else MapFileError."""
     _check_comparable(before, after)
     assert before.covariance is not None
     assert after.covariance is not None

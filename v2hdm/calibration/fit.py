@@ -60,10 +60,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Seen:
-    """N points and their camera: recorded pixels, pinhole pixels and the lens between them.
-
-    ``by_pinhole`` (N, 2, 2) is the derivative of the recorded pixel by the pinhole pixel.
-    """
+    """N points of a camera: recorded and pinhole pixels, their derivative ``by_pinhole`` (N, 2, 2)."""
 
     info: CameraInfo
     points_px: FloatArray
@@ -133,10 +130,7 @@ class Seen:
     def mixture(
         self, square: FloatArray, covariance: FloatArray, factor: FloatArray | float
     ) -> tuple[FloatArray, FloatArray]:
-        """Log density (..., N) of points that may be wrong, and the probability (..., N) that each is right.
-
-        ``square`` (..., N) is that of :meth:`squared`, ``factor`` (...) is q.
-        """
+        """Log density (..., N) of points that may be wrong, and the probability that each is right."""
         q = np.asarray(factor)[..., None]
         log_right = -square / (2 * q) - np.log(2 * np.pi * q * np.sqrt(np.linalg.det(covariance)))
         right = np.log1p(-_WRONG_SHARE) + log_right
@@ -153,18 +147,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Fit:
-    """A mounting and how well the points determine it.
-
-    ``covariance`` (6, 6) is of the left tangent of ``cam_from_vehicle``, infinite on the diagonal where the
-    points leave it free. ``factor`` is q, of the stated variances, ``right`` (N,) the probability that each
-    point is right.
-    """
+    """A mounting and how well the points determine it."""
 
     seen: Seen
     cam_from_vehicle: FloatArray
+    # (6, 6) of the left tangent, infinite on the diagonal where the points leave it free
     covariance: FloatArray
-    factor: float
-    right: FloatArray
+    factor: float  # q, of the stated variances
+    right: FloatArray  # (N,) probability that each point is right
     log_posterior: float
 
     @property
@@ -174,10 +164,7 @@ class Fit:
 
 
 def fit_mountings(seen: Seen, starts: int = _REFINED, rounds: int = _ROUNDS) -> list[Fit]:
-    """Mountings that explain the points, the most likely first; none where all points lie on a line.
-
-    So many ``starts`` are refined, each by ``rounds`` of expectation maximisation at most.
-    """
+    """Mountings that explain the points, the most likely first; none where all points lie on a line."""
     found: list[Fit] = []
     for start in _starts(seen, starts):
         fit = _refine(seen, start, rounds)

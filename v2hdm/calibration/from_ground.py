@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from v2hdm.geometry.mounting import mounting_words
+from v2hdm.geometry.ipm import mounting_words
 from v2hdm.ground import GroundEstimate, GroundStatus, Reading, estimate_cameras
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.records import Calibration, Drive
-from v2hdm.report.outputs import write_json
+from v2hdm.store.files import write_json
 from v2hdm.verdict import Verdict, check_drive
 
 # Each parameter's name, and the factor and unit that people read it in.

@@ -20,15 +20,13 @@ from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
+from v2hdm.geometry.ipm import centre_sigmas, ipm_from_extrinsic, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
-from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_points
-from v2hdm.store.files import dump_yaml, replace_csv
+from v2hdm.store.files import dump_yaml, replace_csv, write_json
 from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
@@ -51,19 +49,12 @@ _UNRELATED = "the pixels have nothing to do with the places; check which pixel b
 
 @dataclass(frozen=True)
 class PointCalibration:
-    """A camera calibrated from surveyed points.
+    """A camera calibrated from surveyed points."""
 
-    Attributes:
-        points: the table.
-        fit: the mounting, its covariance, and the probability of each point to be right.
-        residuals: of the points.
-        verdict: whether points, intrinsics and mounting agree.
-    """
-
-    points: SurveyedPoints
-    fit: Fit
-    residuals: Residuals
-    verdict: Verdict
+    points: SurveyedPoints  # the table
+    fit: Fit  # the mounting, its covariance, and the probability of each point to be right
+    residuals: Residuals  # of the points
+    verdict: Verdict  # whether points, intrinsics and mounting agree
 
     @property
     def calibration(self) -> Calibration:
@@ -128,10 +119,7 @@ def calibrate_from_points(
 
 
 def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
-    """The mountings that explain the points, the most likely first.
-
-    Raises DriveError where none does: they lie on a line, or the table means something else than it says.
-    """
+    """The mountings that explain the points, the most likely first; DriveError, with why, where none does."""
     fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
         cause = _misreading(points, info, noise)

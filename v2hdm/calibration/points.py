@@ -21,10 +21,7 @@ _NAME = "name"
 
 @dataclass(frozen=True)
 class SurveyedPoints:
-    """N ground points: ``points_px`` (N, 2) as recorded, ``points_vehicle`` (N, 2) m.
-
-    ``names`` identify points in messages, by name and line of the file, ``labels`` in a picture.
-    """
+    """N ground points, recorded px and vehicle frame (m), (N, 2); names for messages, labels for pictures."""
 
     path: Path
     names: tuple[str, ...]
@@ -34,11 +31,7 @@ class SurveyedPoints:
 
 
 def read_points(path: Path) -> SurveyedPoints:
-    """Read the CSV file at ``path``: names of columns in its first line, then a point a line.
-
-    Columns are :data:`COLUMNS` and, if wanted, ``name``, parted by commas, semicolons, tabs or blanks. Raises
-    DriveError where the file is missing, a column is, or a cell does not parse; with the line.
-    """
+    """Read a CSV file: names of :data:`COLUMNS`, perhaps ``name``, then a point a line; raises DriveError."""
     header, lines = read_rows(path, ";,\t", "point")
     columns = _columns(header, path)
     names, labels, rows = [], [], []
@@ -55,10 +48,7 @@ def read_points(path: Path) -> SurveyedPoints:
 
 
 def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
-    """Refuse points outside the image, and one that is there twice.
-
-    Raises DriveError, which names the first.
-    """
+    """Raise DriveError, which names the first, for points outside the image or there twice."""
     size = np.array([info.width, info.height])
 
     def inside(points_px: FloatArray) -> BoolArray:

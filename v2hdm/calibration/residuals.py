@@ -36,19 +36,13 @@ _AROUND = 12  # places on the circle of known_around
 
 @dataclass(frozen=True)
 class Residuals:
-    """N points under a mounting.
+    """N points under a mounting."""
 
-    ``off_px`` (N, 2) is the recorded less the predicted pixel, ``off_m`` (N, 2) where the IPM puts the pixel
-    less where the point was surveyed, nan above the horizon. ``sigmas`` (N,) is the distance from what all
-    others predict, in standard deviations, ``probability`` (N,) that of a right point being as far off by
-    chance, ``known_m`` (N,) the standard deviation of the IPM there, in the direction known worst.
-    """
-
-    off_px: FloatArray
-    off_m: FloatArray
-    sigmas: FloatArray
-    probability: FloatArray
-    known_m: FloatArray
+    off_px: FloatArray  # (N, 2) recorded less predicted pixel
+    off_m: FloatArray  # (N, 2) where the IPM puts the pixel less where it was surveyed, nan above the horizon
+    sigmas: FloatArray  # (N,) distance from what all others predict
+    probability: FloatArray  # (N,) of a right point being as far off by chance
+    known_m: FloatArray  # (N,) sigma of the IPM there, in the direction known worst
 
 
 def residuals(fit: Fit) -> Residuals:
@@ -64,10 +58,7 @@ def residuals(fit: Fit) -> Residuals:
 
 
 def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
-    """Standard deviation (M,) of the IPM at ground places (M, 2), in the direction known worst, m.
-
-    Infinite for places behind the camera.
-    """
+    """Standard deviation (M,) of the IPM at places (M, 2), m, the worst way; inf behind the camera."""
     seen, mounting = fit.seen, fit.cam_from_vehicle
     count = len(places_vehicle)
     places = replace(
@@ -88,10 +79,7 @@ def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
 
 
 def known_around(fit: Fit) -> float:
-    """The worst of :func:`known_ground` at the right points and on a circle around them, as wide as they are.
-
-    Points along a line determine the ground on that line, and none beside it.
-    """
+    """The worst of :func:`known_ground` at the right points and on a circle around them."""
     right = fit.seen.points_vehicle[fit.is_right]
     radius = np.ptp(right, axis=0).max() / 2
     angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
@@ -103,10 +91,9 @@ def known_around(fit: Fit) -> float:
 
 
 def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """How far each point is from the others' prediction, under the noise that the others show.
+    """How far each point is, r' cov^-1 r, from the others' prediction, under the noise that they show.
 
-    Of a point that took part, q V - J C J' is the covariance of its residual, of another q V + J C J': either
-    way r' cov^-1 r is its squared distance from the others' prediction.
+    The covariance is q V - J C J' of a point that took part, of another q V + J C J'.
     """
     slopes = fit.seen.jacobian(fit.cam_from_vehicle)
     stated = fit.seen.covariance(fit.cam_from_vehicle)
@@ -143,14 +130,10 @@ def scatter(fit: Fit, chance: float) -> Scatter:
 
 
 class Lens(NamedTuple):
-    """Whether the points agree with the intrinsics.
+    """Whether the points agree with the intrinsics."""
 
-    ``probability`` is of as large a disagreement by chance, with both focal lengths freed. ``focal`` is by
-    which share the points want the focal length longer, and the standard deviation of that.
-    """
-
-    probability: float
-    focal: tuple[float, float]
+    probability: float  # of as large a disagreement by chance, both focal lengths freed
+    focal: tuple[float, float]  # by which share the points want it longer, and its sigma
 
 
 def lens(fit: Fit) -> Lens:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from v2hdm.cli.main import parser_of
 
 if TYPE_CHECKING:
-    from v2hdm.store.pruning import Item
+    from v2hdm.store.cache import Item
 
 _GB = 1e9
 
@@ -26,7 +26,7 @@ def run(arguments: Sequence[str]) -> None:
         action.add_argument("--cache", default=Path("cache"), type=Path, help="the folder (default: cache)")
     parsed = parser.parse_args(arguments)
     from v2hdm.errors import ConfigError
-    from v2hdm.store.pruning import items_of, prune
+    from v2hdm.store.cache import items_of, prune
 
     cache = parsed.cache
     if not cache.is_dir():

@@ -39,7 +39,7 @@ def run(arguments: Sequence[str]) -> int:
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
     from v2hdm.ground import estimate_cameras
-    from v2hdm.report.outputs import write_json
+    from v2hdm.store.files import write_json
     from v2hdm.verdict import check_drive
     from v2hdm.verdict.check import draw_check
 

@@ -18,8 +18,6 @@ from v2hdm.cli.main import parser_of
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.records import FloatArray
 
-_POSITION_SIGMA_M = 0.02  # of the written poses' heights, by which their road is laid flat
-
 
 def run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
@@ -99,14 +97,14 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
 
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:
     from v2hdm.io.drive.road import lay_flat
-    from v2hdm.io.maps.cloud import write_cloud
     from v2hdm.io.maps.features import ground_height_m
+    from v2hdm.io.maps.ground import write_cloud
     from v2hdm.io.trajectory import read_tum
 
     _refuse_crs(parsed, "a point cloud is in the map's own frame")
     if parsed.format != ["pcd"]:
         raise ConfigError("--format: a mosaic is a GeoTIFF already; its other format is pcd")
-    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")), _POSITION_SIGMA_M)
+    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")))
 
     def height_m(places: FloatArray) -> FloatArray:
         return np.zeros(len(places)) if driven.road is None else ground_height_m(driven.road, places)

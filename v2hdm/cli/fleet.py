@@ -31,8 +31,7 @@ def run(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--again", action="store_true", help="do what is finished again")
     parsed = parser.parse_intermixed_args(arguments)
-    from v2hdm.fleet.plan import exit_code
-    from v2hdm.fleet.run import FleetOptions, fleet_on_terminal
+    from v2hdm.fleet import FleetOptions, exit_code, fleet_on_terminal
     from v2hdm.settings import check_workers
 
     check_workers(parsed.workers)

@@ -44,10 +44,7 @@ class Command:
     interrupted: str = _NOTHING
 
     def guard(self, work: Callable[[], int | None]) -> int:
-        """Do the work of the command, which imports what it needs; the exit code is that of the work.
-
-        It is 2, with one line on stderr, for what a user can mend.
-        """
+        """Do the work of the command; its exit code, or 2, with one line on stderr, for a user's mistake."""
         # OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait
         # for as soon as the machine is busy otherwise. Libraries read this when they are loaded.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -251,10 +248,7 @@ _ONE_PRESS_S = 2.0
 
 
 def answer_signals() -> None:
-    """Take SIGTERM, a service manager's way to say Ctrl-C, for it, and several presses in a row for one.
-
-    Otherwise the second would interrupt the tidying up after the first.
-    """
+    """Take SIGTERM for Ctrl-C, and several presses in a row for one, which would interrupt the tidying up."""
     pressed_s = -_ONE_PRESS_S
 
     def interrupt(*_: object) -> None:
@@ -268,10 +262,7 @@ def answer_signals() -> None:
 
 
 def version_line() -> str:
-    """The versions, in one line: of this package, the libraries that count, and the detector's weights.
-
-    Nothing of it is imported: it answers where an install is broken, too.
-    """
+    """The versions of this package, its libraries and weights, in one line; nothing of it is imported."""
     parts = [f"v2hdm {__version__}"]
     for packages in (("torch",), ("onnxruntime", "onnxruntime-gpu"), ("numba",)):
         found = []

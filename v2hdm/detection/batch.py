@@ -32,8 +32,7 @@ _FEW_IMAGES = 8  # fewer are looked at before a process has started
 _IMAGES = 24  # images that are looked at: a second and a half of work
 _LEAST_IMAGES = 10
 _APART_M = 2.0  # they are at least this far apart, m, so that markings have moved on
-_SHARE = 0.7
-"""Paint at one place in this share of images is the vehicle: fields of diamonds cover it in a third."""
+_SHARE = 0.7  # paint at one place in this share of images is the vehicle: diamonds cover it in a third
 
 _MARGIN_PX = 6  # the network sees an edge this far from where it is
 
@@ -67,10 +66,7 @@ def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolA
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
-    """Decode an image file of a drive to (H, W, 3) uint8 BGR; grey cameras are taken, too.
-
-    Raises DriveError where the file is missing, truncated, not 8-bit or not of the camera's size.
-    """
+    """Decode an image of a drive to (H, W, 3) uint8 BGR; raises DriveError where it is not the camera's."""
     pixels = read_bgr(image.path)
     expected = (camera.info.height, camera.info.width)
     if pixels.shape[:2] != expected:
@@ -94,12 +90,10 @@ def detect_all(
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[ImageDetections]:
-    """Detect in every image of a drive, in the drive's order.
+    """Detect in every image of a drive, in the drive's order, whatever the number of ``workers`` (processes).
 
-    The result does not depend on the number of ``workers``: processes, one thread each; 1 stays in this
-    process. ``progress(done, total)`` is called after each image. Raises DriveError where an image is
-    missing, damaged or of the wrong size, DetectorError where the model cannot be used, WorkerError where a
-    process died.
+    Raises DriveError where an image is missing, damaged or of the wrong size, DetectorError where the model
+    cannot be used, WorkerError where a process died.
     """
     options = replace(options) if options else DetectorOptions()
     drive = with_own_vehicle(drive, Detector.load(options=options))  # a bad model is refused here, once
@@ -121,11 +115,7 @@ def detect_images(
     workers: int,
     take: Callable[[ImageDetections], None],
 ) -> None:
-    """Detect in some images of a drive whose cameras know their own vehicle.
-
-    ``images`` are indices; ``take`` is called with the detections of each, in their order. Raises V2hdmError:
-    as :func:`detect_all`.
-    """
+    """Detect in the images of these indices; ``take`` is called with each in order. Raises as detect_all."""
     if options.device != "cpu":
         workers = min(workers, _WORKERS_A_GPU)
     if workers <= 1 or len(images) < _FEW_IMAGES:
@@ -171,10 +161,7 @@ def _work(index: int) -> ImageDetections:
 
 
 def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
-    """The detections of image ``index`` of a drive whose cameras know their own vehicle.
-
-    Raises DriveError where the image is missing, damaged or of the wrong size.
-    """
+    """The detections of image ``index`` of a drive, whose cameras know their vehicle; raises DriveError."""
     image = drive.images[index]
     camera = drive.cameras[image.camera]
     return ImageDetections(index, *detector.detect(read_image(image, camera), camera))

@@ -24,8 +24,7 @@ from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camer
 _LUT_STEP_PX = 4
 _HORIZON_MARGIN_PX = 16
 
-FARTHEST_M = 60.0
-"""Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
+FARTHEST_M = 60.0  # neither markings nor lines are looked for beyond: networks are shown none beyond 50 m
 
 _SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
@@ -37,8 +36,7 @@ ASIDE_RAD = np.deg2rad(60)
 
 _LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
 
-_CURVE_UNIT_PX = 100.0
-"""Unit of the distance below the horizon in the basis of lanes' curves: their parameters are alike."""
+_CURVE_UNIT_PX = 100.0  # unit of the distance below the horizon in lanes' curves: their parameters are alike
 
 _PROBE_PX = 50.0
 
@@ -50,13 +48,12 @@ _FARTHEST_MOUNT_M = 100.0
 class RoadCamera:
     """One camera with fast lens and ground mappings, and the rows worth looking at.
 
-    Recorded pixels are those of the image, pinhole pixels those without distortion. ``top`` is the first of
-    the image rows below the horizon of the camera's initial IPM (with a margin, since that IPM is coarse; the
-    rows from there on are a multiple of ``multiple`` where the image is tall enough). ``far_row``, by a
-    multiple of ``multiple`` below ``top``, is the one from which on ground within :data:`FARTHEST_M` shows.
-    From ``fine_row`` on (None if there is no such row) a pixel is less than ``_FINE_ENOUGH_M`` of ground
-    wide. ``aside`` cameras look across the way that the vehicle drives. ``foot_vehicle`` (2,) lies below the
-    camera. Points far from any lens singularity are assumed.
+    Recorded pixels are those of the image, pinhole pixels those without distortion; points far from any lens
+    singularity are assumed. ``top`` is the first image row below the horizon of the initial IPM, with a
+    margin; from there on rows are a multiple of ``multiple`` where the image is tall enough. From
+    ``far_row``, a multiple of it below ``top``, ground within :data:`FARTHEST_M` shows, from ``fine_row``
+    (None if none) a pixel is less than ``_FINE_ENOUGH_M`` of ground wide. ``aside`` cameras look across the
+    way that the vehicle drives. ``foot_vehicle`` (2,) lies below the camera.
     """
 
     def __init__(self, camera: Camera, multiple: int = 16):
@@ -139,8 +136,8 @@ class RoadCamera:
     def log_size_sigma(self, range_m: FloatArray) -> FloatArray:
         """Standard deviation of the logarithm of lengths on the ground at distances, m.
 
-        It is that of lengths along the view, h f / v^2 per px at v px below the horizon; across it half of
-        the horizon's part is left, and none of the focal length's.
+        Along the view they are h f / v^2 per px at v px below the horizon; across it half of that part is
+        left.
         """
         horizon_rad, log_focal = self.camera.mounting_sigma
         return np.hypot(2 * horizon_rad * range_m / self._height_m, log_focal)
@@ -210,16 +207,12 @@ class RoadCamera:
 
 @dataclass(frozen=True)
 class GroundPoints:
-    """Points on the ground plane: ``points_vehicle`` (N, 2), m, nan where a pixel shows no ground.
+    """Points on the ground plane and their derivatives."""
 
-    ``by_px`` (N, 2, 2) and ``by_mounting`` (N, 2, 6) are their derivatives by the recorded pixel and by the
-    tangent of ``cam_from_vehicle``, whose covariance is ``mounting_covariance`` (6, 6).
-    """
-
-    points_vehicle: FloatArray
-    by_px: FloatArray
-    by_mounting: FloatArray
-    mounting_covariance: FloatArray
+    points_vehicle: FloatArray  # (N, 2) m, nan where a pixel shows no ground
+    by_px: FloatArray  # (N, 2, 2) by the recorded pixel
+    by_mounting: FloatArray  # (N, 2, 6) by the tangent of ``cam_from_vehicle``
+    mounting_covariance: FloatArray  # (6, 6) of that
 
     def __getitem__(self, part: slice) -> GroundPoints:
         """Some of the points."""
@@ -281,10 +274,7 @@ class Horizon:
         self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * _CURVE_UNIT_PX, by_curvature])
 
     def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
-        """The a, b and c (3,) of a line's direction, place beside the camera and curvature, 1/m.
-
-        To first order, about the camera's own direction.
-        """
+        """The a, b and c (3,) of a line by direction, place beside the camera and curvature, 1/m."""
         return self._units * (direction_rad, beside_m, curvature)
 
     def basis(self, below: FloatArray) -> FloatArray:
@@ -312,14 +302,9 @@ class Horizon:
 
 
 def camera_from_calibration(
-    calibration: Calibration,
-    linear_response: bool = False,
-    mounting_sigma: tuple[float, float] = (0.0, 0.0),
+    calibration: Calibration, linear_response: bool = False, mounting_sigma: tuple[float, float] = (0.0, 0.0)
 ) -> Camera:
-    """A camera whose IPM is the one of a finished calibration; ``mounting_sigma`` is that of a guessed one.
-
-    Raises MapFileError where the calibration cannot be that of a camera that looks at the ground.
-    """
+    """A camera of a calibration that is ``mounting_sigma`` off; MapFileError where it sees no ground."""
     info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
     problem = _problem(calibration)
     if not problem:
@@ -346,9 +331,8 @@ def rough_calibration(
 ) -> Calibration:
     """A pinhole camera that looks straight ahead, for images of which nothing better is known.
 
-    Good enough to classify markings by rough size, not to measure with. ``height_m`` is above the ground,
-    ``pitch_deg`` below the horizon, ``fov_deg`` the horizontal field of view, ``width`` and ``height`` px;
-    ``roll_deg`` turns the image's right side down, on which the horizon then rises.
+    ``pitch_deg`` is below the horizon, ``fov_deg`` horizontal; ``roll_deg`` turns the image's right side
+    down, on which the horizon then rises.
     """
     focal_px = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
     intrinsic = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])

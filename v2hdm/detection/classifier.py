@@ -1,18 +1,14 @@
 """How probable it is that a quadrilateral is a whole marking, and which of its sides to trust.
 
-The classifier has two stages. The network in ``judge.onnx`` takes each reading alone: numbers about a fitted
-quadrilateral, and a picture of it in its own frame. A homography takes the four corners to those of a
-rectangle, so that every marking of a class looks the same wherever it lies in the image (Faster R-CNN's
-region of interest, Ren et al., NeurIPS 2015, along the marking's own sides): light and distance cancel, and
-left is what sets a worn marking off from a fleck of sun. It gives log odds, and how far each side may be off
-for reasons that the fit's residuals do not show: worn ends, seams along a side, shadows, something in front.
-Then a logistic function, whose weights are in ``confidence.json``, takes each among the others of its image.
-Both files belong to the paint network.
+The network in ``judge.onnx`` takes each reading alone: numbers about a fitted quadrilateral, and a picture of
+it in its own frame, where every marking of a class looks alike (as Faster R-CNN's region of interest, Ren et
+al., NeurIPS 2015): what sets a worn marking off from a fleck of sun is left. It gives log odds, and how far
+each side may be off for reasons that the fit's residuals do not show: worn ends, seams along a side, shadows,
+something in front. Then a logistic function, whose weights are in ``confidence.json``, takes each among the
+others of its image. Both files belong to the paint network.
 
-A site's markings are painted from few stencils: the diamonds of a field are of one size and lie one way, the
-dashes of a line are as long as each other and follow one another in a row. Where the way bends, directions
-turn with it, by an angle that grows with the distance, and a row is an arc. Flecks of sun do nothing of the
-kind.
+A site's markings are painted from few stencils: the diamonds of a field are of one size and lie one way,
+dashes are as long as each other and follow one another in a row, or an arc where the way bends.
 """
 
 from __future__ import annotations
@@ -68,8 +64,7 @@ CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "sy
 median; log odds of paint; the network's shares of the quadrilateral's own class, lane lines and symbols;
 whether it is outside the image."""
 
-SIZE = 20
-"""Rows and columns of a picture."""
+SIZE = 20  # rows and columns of a picture
 
 _AROUND = 0.6
 _BEFORE, _BESIDE = 0.3, 1.0
@@ -96,8 +91,8 @@ def gather(
 ) -> FloatArray:
     """The :data:`FEATURES` (R, F) of R readings, each the index of one of M quadrilaterals and a class.
 
-    ``quads`` are those of the ``fit`` in the image, ``ground`` on the ground, m, NaN above the horizon;
-    ``proposals`` are the pieces of paint they come from.
+    ``quads`` are in the image, ``ground`` on the ground, m, NaN above the horizon; ``proposals`` are their
+    paint.
     """
     sides = np.sort(np.nan_to_num(ground.length, nan=1.0), axis=1)
     log_sides = np.log(np.clip(sides, *_SIZE_LIMITS_M))
@@ -228,11 +223,9 @@ many are not, and how probable is the surest. Of dashes also: how probable is th
 its line after a gap; 0 for other classes.
 """
 
-AMONG = ("alone", *COMPANY)
-"""The features of a reading among others: its own log odds, and the company of the others."""
+AMONG = ("alone", *COMPANY)  # features of a reading among others: its own log odds, and their company
 
-SHAPES = (DIAMOND, LANE_DASH, "bar")
-"""Diamonds, lane dashes, and whatever else has four corners."""
+SHAPES = (DIAMOND, LANE_DASH, "bar")  # diamonds, lane dashes, and whatever else has four corners
 
 COMPANIES = (STOP_LINE, *SHAPES)
 """Whose company is weighed apart: the bars of a crosswalk are many and alike, a stop line keeps none."""
@@ -245,8 +238,7 @@ _BEND_RADIUS_M = 20.0  # and by the angle that a bend of this radius turns by be
 _MOST = 3.0  # more company than this adds nothing
 _APART_M = 0.3  # nearer quadrilaterals are readings of the same paint
 _LEAST_GAP = 0.5
-_LONGEST_GAP_M = 15.0
-"""Dashes of a line are at least so many times their own length apart, and at most so far."""
+_LONGEST_GAP_M = 15.0  # dashes of a line are at least so many of their lengths apart, and at most so far
 
 _BESIDE_M = 0.3
 _BESIDE_SHARE = 0.02
@@ -282,23 +274,17 @@ _MOST_TURNED_RAD = 0.9
 
 @dataclass(frozen=True)
 class Readings:
-    """R readings of M fitted quadrilaterals, each of one as one class: the input of the classifier.
-
-    ``quadrilateral`` (R,) is the index of each, ``kinds`` its class; ``evidence`` (R, F) and ``views``
-    (R, C, S, S) are given to the network, ``ground`` (R, 4, 2) are corners, m. The first side in a view is
-    side ``first_side`` (R,) of the quadrilateral. ``hidden_ends`` (M, 4) are ends of what
-    is seen of it rather than of its paint. ``parts`` lists, by quadrilateral around a whole piece of
-    paint, those around its parts: either the one or the others are markings.
-    """
+    """R readings of M fitted quadrilaterals, each of one as one class: the input of the classifier."""
 
     fit: Fit
-    quadrilateral: np.ndarray
-    kinds: list[str]
-    evidence: FloatArray
-    views: np.ndarray
-    ground: FloatArray
-    first_side: np.ndarray
-    hidden_ends: BoolArray
+    quadrilateral: np.ndarray  # (R,) index of each
+    kinds: list[str]  # its class
+    evidence: FloatArray  # (R, F) for the network
+    views: np.ndarray  # (R, C, S, S) for the network
+    ground: FloatArray  # (R, 4, 2) corners, m
+    first_side: np.ndarray  # (R,) the quadrilateral's side that is the first in a view
+    hidden_ends: BoolArray  # (M, 4) ends of what is seen of it rather than of its paint
+    # by quadrilateral around a piece, those around its parts: one or the others are markings
     parts: Mapping[int, Sequence[int]]
 
 
@@ -335,10 +321,9 @@ def read_markings(
 def hidden_ends(patches: Patches, quads: ImageQuads, ground: Quad) -> BoolArray:
     """Which sides (M, 4) are ends of long markings at which something hides the rest of the paint.
 
-    Where paint ends, the ground beside it goes on beyond; where a thing stands before it, it ends with the
-    paint. The ground before the end, on both sides of the paint, is compared with what lies beyond the end:
-    behind the paint and behind that ground. It is bare ground, of which a spot may be stained and across
-    which a shadow's border may run just there, or a thing, of any tone and colour, which may be narrow.
+    Where paint ends, the ground beside it goes on; where a thing stands before it, it ends with the paint. So
+    the ground before the end, on both sides, is compared with what lies beyond: stained, shaded, or a thing
+    of any tone.
     """
     longer = np.roll(ground.length, 1, axis=1) + np.roll(ground.length, -1, axis=1)
     hidden = longer > 2 * _ASPECT * ground.length
@@ -415,10 +400,7 @@ def find_markings(
 
 
 def _are_points(covariance_px: FloatArray, corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
-    """Which corners (M, 4, 2) of covariances (M, 8, 8), px^2, lie at a place and not just on a line.
-
-    The ground counts, and the marking's own size: a pixel is a millimetre here and half a metre there.
-    """
+    """Which corners (M, 4, 2) lie at a place and not just on a line, for the marking's size on the ground."""
     pinhole_px = camera.undistort(corners_px.reshape(-1, 2))
     ground = camera.ground(pinhole_px).reshape(corners_px.shape)
     # What the lens does to a pixel's size is little beside the share.
@@ -434,11 +416,7 @@ def _are_points(covariance_px: FloatArray, corners_px: FloatArray, camera: RoadC
 def classify_alone(
     evidence: FloatArray, views: np.ndarray, kinds: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Log odds (R,) of each reading alone, and how far each of its sides may be off, px, (R, 4).
-
-    ``evidence`` (R, F) and ``views`` (R, C, S, S) float32 are those of :mod:`.evidence`; sides are as in
-    the views.
-    """
+    """Log odds (R,) of each reading alone, and how far each side in its view may be off, px, (R, 4)."""
     given = (views, evidence.astype(np.float32), one_hot(kinds))
     inputs = dict(zip(JUDGE_INPUTS, given, strict=True))
     odds, log_sigma = _session(JUDGE_FILE).run(list(JUDGE_OUTPUTS), inputs)
@@ -513,10 +491,7 @@ def company(ground: FloatArray, kinds: Sequence[str], probability: FloatArray) -
 
 
 def _shapes(ground: FloatArray, kind: np.ndarray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Short and long extent (M, 2), m, direction (M, 2) of the longer, and centre (M, 2).
-
-    Diamonds extend along their diagonals, everything else along its sides.
-    """
+    """Short and long extent (M, 2), m, direction (M, 2) of the longer, centre (M, 2); diamonds' diagonals."""
     ground = np.nan_to_num(ground)
     diagonals = ground[:, [2, 3]] - ground[:, [0, 1]]
     quad = Quad(ground)
@@ -530,10 +505,7 @@ def _shapes(ground: FloatArray, kind: np.ndarray) -> tuple[FloatArray, FloatArra
 
 
 def _follows(apart: FloatArray, axis: FloatArray, length: FloatArray, turned: FloatArray) -> np.ndarray:
-    """Which (M, M) others follow each along an arc, after a gap.
-
-    The chord between two points of a circle makes equal and opposite angles with the tangents there.
-    """
+    """Which (M, M) follow each along an arc: its chord makes equal and opposite angles with both tangents."""
     distance = np.hypot(apart[..., 0], apart[..., 1])
     beside = 0.5 * distance * np.abs(_angle(axis[:, None], apart) + _angle(axis[None], apart))
     gap = distance - (length[:, None] + length) / 2

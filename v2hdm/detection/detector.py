@@ -47,10 +47,7 @@ class Detector:
 
     @classmethod
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
-        """Load a model: ``path``, else ``options.model``, else the one that is shipped.
-
-        Raises DetectorError where the model cannot be used, or the shipped files do not belong together.
-        """
+        """Load ``path``, ``options.model`` or the shipped model; raises DetectorError where it fails."""
         options = options or DetectorOptions()
         check_weights()
         path = path if path is not None else options.model
@@ -59,10 +56,7 @@ class Detector:
     def detect(
         self, image_bgr: np.ndarray, camera: Camera
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
-        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
-
-        Raises DetectorError where the image is not of that form or not of the camera's size.
-        """
+        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError."""
         output = self.run_network(image_bgr, camera)
         with lap("propose"):
             found = self.propose(output, camera)
@@ -76,10 +70,7 @@ class Detector:
         return _likelier(markings, self._symbols(image_bgr, found)), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
-        """Run the network on one image; what shows the vehicle itself is no paint.
-
-        Raises DetectorError where the image is not of the right form or not of the camera's size.
-        """
+        """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`."""
         road_camera = self.road_camera(camera)
         _check_image(image_bgr, camera)
         with lap("net"):
@@ -120,10 +111,7 @@ class Detector:
         return read_markings(image_bgr, found, self.catalogue, self.options.blur_px)
 
     def markings_paint(self, image_bgr: np.ndarray, camera: Camera) -> BoolArray:
-        """Where (h, w) the network sees paint of markings, not of lanes, a cell every ``paint_stride`` px.
-
-        The first row of cells is at the image row ``road_camera(camera).far_row``.
-        """
+        """Where (h, w) the network sees paint of markings, from the camera's ``far_row`` on."""
         output = run_on_road(self.network, image_bgr, self.road_camera(camera))
         lanes = np.isin(output.classes, self.catalogue.lane_paint)
         lead = output.kinds[~lanes].max(axis=0) - output.kinds[lanes].max(axis=0)

@@ -34,16 +34,14 @@ from v2hdm.detection.patch import LensFrames, Patches
 from v2hdm.geometry.quadrilateral import Quad, following, is_convex_px
 from v2hdm.records import BoolArray, FloatArray
 
-TYPICAL_BLUR_PX = 0.75
-"""Point spread of a focused camera, px, pixel aperture included."""
+TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture included
 
 _BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
 _BLUR_LIMITS_PX = (0.35, 3.0)
 _SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
 """Blur of the first steps, in distances of the grid's points and px: a wide one sees sides from far away."""
 
-_SEARCH_SIGMA = 0.1
-"""How far the network's outline is from the end of a side before the search, in lengths of the marking."""
+_SEARCH_SIGMA = 0.1  # how far the network's outline is from a side's end before the search, marking lengths
 
 _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
 """Standard deviation of the sum of opposite corners, in parts of the root of the area and at least in m.
@@ -51,9 +49,8 @@ _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
 Stencils are true to 5 mm; a guess of the mounting that is 2 degrees off makes 3 % of a parallelogram.
 """
 
+# Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the paint.
 _BLOOM, _MUCH_CLIPPED = 1.2, 0.15
-"""Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the
-paint."""
 
 _MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
 """A fit that moves its middle by more of its size, or grows or shrinks by more, follows something else."""
@@ -62,19 +59,16 @@ _OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
 
 OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
-_BEYOND_PX = 6.0
-"""How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
+_BEYOND_PX = 6.0  # how far beyond the border a side that it cuts is started, px: farther than blur reaches
 
 _CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
 """Log contrast of paint over ground, as measured on asphalt, widened for worn and for fresh paint."""
 
 _MOST_CONTRAST = 4.0  # log contrast of white paint on the blackest ground
-_LIGHT_STEP = 0.4
-"""By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
+_LIGHT_STEP = 0.4  # by how much the log light differs between knots: a shadow's border is a few of that
 
+# Least scatter at the first step of search and fit, halved at each: the next may explain what one rejects.
 _WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1
-"""Least scatter at the first step of search and fit, halved at each: the next may explain what one
-rejects."""
 
 _MODEL_SIGMA_PX = 0.04
 """Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's
@@ -133,18 +127,14 @@ _CORNER = np.arange(4)
 
 @dataclass(frozen=True)
 class Fit:
-    """M fitted quadrilaterals ``quad`` in their ``frames``.
-
-    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their
-    outward normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels.
-    ``open_sides`` (M, 4) are those cut by the image's border.
-    """
+    """M fitted quadrilaterals in their frames."""
 
     frames: LensFrames
     quad: Quad
+    # (M, 8, 8), px^2, of moves of the sides' starts and ends along outward normals
     side_covariance: FloatArray
-    statistics: FloatArray
-    open_sides: BoolArray
+    statistics: FloatArray  # (M, len(STATISTICS)) how well the model explains the pixels
+    open_sides: BoolArray  # (M, 4) those cut by the image's border
 
     @cached_property
     def corners_px(self) -> FloatArray:
@@ -152,11 +142,7 @@ class Fit:
         return self.frames.to_px(self.quad.corners)
 
     def covariance_px(self, side_sigma_px: FloatArray | None = None) -> FloatArray:
-        """Covariance (M, 8, 8) of the corners, px^2.
-
-        ``side_sigma_px`` (M, 4) is how far each side as a whole may be off besides, for reasons that
-        residuals do not show, px.
-        """
+        """Covariance (M, 8, 8) of the corners, px^2; sides are off by ``side_sigma_px`` (M, 4) besides."""
         by_side = self.side_covariance
         if side_sigma_px is not None:
             sigma = np.tile(side_sigma_px, 2)
@@ -262,17 +248,13 @@ def _sound(quad: Quad, before: Quad) -> BoolArray:
 
 @dataclass
 class _System:
-    """Normal equations at the last linearisation: ``information`` (M, U, U), scatter, weights, last step.
+    """Normal equations at the last linearisation."""
 
-    ``scatter`` (M, 4) of log grey by side, ``inliers`` (M,) mean robust weight, ``by_side`` (M, 8) last step,
-    ``decrement`` (M,) by how much chi-square was to fall by it (Newton's decrement).
-    """
-
-    information: FloatArray
-    scatter: FloatArray
-    inliers: FloatArray
-    by_side: FloatArray
-    decrement: FloatArray
+    information: FloatArray  # (M, U, U)
+    scatter: FloatArray  # (M, 4) of log grey by side
+    inliers: FloatArray  # (M,) mean robust weight
+    by_side: FloatArray  # (M, 8) last step
+    decrement: FloatArray  # (M,) by how much chi-square was to fall by it (Newton's decrement)
 
 
 def _put(whole: _System | _State, rows: np.ndarray, part: _System | _State) -> None:
@@ -284,20 +266,15 @@ def _put(whole: _System | _State, rows: np.ndarray, part: _System | _State) -> N
 
 @dataclass
 class _State:
-    """The unknowns of M markings: quadrilateral, blur, contrast, light (M, KNOTS) and its slope across.
-
-    ``outline`` (M, 4, 2) are the corners that the network drew, ``outline_sigma_px`` (M, 8) how far its
-    sides' starts and ends are off along their normals. ``closure`` (M, 2, 8) takes the corners to p0 - p1 +
-    p2 - p3 on the ground in its standard deviation, ``gap`` (M, 2) is that of the outline.
-    """
+    """The unknowns of M markings: quadrilateral, blur, contrast, light (M, KNOTS) and its slope across."""
 
     quad: Quad
     blur_px: FloatArray
     expected_blur_px: float
-    outline: FloatArray
-    outline_sigma_px: FloatArray
-    closure: FloatArray
-    gap: FloatArray
+    outline: FloatArray  # (M, 4, 2) corners that the network drew
+    outline_sigma_px: FloatArray  # (M, 8) of its sides' starts and ends along their normals
+    closure: FloatArray  # (M, 2, 8) from the corners to p0 - p1 + p2 - p3 on the ground, in its sigma
+    gap: FloatArray  # (M, 2) that of the outline
     contrast: FloatArray
     expected_contrast: FloatArray
     light: FloatArray
@@ -320,10 +297,7 @@ class _State:
         return cls(*known, contrast, contrast.copy(), light, np.zeros(count))
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
-        """Gauss-Newton until each marking's step is small or says nothing; the system is of its last step.
-
-        With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
-        """
+        """Gauss-Newton until each marking's step is small or says nothing; the system is of its last step."""
         scatter, settled_px = (_FINAL_SCATTER, _SETTLED_PX) if paint is None else (_WIDE_SCATTER, _FOUND_PX)
         count = len(self.blur_px)
         system = _System(

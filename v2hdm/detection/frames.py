@@ -22,8 +22,7 @@ _log = logging.getLogger(__name__)
 
 _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-"""Suffixes of images in a folder."""
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
 
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
@@ -33,10 +32,7 @@ _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 
 
 def read_bgr(path: Path) -> np.ndarray:
-    """Decode an image file, in colour or grey, to (H, W, 3) uint8 BGR.
-
-    Raises DriveError where the file is missing, truncated, damaged or not of 8 bits.
-    """
+    """Decode an image file to (H, W, 3) uint8 BGR; raises DriveError where it is damaged or not of 8 bits."""
     pixels = read_pixels(path, _AS_STORED)
     if pixels.dtype != np.uint8:
         raise DriveError(
@@ -49,26 +45,18 @@ def read_bgr(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image (H, W, 3) uint8 BGR to look at.
+    """One image to look at."""
 
-    ``source`` is its file, or the video or camera it comes from, ``index`` its number there. ``stamp_s`` is
-    the time within a video, Unix time for a live camera, None for a file. ``name`` names it. ``dropped``
-    counts the live images before it that nobody has looked at, since newer ones came.
-    """
-
-    source: str
+    source: str  # its file, or the video or camera it comes from
     name: str
-    index: int
-    stamp_s: float | None
-    pixels: np.ndarray
-    dropped: int = 0
+    index: int  # its number there
+    stamp_s: float | None  # within a video, Unix time of a live camera, None of a file
+    pixels: np.ndarray  # (H, W, 3) uint8 BGR
+    dropped: int = 0  # live images before it that nobody has looked at, since newer ones came
 
 
 def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
-    """Image files, each read when its turn comes.
-
-    Raises DriveError where a file is missing, damaged or not of 8 bits.
-    """
+    """Image files, each read when its turn comes; raises DriveError where one is damaged or not of 8 bits."""
     names = [path.stem for path in paths]
     unique = len(set(names)) == len(names)
     for index, path in enumerate(paths):
@@ -89,10 +77,7 @@ def list_images(folder: Path, known: AbstractSet[str] = frozenset()) -> list[Pat
 
 
 def video_frames(path: Path) -> Iterator[Frame]:
-    """Every frame of a video file; a warning reports one that ends early.
-
-    Raises DriveError where OpenCV cannot read it, or it has no frame.
-    """
+    """Every frame of a video, with a warning if it ends early; raises DriveError where there is none."""
     refused = f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
     with _capture(str(path), refused) as capture:
         if turned := int(capture.get(cv2.CAP_PROP_ORIENTATION_META)):
@@ -109,11 +94,7 @@ def video_frames(path: Path) -> Iterator[Frame]:
 
 
 def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
-    """Frames of a live camera, by the operating system's index, until it fails.
-
-    ``size`` is the width and height to ask the camera for; it may give others. Raises DriveError where it
-    does not open, or gives no more frames.
-    """
+    """Frames of a live camera by its index, perhaps of ``size``; raises DriveError where it gives no more."""
     refused = f"camera {number}: does not open; is it plugged in and used by no one else?"
     with _capture(min(number, _MOST_CAMERAS), refused) as capture:
         if size is not None:
@@ -165,8 +146,7 @@ class NewestFrames(Iterator[Frame]):
 def arriving_frames(folder: Path) -> Iterator[Frame]:
     """The newest image of a folder that somebody writes to, each time that one is asked for; never ends.
 
-    Its time is when it was written. Images that were there before the newest one at the start do not count as
-    dropped. One that cannot be read a second after it was written is left out with a warning. Raises
+    Its time is when it was written. One that cannot be read a second after is left out with a warning. Raises
     DriveError where the folder cannot be read.
     """
     known, index = {path.name for path in list_images(folder)[:-1]}, 0

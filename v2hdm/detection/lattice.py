@@ -30,8 +30,7 @@ from v2hdm.detection.patch import LensFrames, Patches
 from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-KNOTS = 6
-"""Knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs."""
+KNOTS = 6  # knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs
 
 _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
@@ -44,35 +43,25 @@ _MOST_ENDS = 1 / 3
 """Ends of at most this share of the length make a quadrilateral slim; they reach that far past corners."""
 
 _SEARCH_ALONG, _SEARCH_ACROSS = 40, 12  # rows and columns of the coarse grid on which a fit begins
-_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
-"""How far it reaches beyond a quadrilateral, in its lengths and widths."""
+_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4  # how far it reaches beyond a quadrilateral, in lengths and widths
 
-_GREY_FIRST = 1.2
-"""By how many times clearer red or blue must be for grey to be left: grey has the least noise."""
+_GREY_FIRST = 1.2  # how many times clearer red or blue must be for grey to be left: it has the least noise
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Up to N pixels about each of M markings.
+    """Up to N pixels about each of M markings, float32."""
 
-    ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values`` (M, N) float32 log grey;
-    ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``limited`` (M, N) where the sensor was at its
-    limit; ``clipped`` (M, 1) the share of those. ``neighbours`` (M, 2, N) is the place in the list of the
-    lattice's next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, 4, N) float32
-    is 1 for the side that is nearest. ``hats`` (M, KNOTS, N) interpolate between knots along the marking,
-    ``across`` (M, N) runs from -1 to 1 across it. ``count`` (M, 1) of the N pixels are there, the first ones.
-    """
-
-    points: np.ndarray
-    values: np.ndarray
-    use: np.ndarray
-    limited: np.ndarray
-    clipped: FloatArray
-    neighbours: np.ndarray
-    of_side: np.ndarray
-    hats: np.ndarray
-    across: np.ndarray
-    count: IntArray
+    points: np.ndarray  # (M, 3, N) (x, y, 1) in the markings' frames
+    values: np.ndarray  # (M, N) log grey
+    use: np.ndarray  # (M, N) 1 where a pixel takes part, else 0
+    limited: np.ndarray  # (M, N) where the sensor was at its limit
+    clipped: FloatArray  # (M, 1) the share of those
+    neighbours: np.ndarray  # (M, 2, N) place of the next pixel right and below, 0 for none
+    of_side: np.ndarray  # (M, 4, N) 1 for the side that is nearest
+    hats: np.ndarray  # (M, KNOTS, N) interpolate between knots along the marking
+    across: np.ndarray  # (M, N) from -1 to 1 across it
+    count: IntArray  # (M, 1) of the N are there, the first ones
 
     @classmethod
     def about(
@@ -116,11 +105,9 @@ class Lattice:
 def lay_grid(
     patches: Patches, frames: LensFrames, corners_px: FloatArray
 ) -> tuple[Lattice, np.ndarray, FloatArray]:
-    """A coarse grid all over quadrilaterals ``corners_px`` (M, 4, 2), recorded px, and beyond them.
+    """A coarse grid all over quadrilaterals (M, 4, 2), recorded px, the paint's probability there (M, N).
 
-    Returns:
-        The lattice, the network's probability of paint there (M, N), and how far apart its points are (M,),
-        px.
+    The third is how far apart its points are (M,), px.
     """
     quad = Quad(frames.from_image(corners_px))
     along = np.linspace(-_MARGIN_ALONG, 1 + _MARGIN_ALONG, _SEARCH_ALONG)
@@ -179,10 +166,7 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
 
 
 def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Log grey, red or blue (M, N), in which a marking's inside differs most from its outside, of (3, M, N).
-
-    Yellow paint on light ground is as bright in grey, but darker in blue.
-    """
+    """Log grey, red or blue (M, N) of (3, M, N), in which inside and outside differ most: yellow in blue."""
     apart, variance = np.float32(0), np.float32(0)
     for part, sign in ((inside * used, 1), ((1 - inside) * used, -1)):
         count = np.maximum(part.sum(axis=1), 1)
@@ -218,10 +202,8 @@ def _near_the_next(places: np.ndarray, size: np.ndarray) -> BoolArray:
 def _columns_and_rows(quad: Quad, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Columns (M, W) and rows (M, H) that leave about ``_MAX_PIXELS`` of the bands about sides, or some more.
 
-    Neighbouring pixels say nearly the same, so a large marking needs only some of them; columns or rows
-    are left out along the marking's longer extent, the finer sampling staying across it. Of a slim one few
-    are left out at its two ends, which show how long it is, but more between. ``size`` (M, 2) is that of the
-    box from whose first pixel the corners count, px.
+    Neighbouring pixels say nearly the same: some are left out along a marking's longer extent, fewer at its
+    ends, never across. ``size`` (M, 2), px, is that of the box from whose first pixel the corners count.
     """
     each = np.arange(len(size))
     along = np.where(size[:, 0] >= size[:, 1], 0, 1)
@@ -251,10 +233,7 @@ def _columns_and_rows(quad: Quad, size: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Places (M, n), every ``step``-th (M,) within ``bounds`` (M, 2) and every ``outer``-th without.
-
-    They go up to ``size`` (M,) and one farther, so that the last have no neighbour.
-    """
+    """Places (M, n) up to ``size`` (M,): every ``step``-th within ``bounds`` (M, 2), else ``outer``-th."""
     head, tail = bounds.T
     first, between = -(-head // outer), -(-(tail - head) // step)
     count = first + between + np.maximum(-(-(size - tail) // outer), 0)
@@ -268,10 +247,7 @@ def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.nda
 def _in_band(
     quad: Quad, bow_px: FloatArray, columns: np.ndarray, rows: np.ndarray, size: np.ndarray
 ) -> BoolArray:
-    """Which pixels (M, H, W) of a lattice are near a side; sides are bowed by up to ``bow_px`` (M,).
-
-    A sharp corner's band would go on beyond the box, whose ``size`` (M, 2) is the marking's own.
-    """
+    """Which pixels (M, H, W) of a lattice are near a side, bowed by up to ``bow_px`` (M,), within the box."""
     band = np.zeros((len(size), rows.shape[1], columns.shape[1]), dtype=np.bool_)
     widths, heights = (columns < size[:, :1]).sum(axis=1), (rows < size[:, 1:]).sum(axis=1)
     outward = quad.outward.astype(np.float32)
@@ -322,16 +298,11 @@ _LAST_CELL = (_CELLS_PER_BLUR * _REACH * np.array([1, 2, 2])[:, None, None, None
 def blurred_coverage(
     quad: Quad, points: np.ndarray, blur_px: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coverage of pixels by convex quadrilaterals and its derivative by their sides and by the blur.
+    """Coverage (M, N) in [0, 1] of pixels by M convex quadrilaterals, and its derivative (M, 9, N) per px.
 
-    Args:
-        quad: M quadrilaterals, px, from a point near each, so that float32 keeps a ten-thousandth of a pixel.
-        points: (M, 3, N) float32, the pixel centres (u, v, 1) from the same point.
-        blur_px: (M,) or one for all, standard deviation of the point spread, pixel aperture included.
-
-    Returns:
-        Coverage (M, N) in [0, 1] and its derivative (M, 9, N) per px by which a side's start (elements
-        0 to 3) or end (4 to 7) moves along the side's outward normal or (8) the blur grows, both float32.
+    That is by which a side's start (0 to 3) or end (4 to 7) moves along its outward normal, or (8) the blur
+    grows; all float32. ``points`` (M, 3, N) are pixel centres (u, v, 1) from a point near each quadrilateral,
+    ``blur_px`` the point spread's sigma, pixel aperture included.
     """
     tangent, length = quad.tangent, quad.length
     per_blur = 1 / np.reshape(blur_px, (-1, 1, 1))
@@ -376,10 +347,7 @@ def blurred_coverage(
 
 @cache
 def owen_table() -> np.ndarray:
-    """T(h, s), float32: rows h from 0, columns s from ``-_REACH``, ``_CELLS_PER_BLUR`` cells a blur.
-
-    Beyond the table T stays what it is at its border: 0 for large h, constant for large s.
-    """
+    """T(h, s), float32, ``_CELLS_PER_BLUR`` cells a blur: h from 0, s from ``-_REACH``; constant beyond."""
     h = np.arange(0, round(_REACH * _CELLS_PER_BLUR) + 1) / _CELLS_PER_BLUR
     s = h[None, :]
     angle = np.arctan2(s, h[:, None])
@@ -414,11 +382,7 @@ _MAX_CORRELATION = 0.7  # of the residuals of neighbouring pixels; beyond it few
 def pixel_weights(
     residual: np.ndarray, use: np.ndarray, lattice: Lattice, least_scatter: float
 ) -> tuple[np.ndarray, FloatArray, FloatArray]:
-    """Weight (M, N) of every pixel, 1 / variance; scatter (M, 4) by side; mean robust weight (M,).
-
-    The robust weight is Cauchy's; the variance is that of a side's own pixels, inflated by the correlation of
-    neighbours.
-    """
+    """Weight (M, N) of every pixel: Cauchy's over its side's inflated variance; scatter (M, 4); mean (M,)."""
     size = np.abs(residual)
     scale = np.maximum(1.4826 * lattice.median_used(size, use), max(_MIN_SCATTER, least_scatter))
     robust = use / (1 + (size / (_CAUCHY * scale[:, None])) ** 2)

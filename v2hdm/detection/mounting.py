@@ -1,11 +1,10 @@
 """How a camera of which little is known is mounted, from the lines that its images show.
 
-Lines along a road are parallel on the ground and meet in one point of the horizon, wherever the road bends:
-points of several images, beside each other, also show the roll. A first network run on half the resolution
-finds crossings of lanes' lines and the edges of paint. Each of these lines is either one of the road's or any
-other; the horizon has a posterior on a grid of pitch and roll, whose prior is the stated or a usual mounting.
-An image's own horizon moves about the camera's with the vehicle's body. One vanishing point does not show the
-focal length: that stays as uncertain as its prior, and so does the height.
+Lines along a road are parallel on the ground and meet in one point of the horizon: points of several images,
+beside each other, also show the roll. A first network run on half the resolution finds crossings of lanes'
+lines and the edges of paint; each is one of the road's or any other. The horizon has a posterior on a grid of
+pitch and roll, whose prior is the stated or a usual mounting; an image's own moves about it with the
+vehicle's body. Focal length and height stay as uncertain as their priors.
 """
 
 from __future__ import annotations
@@ -31,9 +30,8 @@ _LEAST_EDGE_PX, _EDGE_SIGMA_PX = 6.0, 0.45
 """Least length of a paint's edge, and the standard deviation of its ends, in elements of the paint."""
 
 _FLAT = 0.12  # edges that rise less than this are of stop lines and of shadows across the road
+# Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is known.
 _PARALLEL_SIGMA_RAD = 0.015
-"""Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is
-known."""
 
 _SHARE = 0.4  # share of the lines that keep to the road: kerbs, arrows, letters and façades need not
 _POINT_SIGMA_PX = 1.5  # a vanishing point is a point to no more than this
@@ -49,40 +47,29 @@ _STEEPEST_RAD = np.deg2rad(80.0)  # nearer to straight down or up lines look par
 
 @dataclass(frozen=True)
 class Mounting:
-    """How a camera sits: its height, m; pitch, down from the horizon; roll; horizontal field of view.
-
-    ``sigma_rad`` (2,) are the standard deviations of pitch and roll, ``log_focal_sigma`` that of the
-    logarithm of the focal length.
-    """
+    """How a camera sits."""
 
     height_m: float
-    pitch_rad: float
+    pitch_rad: float  # down from the horizon
     roll_rad: float
-    fov_rad: float
-    sigma_rad: tuple[float, float]
-    log_focal_sigma: float = 0.0
+    fov_rad: float  # horizontal
+    sigma_rad: tuple[float, float]  # of pitch and roll
+    log_focal_sigma: float = 0.0  # of the logarithm of the focal length
 
 
 @dataclass(frozen=True)
 class Lines:
-    """N lines of an image: a point (N, 2) and the unit direction (N, 2) of each, pinhole px.
+    """N lines of an image."""
 
-    ``sigma_px`` and ``sigma_rad`` (N,) are their standard deviations across, ``weight`` (N,) how much each
-    counts.
-    """
-
-    point_px: FloatArray
-    direction: FloatArray
-    sigma_px: FloatArray
-    sigma_rad: FloatArray
-    weight: FloatArray
+    point_px: FloatArray  # (N, 2) on each, pinhole
+    direction: FloatArray  # (N, 2) unit
+    sigma_px: FloatArray  # (N,) across
+    sigma_rad: FloatArray  # (N,)
+    weight: FloatArray  # (N,) how much each counts
 
 
 def image_lines(network: Network, image_bgr: np.ndarray, info: CameraInfo) -> Lines:
-    """The lines that the network's output on the whole of an image (H, W, 3) uint8 shows.
-
-    Raises DetectorError where the network cannot be run on it.
-    """
+    """The lines that the network shows in an image (H, W, 3) uint8; DetectorError where it cannot be run."""
     half = cv2.resize(image_bgr, None, fx=1 / _SCALE, fy=1 / _SCALE, interpolation=cv2.INTER_AREA)
     output = network.run(half)
     rows = anchor_rows(output.lanes, network, 0, _SCALE)

@@ -24,8 +24,7 @@ from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.io.safe.texts import parse_json
 from v2hdm.records import SEEN_ACROSS, FloatArray
 
-METADATA_KEY = "v2hdm"
-"""Key of the file's ``metadata_props`` that holds its label, as JSON."""
+METADATA_KEY = "v2hdm"  # key of the file's ``metadata_props`` that holds its label, as JSON
 
 _OUTPUTS = ["paint", "kinds", "lanes"]
 
@@ -55,14 +54,10 @@ def as_probability(odds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NetworkInfo:
-    """The label of a model file.
+    """The label of a model file; strides are px per element of each output."""
 
-    ``classes`` are those of the channels of ``kinds``; inputs are padded to ``multiple`` px; the strides are
-    the numbers of px per element of each output. ``catalogue`` describes the classes.
-    """
-
-    classes: tuple[str, ...]
-    multiple: int
+    classes: tuple[str, ...]  # of the channels of ``kinds``
+    multiple: int  # px that inputs are padded to
     paint_stride: int
     kind_stride: int
     lane_stride: int
@@ -76,16 +71,11 @@ class NetworkInfo:
 
 @dataclass(frozen=True)
 class RawOutput:
-    """The network's output on one image.
+    """The network's output on an image; element (i, j) of stride s is at s * j + (s - 1) / 2, likewise i."""
 
-    Element (i, j) of an output of stride s belongs to the image point (s * j + (s - 1) / 2, likewise i).
-    ``paint`` (h, w) float32: log odds of paint. ``kinds`` (K, h', w') float32: logits of its class.
-    ``lanes`` (2, h", w") float32: log odds that a lane's line crosses the row anchor in the cell, and its
-    offset from the cell's centre in cells.
-    """
-
-    paint: np.ndarray
-    kinds: np.ndarray
+    paint: np.ndarray  # (h, w) float32: log odds of paint
+    kinds: np.ndarray  # (K, h', w') float32: logits of its class
+    # (2, h", w") float32: log odds that a line crosses the row anchor in the cell; offset, cells
     lanes: np.ndarray
 
 
@@ -100,18 +90,14 @@ class AnchorRow:
 
 @dataclass(frozen=True)
 class NetworkOutput:
-    """The network's output on the rows of an image that show road.
-
-    ``paint`` (h, w) and ``kinds`` (K, h', w'), logits of the ``classes``, are as in :class:`RawOutput`; they
-    start at image row ``top``, ``stride`` px per element of paint. ``anchors`` run from near to far.
-    """
+    """The network's output, as :class:`RawOutput`, on the rows of an image that show road."""
 
     paint: np.ndarray
     kinds: np.ndarray
-    anchors: list[AnchorRow]
-    classes: tuple[str, ...]
-    stride: int
-    top: int
+    anchors: list[AnchorRow]  # from near to far
+    classes: tuple[str, ...]  # of ``kinds``
+    stride: int  # px per element of paint
+    top: int  # the first image row
 
     @cached_property
     def kind_scale(self) -> float:
@@ -155,21 +141,13 @@ class Network:
     """The paint and lane network: uint8 BGR images in, :class:`RawOutput` out."""
 
     def __init__(self, path: Path | None = None, threads: int = 1, device: str = "cpu"):
-        """Load a model file, to be run on ``cpu`` or ``cuda``.
-
-        Raises DetectorError where there is no such file, it is not an ONNX model or not one of ours, or the
-        device is not there.
-        """
+        """Load a model file, to be run on ``cpu`` or ``cuda``; raises DetectorError where it cannot be."""
         self.path = NETWORK_FILE if path is None else Path(path)
         self._session = open_session(self.path, threads, device)
         self.info = _read_info(self._session, self.path)
 
     def run(self, image_bgr: np.ndarray) -> RawOutput:
-        """Look at an image (H, W, 3) uint8 of any size.
-
-        Raises DetectorError where the network refused the image, or its output is not what its label
-        promises.
-        """
+        """Look at an image (H, W, 3) uint8 of any size; DetectorError where the output is not as labelled."""
         height, width = image_bgr.shape[:2]
         below, right = -height % self.info.multiple, -width % self.info.multiple
         padded = image_bgr
@@ -203,10 +181,7 @@ class Network:
 def run_on_road(
     network: Network, image_bgr: np.ndarray, camera: RoadCamera, mirrored: bool = False
 ) -> NetworkOutput:
-    """Run the network on the rows of an image (H, W, 3) that show ground in reach.
-
-    ``mirrored`` runs it on the mirror image, too, and takes the mean of both outputs.
-    """
+    """Run the network on the rows that show ground in reach, and take the mean with the mirror image's."""
     info, top = network.info, camera.far_row
     band = image_bgr[top:]
     run = partial(_run_twice, network) if mirrored else network.run
@@ -292,10 +267,7 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that this onnxruntime was built without.
-
-    Raises DetectorError that says what to install.
-    """
+    """Raise DetectorError, with what to install, for a device that this onnxruntime was built without."""
     provider = _PROVIDERS[device][0]
     if provider not in onnxruntime.get_available_providers():
         raise DetectorError(
@@ -305,10 +277,7 @@ def check_device(device: str) -> None:
 
 
 def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
-    """A model file ready to run on so many threads, on ``cpu`` or ``cuda``.
-
-    Raises DetectorError where there is no such file, it is not an ONNX model, or the device is not there.
-    """
+    """A model file ready to run on ``cpu`` or ``cuda``; raises DetectorError where it cannot be."""
     check_device(device)
     if not path.is_file():
         raise DetectorError(
@@ -336,10 +305,7 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
 
 
 def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
-    """The classes that a model file describes: the shipped ones, and after them those of its user.
-
-    Raises ConfigError where one of them is wrong.
-    """
+    """The classes of a model file, the shipped ones first; raises ConfigError where one is wrong."""
     return SHIPPED.with_own(metadata.get("own_classes", {}), "its classes")
 
 

@@ -54,10 +54,7 @@ class DetectorOptions:
         return cls(min_confidence=0.3, mirrored=True)
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot work.
-
-        Raises ConfigError where a value is out of range.
-        """
+        """Raise ConfigError where a value is out of range."""
         check_settings(self, _RANGES, "detector.")
         if self.device not in DEVICES:
             raise ConfigError(f"detector.device is {shown(self.device)}: choose {' or '.join(DEVICES)}")

@@ -15,8 +15,7 @@ from v2hdm.records import BoolArray, FloatArray
 
 _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)  # weights of ITU-R BT.601
 _CLIPPED = 250  # codes from here on are those of a sensor at its limit, noise and white balance allowed for
-_DARK = 0.01
-"""Added to radiance before taking logarithms: in shade a step is as large as in the sun, noise is not."""
+_DARK = 0.01  # added to radiance before logarithms: in shade a step is as large as in the sun, noise is not
 
 _CODED = np.arange(256) / 255
 _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)
@@ -103,15 +102,11 @@ class Patches:
 
 @dataclass(frozen=True)
 class LensFrames:
-    """One frame for each of M markings: pinhole px from its middle in the image, scaled to recorded ones.
-
-    So a recorded pixel, and what blurs it, is about as large and as round in them as in the image, also near
-    the border of a wide lens. ``middle`` (M, 2) is in pinhole px, ``scale`` (M, 2, 2) leads to recorded ones.
-    """
+    """One frame for each of M markings: pinhole px from its middle, as large as recorded ones there."""
 
     camera: RoadCamera
-    middle: FloatArray
-    scale: FloatArray
+    middle: FloatArray  # (M, 2) pinhole px
+    scale: FloatArray  # (M, 2, 2) to recorded ones
 
     @classmethod
     def about(cls, camera: RoadCamera, corners_px: FloatArray) -> LensFrames:
@@ -153,14 +148,10 @@ class LensFrames:
 
 @dataclass(frozen=True)
 class ImageQuads(Quad):
-    """M quadrilaterals of an image, in coordinates in which their sides are straight.
+    """M quadrilaterals of an image, recorded px or, where the lens bows their sides, in their ``frames``."""
 
-    Those are recorded px, but for quadrilaterals that are ``bowed`` (M,) by the lens: ``frames`` (of them
-    alone).
-    """
-
-    bowed: BoolArray
-    frames: LensFrames | None
+    bowed: BoolArray  # (M,)
+    frames: LensFrames | None  # of the bowed ones alone
 
     @classmethod
     def of(cls, camera: RoadCamera, corners_px: FloatArray) -> ImageQuads:

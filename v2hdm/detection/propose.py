@@ -59,31 +59,21 @@ Shares of 39 arrows and 62 lines of 24 px and more, on photographs.
 """
 
 _LEAST_FILL = 0.5  # least share of a quadrilateral that its piece of paint fills: a triangle fills half
-_BORDER_PX = 3.0
-"""A side this near to the image's border is cut by it: the network's outline is coarser than this."""
+_BORDER_PX = 3.0  # a side this near to the image's border is cut by it: outlines are coarser than this
 
 
 @dataclass(frozen=True)
 class Blob:
-    """One connected piece of paint.
+    """One connected piece of paint; one that may be several markings comes whole, followed by its parts."""
 
-    ``level`` (h, w) float32 is positive inside, its zero crossing is the soft outline; element
-    (i, j) lies at recorded pixel ``origin_px + stride * (j, i)``. ``outline_px`` (N, 2) are the
-    zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
-    each class to its mean probability over the blob. ``touches_symbol`` says that it was split
-    off a connected piece of paint another part of which is an arrow, a chevron or other paint. A piece that
-    may be several markings comes whole, followed by its ``parts``. Lanes are ``traced`` in pieces of likely
-    paint, or in their parts of different classes.
-    """
-
-    class_score: dict[str, float]
-    level: np.ndarray
-    origin_px: FloatArray
+    class_score: dict[str, float]  # mean probability of each class
+    level: np.ndarray  # (h, w) float32, positive inside
+    origin_px: FloatArray  # of element (0, 0), recorded px; others are ``stride`` apart
     stride: int
-    outline_px: FloatArray
-    touches_symbol: bool = False
+    outline_px: FloatArray  # (N, 2) zero crossings of ``level``, recorded px, in no order
+    touches_symbol: bool = False  # split off a piece another part of which is a symbol or other paint
     parts: int = 0
-    traced: bool = True
+    traced: bool = True  # lanes are, in pieces of likely paint or parts of one class
 
     @property
     def kind(self) -> str:
@@ -93,18 +83,14 @@ class Blob:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A piece of paint: ``blob`` and its ``index``, the ``share`` of each class by network and size.
-
-    ``outline_vehicle`` (N, 2), m, is its outline on the ground. ``corners_pinhole_px`` (4, 2) is the tightest
-    quadrilateral around it, of which it fills ``fill``; None where there is none.
-    """
+    """A piece of paint as the classifier's candidate."""
 
     blob: Blob
     index: int
-    share: Mapping[str, float]
-    outline_vehicle: FloatArray
-    corners_pinhole_px: FloatArray | None
-    fill: float
+    share: Mapping[str, float]  # of each class, by network and size
+    outline_vehicle: FloatArray  # (N, 2) m, on the ground
+    corners_pinhole_px: FloatArray | None  # (4, 2) of the tightest quadrilateral, if any
+    fill: float  # share of that
 
     @property
     def kind(self) -> str:
@@ -123,9 +109,9 @@ class Proposal:
     def symbol_score(self, kind: str) -> float:
         """Probability of a symbol of a class.
 
-        A shaft is like a dash, so that the network names parts of an arrow wrongly, but hardly ever a dash an
-        arrow: a few independent votes are weighed by how often each is given where it is right and wrong.
-        What is hardly paint, or of another size, votes against it; a size by itself speaks for no symbol.
+        The network names parts of an arrow a dash, but hardly ever a dash an arrow: a few independent votes
+        are weighed by how often each is right and wrong. What is hardly paint, or of another size, votes
+        against it.
         """
         share = min(self.score_of([kind]), self.certainty * self.share.get(kind, 0.0))
         odds = _SYMBOL_ODDS + _VOTES * (share * _NAMED_ODDS - (1 - share) * _MISSED_ODDS)
@@ -143,10 +129,7 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Proposals:
-    """One image between network and fit: the network's output, and the ``pieces`` of paint in it.
-
-    ``owner`` (h, w) is 1 + the index of the piece that each element of the output's paint is of, 0 for none.
-    """
+    """One image between network and fit: its ``pieces``, and ``owner`` (h, w), 1 + the index of each's."""
 
     camera: RoadCamera
     output: NetworkOutput
@@ -203,10 +186,7 @@ def _shares(
 def _tightest(
     outlines: Sequence[FloatArray], camera: RoadCamera, max_range_m: float
 ) -> list[tuple[FloatArray | None, float]]:
-    """The tightest quadrilateral around the hull of each outline (N, 2), pinhole px, and its share filled.
-
-    None where it is not convex, not on the ground or out of range.
-    """
+    """The tightest quadrilateral around each outline (N, 2), pinhole px, None for none, and its share."""
     hulls = [cv2.convexHull((outline - outline[0]).astype(np.float32)) for outline in outlines]
     quads = [quad_from_hull(hull) for hull in hulls]
     there = [k for k, quad in enumerate(quads) if quad is not None]
@@ -223,10 +203,7 @@ def _tightest(
 
 
 class _Groups:
-    """Groups of classes: ``of_class`` (K,) of each class, the ``least_share`` (G,) of a blob to be present.
-
-    ``symbols`` are the names of symbols and other paint.
-    """
+    """Groups of classes, the ``least_share`` (G,) of a blob for each to be present, and the ``symbols``."""
 
     def __init__(self, classes: Sequence[str], catalogue: Catalogue) -> None:
         names = [catalogue.classes[name].group for name in classes]
@@ -239,14 +216,7 @@ class _Groups:
 def find_blobs(
     output: NetworkOutput, reach_px: int = 0, catalogue: Catalogue = SHIPPED
 ) -> tuple[list[Blob], np.ndarray]:
-    """Split the paint of one image into blobs; nothing is split within the groups of the catalogue's classes.
-
-    Blobs that lie above the image row ``reach_px`` as a whole are too far away to be of use.
-
-    Returns:
-        The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
-        ``paint``, that of the part where a piece has parts, 0 for none.
-    """
+    """Blobs of paint below image row ``reach_px``, and 1 + the index of each element's (h, w) int16."""
     # A frame of no paint around it lets every outline close.
     level = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
@@ -298,10 +268,7 @@ def _origin_px(output: NetworkOutput, row: int, column: int) -> FloatArray:
 def _doubtful(
     level: np.ndarray, contours: Sequence[np.ndarray], cells: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, IntArray]:
-    """Labels (h, w) of doubtful paint, their statistics, and which of them each piece (B,) is a part of.
-
-    0 for pieces that are all of theirs but for a rim.
-    """
+    """Labels (h, w) of doubtful paint, their statistics, the label of each piece (B,), 0 if the same area."""
     doubtful = (level > _DOUBTFUL).view(np.uint8)
     doubtful[[0, -1]], doubtful[:, [0, -1]] = 0, 0
     # Labels of 16 bits take a third of the time.
@@ -370,10 +337,7 @@ def _split(
     groups: _Groups,
     votes: FloatArray,
 ) -> list[Blob]:
-    """The parts that a piece (h, w) may be: those of different groups of classes, or else of sure paint.
-
-    ``votes`` (G,) are the shares of its elements that the groups have.
-    """
+    """The parts of a piece (h, w) of different groups, by their ``votes`` (G,), or else of sure paint."""
     present = np.flatnonzero(votes >= groups.least_share)
     levels = [level - _SURE]
     if len(present) > 1:
@@ -403,10 +367,7 @@ def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: tuple[
 
 
 def _lead(output: NetworkOutput, mine: BoolArray, box: tuple[slice, slice]) -> np.ndarray:
-    """By how much the best class of ``mine`` (K,) leads the best of the rest, in logits.
-
-    It is interpolated to the elements of the framed ``paint`` in a box, (h, w).
-    """
+    """By how many logits the best class of ``mine`` (K,) leads the rest, on the paint's elements in a box."""
     scale = output.kind_scale
     near = tuple(slice(max(int((p.start - 2) / scale) - 1, 0), int(p.stop / scale) + 2) for p in box)
     kinds = output.kinds[:, *near]
@@ -437,11 +398,7 @@ def outline_polygon(blob: Blob) -> FloatArray:
 
 
 def on_edges(outline_px: FloatArray, bgr: np.ndarray) -> FloatArray:
-    """An outline (N, 2), recorded px, of bright paint in (H, W, 3) uint8, moved to the paint's edges nearby.
-
-    There the light falls fastest from inside to outside. Places along the outline share their light, so that
-    dirt does not move one of them; where it falls nowhere, the outline stays.
-    """
+    """An outline (N, 2), recorded px, of bright paint, moved to where the light falls fastest nearby."""
     ring = np.vstack([outline_px, outline_px[:1]])
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
     wanted = np.linspace(0.0, at[-1], max(round(float(at[-1])), 3), endpoint=False)

@@ -42,8 +42,7 @@ from v2hdm.records import (
     MarkingDetection,
 )
 
-_LANE_SIGMA_PX = 1.0
-"""Standard deviation of a point of a lane's paint; points of whole lines have a sigma of their own."""
+_LANE_SIGMA_PX = 1.0  # standard deviation of a point of a lane's paint; points of whole lines have their own
 
 _PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
 
@@ -86,15 +85,11 @@ class RoadMarking:
 
 @dataclass(frozen=True)
 class RoadLane:
-    """One lane's line: ``points_vehicle`` (N, 2) belong to ``image.points_px``.
-
-    ``covariance_m2`` (N, 2, 2) holds the errors of pixels and calibration, point by point. Both are empty
-    where the camera is not calibrated.
-    """
+    """One lane's line; on the ground empty where the camera is not calibrated."""
 
     image: LaneDetection
-    points_vehicle: FloatArray
-    covariance_m2: FloatArray
+    points_vehicle: FloatArray  # (N, 2) m, of ``image.points_px``
+    covariance_m2: FloatArray  # (N, 2, 2) by the errors of pixels and calibration
 
 
 @dataclass(frozen=True)
@@ -142,10 +137,7 @@ class RoadDetector:
             raise MapFileError(f"{calibration}: {error}") from error
 
     def detect(self, image_bgr: np.ndarray) -> Road:
-        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
-
-        Raises DetectorError where the image is not of that form or not of the camera's size.
-        """
+        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError."""
         markings, lanes = self.detector.detect(image_bgr, self.camera)
         with lap("metres"):
             return self._on_ground(markings, lanes)

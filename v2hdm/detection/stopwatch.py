@@ -12,11 +12,9 @@ import numpy as np
 
 _running: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
-KEPT = 10_000
-"""Images whose times are kept, the last ones: a vehicle's process runs for days."""
+KEPT = 10_000  # images whose times are kept, the last ones: a vehicle's process runs for days
 
-TOTAL = "all"
-"""The name of the time from beginning to end of an image, stages or not."""
+TOTAL = "all"  # the name of the time from beginning to end of an image, stages or not
 
 
 class Stopwatch:

@@ -1,4 +1,4 @@
-"""One drive of an experiment: read or rendered, detected, mapped by every recipe, held against the truth.
+"""One drive of an experiment: read or rendered, detected, mapped by every recipe, measured by the truth.
 
 Every stage is kept in the cache, as those of ``v2hdm map`` are: a drive that was stopped goes on, and all
 that tables, figures and text need of a finished one is there in seconds.
@@ -7,12 +7,15 @@ that tables, figures and text need of a finished one is there in seconds.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.experiment.plan import OURS, Job
+from v2hdm.experiment.plan import OURS, RECIPES, Job
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS
 from v2hdm.mapping.results import MethodResult
@@ -23,18 +26,15 @@ from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
 from v2hdm.pipeline.survey import take_survey
 from v2hdm.progress import Progress
-from v2hdm.records import Drive, Marking, Truth
-from v2hdm.report.metrics import driven_past
+from v2hdm.records import DIAMOND, LANE_LINE, Drive, FloatArray, HdMap, IntArray, Lane, Marking, Truth
+from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings, rms
+from v2hdm.report.terminal import METHODS
 from v2hdm.simulate import rendered_drive
 from v2hdm.store.cache import StageCache
 
 
 def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:
-    """The record of a drive and of its maps by every recipe.
-
-    ``workers`` are processes to render and detect in; 1 stays in this one. Raises V2hdmError where the drive
-    cannot be rendered, read or looked at, or has no truth.
-    """
+    """The record of a drive and of its maps by every recipe; raises V2hdmError where it has no truth."""
     folder = Path(job.site.drive.path or "")
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))
@@ -70,8 +70,8 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
         "route": drive.route_map,
         "expected": {name: driven_past(drive, truth, members) for name, members in sets.items()},
         "maps": {name: {} for name in sets},
-        "lanes": {}, "failures": [],
-    }  # fmt: skip
+        "failures": [],
+    }
 
 
 def _add(record: dict[str, Any], recipe: str, sets: Mapping[str, Mapping[str, MethodResult]]) -> None:
@@ -81,8 +81,6 @@ def _add(record: dict[str, Any], recipe: str, sets: Mapping[str, Mapping[str, Me
             if recipe == OURS or method not in NAIVE_IPMS:
                 row = method if recipe == OURS else f"{method}, {recipe}"
                 record["maps"][name][row] = _plain_map(result.hd_map.markings)
-    if recipe == OURS:
-        record["lanes"] = {"Opt": [lane.points_map for lane in list(sets.values())[-1]["Opt"].hd_map.lanes]}
 
 
 def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
@@ -91,3 +89,118 @@ def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
         "corners": [marking.corners_map for marking in markings],
         "sightings": [marking.sightings for marking in markings],
     }
+
+
+ROWS: tuple[str, ...] = (
+    *METHODS,
+    *(f"{method}, {recipe}" for recipe in RECIPES if recipe != OURS for method in ("Opt", "ONI")),
+)
+"""Rows of the tables: the paper's four methods, then ours under other recipes."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one set of cameras of one drive; nan where nothing matched."""
+
+    markings: int
+    recall: float  # of the diamonds driven past, of all markings where there are none
+    false_markings: int
+    rmse_m: float
+    bias_m: float
+    spread_m: float  # root mean square distance of the error vectors from their mean
+    shared: int  # markings that every method of this camera set has mapped
+    shared_rmse_m: float  # of those alone
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Markings with a true counterpart ``true`` (M,), in route order, and their errors (M, 4, 2)."""
+
+    true: IntArray
+    errors_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The figures of one drive: by camera set, then by row."""
+
+    port: str
+    seed: int | None
+    started_from: str
+    rows: Mapping[str, Mapping[str, Row]]
+    matched: Mapping[str, Mapping[str, Matched]]
+    failures: tuple[tuple[str, str, str], ...]
+
+    @property
+    def title(self) -> str:
+        """The drive in words."""
+        return self.port if self.seed is None else f"{self.port} seed {self.seed}"
+
+
+def markings_of(plain: Mapping[str, Any]) -> tuple[Marking, ...]:
+    """The markings of a map in a drive's record."""
+    corners = np.array(plain["corners"], dtype=np.float64).reshape(-1, 4, 2)
+    return tuple(
+        Marking(kind, own, sightings)
+        for kind, own, sightings in zip(plain["kinds"], corners, plain["sightings"], strict=True)
+    )
+
+
+def truth_of(record: Mapping[str, Any]) -> Truth:
+    """The true map of a drive's record."""
+    true = markings_of(record["truth"])
+    lanes = tuple(Lane(LANE_LINE, np.array(line), 1) for line in record["true_lanes"])
+    return Truth(HdMap(true, lanes), {}, np.empty((0, 4, 4)), np.empty((0, len(true))), (), {})
+
+
+def measure(record: Mapping[str, Any]) -> Measured:
+    """The figures of a drive's record."""
+    truth = truth_of(record)
+    true = truth.map.markings
+    passed = _passed(true, np.array(record["route"], dtype=np.float64))
+    rows: dict[str, Mapping[str, Row]] = {}
+    matched: dict[str, Mapping[str, Matched]] = {}
+    for cameras, plain_maps in record["maps"].items():
+        maps = {row: HdMap(markings_of(plain_maps[row])) for row in ROWS if row in plain_maps}
+        found = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
+        shared = set(range(len(true))).intersection(*(one.true.tolist() for one in found.values()))
+        expected = np.array(record["expected"][cameras], dtype=np.bool_)
+        rows[cameras] = {row: _row(maps[row], truth, expected, found[row], shared) for row in maps}
+        matched[cameras] = found
+    failures = tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"])
+    port, seed, started_from = (record[name] for name in ("port", "seed", "started_from"))
+    return Measured(port, seed, started_from, rows, matched, failures)
+
+
+def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
+    """For every true marking the point of the route nearest to it, the first where there are several."""
+    if not true:
+        return np.empty(0, dtype=np.int64)
+    centres = np.array([marking.corners_map.mean(axis=0) for marking in true])
+    away_m = np.linalg.norm(centres[:, None] - route_map[None], axis=2)
+    return np.asarray(away_m.argmin(axis=1))
+
+
+def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:
+    mapped, other = (np.array(i, dtype=np.int64) for i in match_markings(hd_map.markings, true))
+    order = np.argsort(passed[other], kind="stable")
+    mapped, other = mapped[order], other[order]
+    errors = corner_errors([hd_map.markings[m] for m in mapped], [true[t] for t in other])
+    return Matched(other, errors.reshape(-1, 4, 2))
+
+
+def _row(hd_map: HdMap, truth: Truth, expected: np.ndarray, matched: Matched, shared: set[int]) -> Row:
+    overall = marking_metrics(hd_map, truth, expected)
+    diamonds = marking_metrics(hd_map, truth, expected, DIAMOND)
+    errors = matched.errors_m.reshape(-1, 2)
+    of_shared = matched.errors_m[np.isin(matched.true, list(shared))].reshape(-1, 2)
+    return Row(
+        markings=overall.markings,
+        recall=diamonds.recall if diamonds.expected else overall.recall,
+        false_markings=overall.false_markings,
+        rmse_m=overall.corner_rmse_m,
+        bias_m=overall.corner_bias_m,
+        spread_m=rms(errors - errors.mean(axis=0)) if len(errors) else float("nan"),
+        shared=len(shared),
+        shared_rmse_m=rms(of_shared),
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from v2hdm.experiment.measures import Matched, Measured, markings_of, truth_of
-from v2hdm.records import LANE_LINE, FloatArray, HdMap, Lane
+from v2hdm.experiment.drive import Matched, Measured, truth_of
+from v2hdm.records import FloatArray, Truth
 from v2hdm.report import style
-from v2hdm.report.figures import draw_truth, save_birdseye, site_and_detail
-from v2hdm.report.terminal import METHODS
 
 Caption = Mapping[str, Any]  # the values in a figure's caption, by their names in the template figures.md
 
@@ -38,8 +37,8 @@ def save_figures(
         firsts.setdefault(one.port, number)
     work: dict[str, tuple[str, Callable[[Path], Caption | None]]] = {}
     for port, n in firsts.items():
-        for kind, draw in (("map", _save_map), ("eni_oni", _save_shift)):
-            work[f"{kind}_{port}.png"] = kind, partial(draw, record=records[n], measured=measured[n])
+        draw = partial(_save_shift, record=records[n], measured=measured[n])
+        work[f"eni_oni_{port}.png"] = "eni_oni", draw
     work["corners.png"] = "corners", partial(_save_boxes, firsts=[measured[n] for n in firsts.values()])
     captions = {}
     for done, (name, (kind, save)) in enumerate(work.items()):
@@ -51,25 +50,8 @@ def save_figures(
     return captions
 
 
-def _save_map(path: Path, record: Mapping[str, Any], measured: Measured) -> Caption | None:
-    """Draw the optimised map over the truth, and a close-up of all methods."""
-    cameras, by_method = list(measured.matched.items())[-1]
-    found = by_method.get("Opt")
-    if found is None or not len(found.true):
-        return None
-    lanes = tuple(Lane(LANE_LINE, np.array(line), 1) for line in record["lanes"].get("Opt", []))
-    plain = record["maps"][cameras]
-    maps = {
-        one: HdMap(markings_of(plain[one]), lanes if one == "Opt" else ()) for one in METHODS if one in plain
-    }
-    save_birdseye(path, maps, "Opt", np.array(record["route"]), truth_of(record))
-    error_cm = 100 * np.linalg.norm(found.errors_m, axis=2)
-    of_marking, worst = np.median(error_cm.mean(axis=1)), error_cm.max()
-    drawn = [f"{one} {' and '.join(style.WORDS[one])}" for one in maps]
-    said = {"drive": measured.title, "cameras": cameras, "methods": ", ".join(drawn)}
-    return said | {"median": f"{of_marking:.1f}", "worst": f"{worst:.1f}"}
-
-
+_HEIGHT_IN = 7.6
+_BESIDE_ROUTE_M = 12.0
 _CLOSE_UP_M = 6.0  # half the width of the close-up on where most markings stand together
 
 
@@ -86,9 +68,9 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
     true = np.array([marking.corners_map for marking in truth.map.markings])[common]
     moved = {"ENI": true + before.errors_m[rows], "ONI": true + after.errors_m[columns]}
     links = np.stack([one.reshape(-1, 2) for one in moved.values()], axis=1)
-    with site_and_detail(path, np.array(record["route"])) as (site, detail):
+    with _site_and_detail(path, np.array(record["route"])) as (site, detail):
         for axes, width in ((site, 0.7), (detail, 1.5)):
-            draw_truth(axes, truth)
+            _draw_truth(axes, truth)
             for method, corners in moved.items():
                 outline: dict[str, Any] = {"facecolors": "none", "edgecolors": style.METHOD[method]}
                 outlines = PolyCollection(list(corners), lw=width, zorder=3, label=method, **outline)
@@ -96,13 +78,39 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
             dashes: dict[str, Any] = {"colors": "k", "ls": (0, (3, 2)), "label": "the same corner"}
             axes.add_collection(LineCollection(list(links), lw=width, zorder=4, **dashes))
         site.set_title(f"{measured.title}: ENI against ONI, {cameras}")
-        style.cut_to_square(detail, _crowd(true.mean(axis=1)), _CLOSE_UP_M)
+        x, y = _crowd(true.mean(axis=1)).tolist()
+        detail.set(xlim=(x - _CLOSE_UP_M, x + _CLOSE_UP_M), ylim=(y - _CLOSE_UP_M, y + _CLOSE_UP_M))
         detail.set_title("Where most markings stand together")
     said: dict[str, Any] = {"drive": measured.title, "cameras": cameras, "markings": len(common)}
     for method, corners in moved.items():
         rmse_cm = 100 * np.sqrt(((corners - true) ** 2).sum(axis=2).mean())
-        said |= {method: f"{rmse_cm:.1f}", f"{method}_colour": style.WORDS[method][0]}
+        said |= {method: f"{rmse_cm:.1f}", f"{method}_colour": style.WORDS[method]}
     return said
+
+
+@contextmanager
+def _site_and_detail(path: Path, route_map: FloatArray) -> Iterator[tuple[Axes, Axes]]:
+    """A figure of two panels, the site with the route (N, 2) in it and a close-up; legends below them."""
+    low, high = route_map.min(axis=0) - _BESIDE_ROUTE_M, route_map.max(axis=0) + _BESIDE_ROUTE_M
+    extent_m = high - low
+    site_width_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.5, 2.0)) + 1.6
+    with style.figure(path, site_width_in + _HEIGHT_IN, _HEIGHT_IN) as fig:
+        site, detail = fig.subplots(1, 2, width_ratios=[site_width_in, _HEIGHT_IN])
+        site.plot(*route_map.T, color=style.ROUTE, lw=6, zorder=0, solid_capstyle="round", label="route")
+        site.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        yield site, detail
+        for axes in (site, detail):
+            if axes.axison:
+                axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
+                axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=5, borderaxespad=3.5)
+
+
+def _draw_truth(axes: Axes, truth: Truth) -> None:
+    """Draw the true paint."""
+    polygons, lanes = [m.corners_map for m in truth.map.markings], [one.points_map for one in truth.map.lanes]
+    paint = PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.4, label="truth")
+    axes.add_collection(paint)
+    axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
 
 
 def _crowd(centres: FloatArray) -> FloatArray:

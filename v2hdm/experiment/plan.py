@@ -69,10 +69,7 @@ class ExperimentConfig:
 
 @dataclass(frozen=True)
 class Job:
-    """One drive of the experiment: a port under one seed, None where the drive is read.
-
-    ``options`` are the settings of the mapping by recipe.
-    """
+    """One drive of the experiment: a port under one seed, None if it is read; ``options`` by recipe."""
 
     port: str
     seed: int | None
@@ -88,11 +85,7 @@ class Job:
 
 
 def jobs(config: ExperimentConfig) -> list[Job]:
-    """The drives of an experiment, seed by seed, so that what is finished first compares all ports.
-
-    Raises ConfigError, which names the key, where a setting cannot work, DetectorError where
-    ``detector.model`` cannot be used.
-    """
+    """The drives of an experiment, seed by seed, so that what is finished first compares all ports."""
     _check(config)
     changed: dict[str, dict[str, Any]] = {
         OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}

@@ -12,9 +12,8 @@ from typing import Any
 from rich.console import Console
 
 from v2hdm.errors import ConfigError, WorkerError
-from v2hdm.experiment.drive import drive_record
+from v2hdm.experiment.drive import Measured, drive_record, measure
 from v2hdm.experiment.figures import save_figures
-from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.summary import claims, write_tables, write_words
 from v2hdm.progress import patient
@@ -29,12 +28,7 @@ _OPTION, _MADE = "output=", "v2hdm experiment"
 def run_experiment(
     config: ExperimentConfig, config_yaml: str, progress: DriveProgress
 ) -> tuple[Path, list[Measured]]:
-    """Map every drive by every recipe and write what comes of it into ``<output>/<name>/``.
-
-    ``config_yaml`` is the configuration as text, kept beside the results. Returns the folder, and the
-    figures of every drive.
-    Raises V2hdmError where a setting or a drive is at fault, or the folder holds something that is not ours.
-    """
+    """Map every drive by every recipe and write what comes of it; returns the folder and all figures."""
     todo = jobs(config)
     folder = Path(config.output) / config.name
     try:

@@ -12,7 +12,7 @@ import jinja2
 import numpy as np
 
 from v2hdm import __version__
-from v2hdm.experiment.measures import ROWS, Measured, Row
+from v2hdm.experiment.drive import ROWS, Measured, Row
 from v2hdm.experiment.plan import RECIPES, ExperimentConfig
 from v2hdm.store.files import replace_csv, replace_text
 
@@ -105,11 +105,7 @@ IPM that a port must start from to test it; None for any."""
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim held against the figures of one port and set of cameras.
-
-    The mean of ``values``, one per seed, is to keep ``limit``; ``shared`` are the same ratios over the
-    markings that every method has mapped.
-    """
+    """One claim against the figures of a port and camera set: by seed, and over the shared markings."""
 
     text: str
     where: str
@@ -176,10 +172,7 @@ def write_words(
     captions: Mapping[str, tuple[str, Mapping[str, Any]]],
     config: ExperimentConfig,
 ) -> None:
-    """Write ``experiment.md``, the text, and ``figures.md``, the figures with their captions.
-
-    ``captions`` are by file name the kind of a figure and the values that its caption states.
-    """
+    """Write ``experiment.md``, the text, and ``figures.md``, the figures with their captions."""
     replace_text(folder / "experiment.md", words(measured, config))
     replace_text(folder / "figures.md", _filled("figures.md", captions=captions))
 

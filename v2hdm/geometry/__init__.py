@@ -1,11 +1,7 @@
 """Frames, conventions and the ground floor of geometry, in numpy: every other part may import it.
 
-Modules: :mod:`~v2hdm.geometry.rigid` (rigid motions), :mod:`~v2hdm.geometry.lens` (distortion),
-:mod:`~v2hdm.geometry.ipm` (the camera and the ground plane), :mod:`~v2hdm.geometry.planar` (polygons),
-:mod:`~v2hdm.geometry.quadrilateral` (markings of four corners), :mod:`~v2hdm.geometry.mounting` (mountings in
-words), :mod:`~v2hdm.geometry.trajectory` (poses at any time), :mod:`~v2hdm.geometry.least_squares`
-(Gauss-Newton for the small problems). :mod:`~v2hdm.geometry.tensors` has the parts that mapping and
-adjustment need in torch and kornia; nothing that runs on the vehicle imports it.
+:mod:`~v2hdm.geometry.tensors` has the parts that mapping and adjustment need in torch and kornia; nothing
+that runs on the vehicle imports it.
 
 Frames
     - ``map``: local east-north-up, metres, z up, the ground near z = 0, origin near the site (ROS

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import MapFileError, V2hdmError
-from v2hdm.extras import need
+from v2hdm.errors import MapFileError, V2hdmError, need
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84
@@ -63,8 +62,7 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     return geodetic
 
 
-LOCAL = "local"
-"""The name of the map's own frame where a coordinate system is asked for."""
+LOCAL = "local"  # the name of the map's own frame where a coordinate system is asked for
 
 _GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # .1 mm on the ground
 _BESIDE_DEG = 1.0  # surveyors use a zone's grid a little beyond its edges
@@ -187,8 +185,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
     """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
 
-    Raises ``error`` as :func:`geodetic_from_grid`, and when the projection is not conformal: then a grid has
-    no north that all directions turn with.
+    Raises ``error`` as :func:`geodetic_from_grid`, and when the projection is not conformal.
     """
     here = geodetic_from_grid(crs, points, where, error)
     pyproj = need("pyproj", "map", f"{where}: crs", error)

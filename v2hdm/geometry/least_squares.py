@@ -20,23 +20,18 @@ from v2hdm.records import FloatArray
 X = TypeVar("X")
 N = TypeVar("N", bound="Normal")
 
-_RANK = 1e-12
-"""Relative size below which an eigenvalue of the scaled information is rounding: nothing observes it."""
+_RANK = 1e-12  # relative size below which an eigenvalue of the scaled information is rounding
 
 _GIVE_UP = 1e8  # damping from which a cost that still grows is at its minimum but for rounding
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations at an estimate.
+    """Normal equations at an estimate, of residuals r, their derivative J and inverse covariance W."""
 
-    ``information`` (U, U) is J'WJ and ``gradient`` (U,) J'Wr of residuals r with the derivative J and the
-    inverse covariance W; ``cost`` is r'Wr / 2, or that of a robust loss.
-    """
-
-    information: FloatArray
-    gradient: FloatArray
-    cost: float
+    information: FloatArray  # (U, U) J'WJ
+    gradient: FloatArray  # (U,) J'Wr
+    cost: float  # r'Wr / 2, or that of a robust loss
 
 
 def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatArray | None = None) -> Normal:
@@ -52,16 +47,12 @@ def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatAr
 
 @dataclass(frozen=True)
 class Fit(Generic[X, N]):
-    """Where an iteration ended: at the estimate ``x``, after ``steps``.
-
-    ``step`` (U,) is the last one, as limited, taken from the normal equations ``last``. It was short enough
-    if ``converged``; if not, the steps were used up, or the problem was not finite.
-    """
+    """Where an iteration ended."""
 
     x: X
     last: N
-    step: FloatArray
-    converged: bool
+    step: FloatArray  # (U,) the last one, as limited, from the equations ``last``
+    converged: bool  # it was short enough; else steps were used up, or the problem was not finite
     steps: int
 
     @property

@@ -53,10 +53,7 @@ def is_simple(polygon: FloatArray) -> bool:
 
 
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
-    """A polygon (N, 2) cut to a convex window (M, 2) of either turning (Sutherland and Hodgman, CACM 1974).
-
-    OpenCV's intersectConvexConvex gives nothing for some polygons that nearly coincide.
-    """
+    """A polygon (N, 2) cut to a convex window (M, 2); OpenCV gives nothing where they nearly coincide."""
     inside = window.mean(axis=0)
     for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
         along = end - start
@@ -105,10 +102,7 @@ def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:
-    """Length and width of the smallest rectangle around points (N, 2), those that are nan left out.
-
-    They are nan for fewer than three points.
-    """
+    """Length and width of the smallest rectangle around points (N, 2); nan for fewer than three not nan."""
     seen = points[np.isfinite(points[:, 0])]
     if len(seen) < 3:
         return float("nan"), float("nan")

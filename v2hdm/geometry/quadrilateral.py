@@ -33,10 +33,7 @@ _END = 4 + (_CORNER - 1) % 4
 
 @dataclass(frozen=True)
 class Quad:
-    """Quadrilaterals ``corners`` (..., 4, 2) with all that follows from them, each worked out once.
-
-    The sides' normals point outwards in an image and inwards in the map.
-    """
+    """Quadrilaterals (..., 4, 2) with all that follows, each once; normals point outwards in an image."""
 
     corners: FloatArray
 
@@ -110,16 +107,11 @@ class Quad:
 
 
 class Alignment(NamedTuple):
-    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift.
+    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift."""
 
-    ``shift``: corner c of a matches corner (c + shift) mod 4 of b; ``offset`` (..., 2) is the mean
-    displacement of b's corners; ``deformation_m`` the largest deviation of a corner from that mean, infinite
-    where fewer than two corners are valid in both.
-    """
-
-    shift: IntArray
-    offset: FloatArray
-    deformation_m: FloatArray
+    shift: IntArray  # corner c of a matches (c + shift) mod 4 of b
+    offset: FloatArray  # (..., 2) mean displacement of b's corners
+    deformation_m: FloatArray  # largest deviation from that, infinite for fewer than two common corners
 
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
@@ -148,10 +140,7 @@ def following(values: np.ndarray, axis: int = -2) -> np.ndarray:
 
 
 def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Tangent (..., 4, 2), normal (..., 4, 2) and length (..., 4) of each side.
-
-    The normal is (-t_y, t_x) of the tangent t: it points outwards in an image and inwards in the map.
-    """
+    """Tangent t (..., 4, 2), normal (-t_y, t_x) (..., 4, 2) and length (..., 4) of each side."""
     along = following(corners) - corners
     length = np.hypot(along[..., 0], along[..., 1])
     tangent = along / np.maximum(length, 1e-9)[..., None]
@@ -170,11 +159,7 @@ def is_convex_px(corners_px: FloatArray) -> BoolArray:
 
 
 def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) -> Alignment:
-    """Align quadrilaterals ``b`` (..., 4, 2) to ``a`` (..., 4, 2); leading dimensions broadcast.
-
-    The shift is the one with the least mean squared distance over the common valid corners: sense
-    of rotation is known, so there are four candidates and no mirror images.
-    """
+    """Align ``b`` (..., 4, 2) to ``a`` by that shift which brings the common valid corners nearest."""
     both = valid_a[..., None, :] & valid_b[..., SHIFTS]
     difference = np.where(both[..., None], b[..., SHIFTS, :] - a[..., None, :, :], 0.0)
     common = both.sum(axis=-1)

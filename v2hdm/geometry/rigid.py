@@ -13,8 +13,7 @@ import numpy as np
 
 from v2hdm.records import FloatArray
 
-SERIES_TERMS = 15
-"""Terms of the power series of theta^2, enough for float64 up to theta = pi: pi^(2 * 15) / 31! < 1e-18."""
+SERIES_TERMS = 15  # terms of the power series of theta^2: for float64, up to pi, as pi^(2 * 15) / 31! < 1e-18
 
 EXP_SERIES = tuple(tuple(1 / factorial(2 * n + offset) for offset in (1, 2, 3)) for n in range(SERIES_TERMS))
 """Coefficients (terms, 3) of (-theta^2)^n in sin(theta) / theta, (1 - cos(theta)) / theta^2 and
@@ -66,10 +65,7 @@ def hat(vectors: FloatArray) -> FloatArray:
 
 
 def exp(tangents: FloatArray) -> FloatArray:
-    """The rigid motions (..., 4, 4) of tangents (..., 6), for rotations up to pi.
-
-    Rodrigues' formula with its coefficients as power series of theta^2.
-    """
+    """The rigid motions (..., 4, 4) of tangents (..., 6), for rotations up to pi, by Rodrigues' formula."""
     omega = hat(tangents[..., 3:])
     squared = omega @ omega
     sine, cosine, third = _even_series(tangents[..., 3:], EXP_SERIES)
@@ -135,11 +131,7 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4), xyzw with w >= 0, of rotation matrices (N, 3, 3).
-
-    Shepperd's method (Journal of Guidance and Control 1, 1978): of the four equivalent formulas,
-    each matrix takes the one that divides by its largest component.
-    """
+    """Unit quaternions (N, 4), xyzw with w >= 0, of rotation matrices (N, 3, 3), by Shepperd (1978)."""
     diagonal = np.diagonal(rotation, axis1=1, axis2=2)
     trace = diagonal.sum(axis=1)
     candidates = np.empty((len(rotation), 4, 4))

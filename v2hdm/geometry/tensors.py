@@ -16,8 +16,7 @@ from torch import Tensor
 
 from v2hdm.records import CameraInfo
 
-NEAR_M = 0.1
-"""Depth below which :func:`inverse_depth` leaves 1 / z: nothing a vehicle maps is that close."""
+NEAR_M = 0.1  # depth below which :func:`inverse_depth` leaves 1 / z: nothing a vehicle maps is that close
 
 
 def inverse_depth(depth_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -40,19 +39,13 @@ def inverse(dst_from_src: Tensor) -> Tensor:
 
 
 def back_project(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> Tensor:
-    """Ground points (N, K, 2) of pixels (N, K, 2) by IPMs (N, 3, 3); nan at and above the horizon.
-
-    Below the horizon the third homogeneous coordinate is positive, as :mod:`v2hdm.geometry.ipm` has it.
-    """
+    """Ground points (N, K, 2) of pixels (N, K, 2) by IPMs (N, 3, 3); nan at and above the horizon."""
     third = convert_points_to_homogeneous(pinhole_px) @ ground_from_pinhole_px[:, 2, :, None]
     return torch.where(third > 0, transform_points(ground_from_pinhole_px, pinhole_px), torch.nan)
 
 
 def back_project_with_jacobian(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`back_project`, and its derivative (N, K, 2, 2) by the pixels, nan where it is nan itself.
-
-    Each point depends on its own pixel alone, so that one backward pass per coordinate gives all of it.
-    """
+    """:func:`back_project`, and its derivative (N, K, 2, 2) by the pixels, nan where it is nan itself."""
     with torch.enable_grad():
         leaves = pinhole_px.detach().requires_grad_()
         points = back_project(ground_from_pinhole_px, leaves)

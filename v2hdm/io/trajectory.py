@@ -32,10 +32,7 @@ _LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand ye
 def checked_rotations(
     quaternion: FloatArray, place: Callable[[int], str], advice: str = "normalise it", tolerance: float = 1e-3
 ) -> FloatArray:
-    """Rotations (N, 3, 3) of quaternions (N, 4), xyzw; DriveError at the ``place`` of one not of unit norm.
-
-    Files with four decimals pass the usual ``tolerance``, a forgotten component does not.
-    """
+    """Rotations (N, 3, 3) of quaternions (N, 4), xyzw; DriveError, at its ``place``, for a wrong norm."""
     norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norm - 1) > tolerance)
     if len(wrong):
@@ -147,10 +144,7 @@ def _check_rising(stamp_s: FloatArray, numbers: Sequence[int], path: Path) -> No
 
 
 def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
-    """Rows (K,) by time, the first of equal times; refuses stamps a second or more behind an earlier one.
-
-    Recorders and networks swap neighbours; a longer way back in time is a second clock or recording.
-    """
+    """Rows (K,) by time, the first of equal times; refuses stamps a second or more behind an earlier one."""
     if not len(stamp_s):
         raise DriveError(f"{where}: holds no pose; record some, or check what it is")
     if not np.isfinite(stamp_s).all():
@@ -173,10 +167,7 @@ def why_no_pose(
     asking: str = "images",
     asked: str = "poses",
 ) -> str:
-    """The likely cause, and its remedy, why no image (N,) finds a pose (P,): units, epochs, or gaps.
-
-    ``asking`` and ``asked`` are the words for images and poses.
-    """
+    """Why no image (N,) finds a pose (P,), or what is called so, and what to do: units, epochs or gaps."""
     images, poses = unit_of(image_stamp_s), unit_of(pose_stamp_s)
     if unit := images or poses:
         whose = "all stamps" if images == poses else f"the {asking if images else asked}' stamps"

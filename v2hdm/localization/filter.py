@@ -90,11 +90,7 @@ def start(map_from_vehicle: FloatArray, sigma_m: float, sigma_rad: float, attitu
 
 
 def predict(state: State, step_s: float, attitude_rad: float) -> State:
-    """The state ``step_s`` later: constant speed and yaw rate, disturbed by white accelerations.
-
-    Roll and pitch start afresh, with the standard deviation ``attitude_rad``: the road and the
-    springs are not modelled.
-    """
+    """The state ``step_s`` later: constant speed and yaw rate, white accelerations; roll and pitch afresh."""
     x, y, heading, speed, turn = state.mean[:5]
     middle = heading + turn * step_s / 2
     ahead = np.array([np.cos(middle), np.sin(middle)])
@@ -120,10 +116,7 @@ def predict(state: State, step_s: float, attitude_rad: float) -> State:
 
 @dataclass(frozen=True)
 class Seen:
-    """One detection: its class, camera, and corners (4, 2) with covariances (4, 2, 2) in pinhole pixels.
-
-    ``informs`` (4,) says which corners say anything; a corner on a known line has a large sigma along it.
-    """
+    """One detection: class, camera, corners (4, 2), pinhole px, covariances (4, 2, 2), which inform."""
 
     kind: str
     intrinsic: FloatArray
@@ -158,16 +151,12 @@ class Seen:
 
 @dataclass(frozen=True)
 class Match:
-    """A detection and a marking of the map that it may show.
-
-    ``rows`` (2 K,) of the detection's stacked corners, those that say anything, are the rows ``kept`` of the
-    marking's. ``noise`` (2 K, 2 K) is the covariance of both, px^2.
-    """
+    """A detection and a marking of the map that it may show."""
 
     seen: Seen
-    rows: IntArray
-    kept: BoolArray
-    noise: FloatArray
+    rows: IntArray  # (2 K,) of the detection's stacked corners that say anything
+    kept: BoolArray  # those of the marking's
+    noise: FloatArray  # (2 K, 2 K) covariance of both, px^2
     corners_map: FloatArray
 
     def against(self, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -240,8 +229,7 @@ class Markings:
 def fit(state: State, match: Match) -> tuple[State, float, float]:
     """The state after a match, its squared distance, in sigmas, and that less twice the log likelihood.
 
-    The iterated update of an extended Kalman filter as least squares over the state whitened by its own
-    covariance, which may be singular; the distance is the part of pixels and state that no state explains.
+    An iterated extended Kalman update, as least squares over the state whitened by its covariance.
     """
     values, axes = np.linalg.eigh(state.covariance)
     spread = axes * np.sqrt(np.maximum(values, 0.0))
@@ -268,11 +256,7 @@ def fit(state: State, match: Match) -> tuple[State, float, float]:
 
 
 def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[State, list[int]]:
-    """The state after one frame's detections, and the markings matched.
-
-    Detections that only one marking explains are used first, near ones before far ones; then the rest is
-    tried again with the better state.
-    """
+    """The state after one frame's detections, the unambiguous ones first, and the markings matched."""
     matched: list[int] = []
     waiting = sorted(seen, key=lambda one: -float(one.corners_px[:, 1].max()))
     while waiting:

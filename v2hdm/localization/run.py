@@ -29,7 +29,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.report import style
-from v2hdm.report.outputs import write_json
+from v2hdm.store.files import write_json
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
 _START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
@@ -44,25 +44,16 @@ _KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
 
 @dataclass(frozen=True)
 class Localised:
-    """A vehicle followed through F frames.
+    """A vehicle followed through F frames."""
 
-    Attributes:
-        stamp_s: (F,) time of each frame.
-        recorded: (F, 4, 4) ``map_from_vehicle`` as recorded.
-        states: after each frame.
-        matched: (F,) markings matched.
-        in_view: (F,) whether a marking was in view.
-        shared: (3,) variances of ahead, left and heading that map and calibration share among all frames.
-        detections: number of all frames together.
-    """
-
-    stamp_s: FloatArray
-    recorded: FloatArray
-    states: tuple[State, ...]
-    matched: IntArray
-    in_view: BoolArray
+    stamp_s: FloatArray  # (F,) time of each frame
+    recorded: FloatArray  # (F, 4, 4) ``map_from_vehicle`` as recorded
+    states: tuple[State, ...]  # after each frame
+    matched: IntArray  # (F,) markings matched
+    in_view: BoolArray  # (F,) whether a marking was in view
+    # (3,) variances of ahead, left and heading that map and calibration share among all frames
     shared: FloatArray
-    detections: int
+    detections: int  # number of all frames together
 
     @property
     def poses(self) -> Trajectory:
@@ -224,11 +215,7 @@ def _in_view(
 
 
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
-    """Write figures, poses and the picture of the errors into a folder.
-
-    Its bands are two standard deviations of estimate and recorded pose together; frames in which the vehicle
-    does not know where it is are crosses.
-    """
+    """Write figures, poses and the errors' picture: two-sigma bands, crosses where the vehicle is lost."""
     write_json(folder / "localization.json", found.figures())
     write_tum(found.poses, folder / "localized.tum")
     noise = drive.pose_noise

@@ -13,17 +13,14 @@ from v2hdm.association.sightings import Sightings
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import Camera, FloatArray
 
-_ENDS = 60
-"""Places along a session where a stretch may begin or end."""
+_ENDS = 60  # places along a session where a stretch may begin or end
 
 _PSEUDO_VIEWS = 2.0
 """Views that the drive's share of found markings counts for in that of one: some are worn or half hidden."""
 
-_BY_MISTAKE = 0.05
-"""Share of its views in which a marking of one place is taken for one of the other."""
+_BY_MISTAKE = 0.05  # share of its views in which a marking of one place is taken for one of the other
 
-_CONFUSED = 0.3
-"""Share of the markings that are a mixture of two, one of either place."""
+_CONFUSED = 0.3  # share of the markings that are a mixture of two, one of either place
 
 _HIDDEN = 0.08
 """Share of the markings that a vehicle or a post hides in some of their views, one after the other: the
@@ -66,10 +63,7 @@ def foreign_stretch(
 
 
 def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray:
-    """The gains (E,) of stretches: (2, E, G) views ``within`` that found markings, and all there are.
-
-    What hides a marking may begin or end where the stretch does, by chance: at one of its views.
-    """
+    """The gains (E,) of stretches, by views (2, E, G) within them that found markings, and all there are."""
     beyond, together = all_over - within, _log_likelihood(all_over, share)
     mistake = np.log([_BY_MISTAKE, 1 - _BY_MISTAKE])
     home, foreign = (

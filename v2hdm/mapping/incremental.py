@@ -1,12 +1,9 @@
 """The drive mapped as it would be on the vehicle: marking by marking, with nothing known of what comes.
 
-A track that the vehicle has left behind becomes a marking as soon as it ends: one of the map, where it lies
-on it, or else a further one. Map and extrinsics are up to date after each (:mod:`v2hdm.adjust.incremental`),
-under a model that takes the poses at their word, and their errors for noise in the image.
-
-The first tracks are linked under a coarse IPM. Whenever the map has grown fourfold, and when the drive ends,
-all is solved together with the errors of the poses, as the batch does, and what has been seen so far is
-linked again under the extrinsics and poses that this leads to: a constant share of the cost.
+A track becomes a marking, of the map where it lies on one, as soon as it ends. Map and extrinsics are up to
+date after each (:mod:`v2hdm.adjust.incremental`), under a model that takes poses' errors for noise in the
+image. Whenever the map has grown fourfold, and when the drive ends, all is linked again and solved together
+with the errors of the poses, as the batch does: a constant share of the cost.
 """
 
 from __future__ import annotations
@@ -19,8 +16,14 @@ import numpy as np
 from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association, group_kinds
-from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.tracks import (
+    GATE_SIGMAS,
+    LEAST_SIGHTINGS,
+    MAX_GATE_M,
+    REFINED_SIGMA_RAD,
+    SHAPE_TOLERANCE,
+)
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths
@@ -43,10 +46,7 @@ _LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
 
 @dataclass
 class _Place:
-    """A mapped marking: the number of each corner (4,) there, -1 for none.
-
-    ``images`` showed it, ``point`` (4,) corners as points, at ``preview`` (4, 2) before it was solved.
-    """
+    """A mapped marking: the number of each corner (4,), -1 for none, the images, where it was previewed."""
 
     corner: IntArray
     kind: int
@@ -79,23 +79,16 @@ class IncrementalMapper:
         solve: Solve,
         model: Model,
     ) -> None:
-        """Begin with an empty map, from the extrinsics and recorded poses of ``rig``.
-
-        ``position_sigma_m`` is how far the recorded positions are off, ``model`` that of the solve for each
-        marking, which estimates no pose.
-        """
+        """Begin with an empty map; ``model`` solves for each marking and estimates no pose."""
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
         self._drive = drive_problem(sightings, rig, cameras, model)
         self._begin(rig, 0)
 
     def run(self, progress: Callable[[str], None]) -> tuple[Association, Rig]:
-        """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
+        """Take up all tracks as they end; returns the markings as groups, and the rig that they lead to.
 
-        Returns the markings as groups of sightings, and the rig that they lead to.
-
-        Raises:
-            MappingError: nothing can be solved for.
+        ``progress`` gets the map's size. Raises MappingError where nothing can be solved for.
         """
         tracks, usable = self._link(self._rig, True)
         due, ended = _FIRST_LINK_MARKINGS, False
@@ -240,15 +233,15 @@ class IncrementalMapper:
         valid = np.asarray(np.isfinite(corners).all(axis=1))
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
-        tolerance_m = max(self._options.association.shape_tolerance * size_m, LEAST_TOLERANCE_M)
+        tolerance_m = max(SHAPE_TOLERANCE * size_m, LEAST_TOLERANCE_M)
         # How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic.
         middle = np.nanmean(corners, axis=0)
-        options, frame = self._options.association, self._sightings.frame[track.rows]
+        frame = self._sightings.frame[track.rows]
         away = middle - self._rig.map_from_vehicle[frame, :2, 3]
         range_m = float(np.median(np.linalg.norm(away, axis=1)))
         height_m = float(np.median(self._rig.height_m[self._sightings.camera[track.rows]]))
-        floor_m = np.hypot(self._floor_m, options.refined_sigma_rad * range_m**2 / height_m)
-        gate_m = float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
+        floor_m = np.hypot(self._floor_m, REFINED_SIGMA_RAD * range_m**2 / height_m)
+        gate_m = float(min(GATE_SIGMAS * np.sqrt(2) * floor_m, MAX_GATE_M))
         best: tuple[float, int | None, int] = (gate_m, None, 0)
         near = np.linalg.norm(self._centres - middle, axis=1) < gate_m + size_m
         for marking in np.flatnonzero(near).tolist():

@@ -25,6 +25,8 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
+    HALF_WIDTH_M,
+    NODE_SPACING_M,
     OWN_SIGMA_M,
     LaneCloud,
     collect_lane_points,
@@ -35,45 +37,37 @@ from v2hdm.site.options import LaneOptions
 
 _log = logging.getLogger(__name__)
 
-_SPACING_M = 2.0
-"""Distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle."""
+_SPACING_M = 2.0  # distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle
 
 _HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
 _OPEN_END_PX = 1000.0  # sigma along the line of where an image shows it: anywhere
 _SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
 
-_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-"""Directions (N, 2) times it are turned to their left."""
+_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # directions (N, 2) times it are turned to their left
 
 
 @dataclass(frozen=True)
 class Knots:
-    """The knots of lanes, and where images show a line pass them.
+    """The knots of lanes, and where images show a line pass them."""
 
-    Attributes:
-        lanes: as they were drawn under the adjustment without them.
-        lane, at_m, points_map, along: (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that
-            it lies, its place on it and the unit direction there.
-        unknown: (N,) its number among those that enough images show, -1 where they do not.
-        camera, frame, knot: (K,) of each observation; ``knot`` counts those with a number.
-        pinhole_px, covariance_px, row_share: (K, 2), (K, 2, 2) and (K,) of it.
-        variance_factor: what its covariance is to be multiplied by, as residuals say.
-    """
-
-    lanes: tuple[Lane, ...]
+    lanes: tuple[Lane, ...]  # as they were drawn under the adjustment without them
+    # (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that it lies, its place on it and the
+    # unit direction there
     lane: IntArray
     at_m: FloatArray
     points_map: FloatArray
     along: FloatArray
-    unknown: IntArray
+    unknown: IntArray  # (N,) its number among those that enough images show, -1 where they do not
+    # (K,) of each observation; ``knot`` counts those with a number
     camera: IntArray
     frame: IntArray
     knot: IntArray
+    # (K, 2), (K, 2, 2) and (K,) of it
     pinhole_px: FloatArray
     covariance_px: FloatArray
     row_share: FloatArray
-    variance_factor: float = 1.0
+    variance_factor: float = 1.0  # what its covariance is to be multiplied by, as residuals say
 
     @property
     def count(self) -> int:
@@ -109,7 +103,7 @@ def find_knots(
     course = _Course.of(lanes)
     lane, at_m = course.stations()
     points_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    pairs = _pairs(cloud, course, lane, at_m, options.half_width_m)
+    pairs = _pairs(cloud, course, lane, at_m)
     image, at, *shown = _passing(cloud, points_map, along, *pairs)
     enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
     unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
@@ -128,10 +122,7 @@ def find_knots(
 
 @dataclass(frozen=True)
 class _Course:
-    """Lanes as polylines by their length: ``arc_m`` (V,) of all vertices ``points_map`` (V, 2).
-
-    Lane l begins at ``begin_m[l]``, is ``length_m[l]`` long and a metre away from the next.
-    """
+    """Lanes as polylines by length: ``arc_m`` (V,) of ``points_map`` (V, 2), a metre from lane to lane."""
 
     arc_m: FloatArray
     points_map: FloatArray
@@ -165,14 +156,11 @@ class _Course:
 
 
 def _pairs(
-    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray, half_width_m: float
+    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Points (P,) and knots that they tell of: of the nearest line, at most half a spacing away.
-
-    Lastly how far ahead of its knot each lies, and how far to the left of its lane there, m.
-    """
+    """Points (P,) and the nearest knots, at most half a spacing away, how far ahead and left of these, m."""
     knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    reach_m = float(np.hypot(_SPACING_M / 2, half_width_m))
+    reach_m = float(np.hypot(_SPACING_M / 2, HALF_WIDTH_M))
     near = cKDTree(cloud.points_map).sparse_distance_matrix(
         cKDTree(knots_map), reach_m, output_type="ndarray"
     )
@@ -182,7 +170,7 @@ def _pairs(
     here = lane[knot], at_m[knot] + ahead_m
     off_m = ((points_map - course.at(*here)) * (course.along(*here) @ _TURN)).sum(axis=1)
     fits = np.abs((cloud.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
-    fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= half_width_m)
+    fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= HALF_WIDTH_M)
     order = np.lexsort((np.abs(off_m), ~fits, point))
     best = order[np.unique(point[order], return_index=True)[1]]
     best = best[fits[best]]
@@ -200,8 +188,8 @@ def _passing(
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
     """Where images show lines pass knots: image, knot, pinhole pixel, its covariance and row share.
 
-    A line through the points of a piece, as turned as they are, gives how far to the left of the lane it is.
-    Their errors are taken for one, since neighbouring cells of the network err alike.
+    A line is laid through the points of a piece, whose errors are taken for one: neighbouring cells err
+    alike.
     """
     groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
     (image, at), own = groups.T, own.ravel()
@@ -230,11 +218,10 @@ def _passing(
     return image, at, cloud.points_px[nearest] + off_px, covariance_px, cloud.row_share[nearest]
 
 
-def draw_lanes(knots: Knots, solution: Solution, spacing_m: float) -> tuple[Lane, ...]:
+def draw_lanes(knots: Knots, solution: Solution, spacing_m: float = NODE_SPACING_M) -> tuple[Lane, ...]:
     """The lanes as splines through the adjusted knots, vertices about ``spacing_m`` apart with their sigmas.
 
-    The first corner of ``solution`` that is a knot follows those of the markings. Where no image shows the
-    line, as between dashes, it keeps its course beside the knots around.
+    Where no image shows the line, as between dashes, it keeps its course beside the knots around.
     """
     return tuple(
         _drawn(lane, knots, np.flatnonzero(knots.lane == number), solution, spacing_m)

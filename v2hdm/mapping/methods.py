@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from v2hdm.adjust import Fault, Status, observability
 from v2hdm.association.ground import ground_points, views_of
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
-from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import camera_of, frames_of
+from v2hdm.association.tracks import LEAST_SIGHTINGS, SHAPE_TOLERANCE
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex
@@ -31,8 +31,7 @@ from v2hdm.mapping.optimise import Optimised, silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
-from v2hdm.site.candidates import Exclusion
+from v2hdm.records import Drive, Exclusion, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.changes import Base, update_map
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
@@ -85,8 +84,8 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
 def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) -> FloatArray:
     """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
 
-    Within a marking it is what the map states. From one marking to another only the errors of the adjustment
-    are shared, drift above all: a corner that was not seen shares those of one that was.
+    From one marking to another only errors of the adjustment are shared; an unseen corner shares a seen
+    one's.
     """
     bundle = optimised.bundle
     index = bundle.corner_index[optimised.groups[marking]]
@@ -153,23 +152,12 @@ def run_methods(
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
 ) -> dict[str, MethodResult]:
-    """Map a drive with every method that its IPMs allow.
+    """Map a drive, whose truth is not looked at, with every method that the IPMs of ``cameras`` allow.
 
-    Args:
-        drive: the drive; its truth is not looked at.
-        detections: of its images.
-        cameras: to map with, together.
-        options: settings of the mapping.
-        progress: gets the name of each step as it begins.
-        base: an earlier map that ``Opt`` brings up to date.
-        grey: reads the grey values (H, W) of an image, to look where ``base`` has paint.
-
-    Returns:
-        Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
-
-    Raises:
-        MappingError: there is nothing to map.
-        ConfigError: an option is out of range.
+    ``progress`` gets the name of each step as it begins. ``base`` is an earlier map that ``Opt`` brings up to
+    date; ``grey`` reads the grey values (H, W) of an image, to look where it has paint. Results are by
+    method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError
+    where there is nothing to map, ConfigError for an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)
@@ -211,17 +199,18 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
     )
 
 
+_NAIVE_MERGE_M = 1.0  # how far apart the naive methods may put two tracks of one marking
+
+
 def _naive_markings(
     inputs: Inputs, ipm: Mapping[str, FloatArray], ground: ImageGround
 ) -> tuple[list[Marking], list[Exclusion]]:
-    """The naive strategy: back-project by an IPM within its region of interest, and average.
+    """The paper's baseline: back-project by an IPM within its region of interest, and average.
 
-    It is the paper's baseline. Recorded poses are taken at their word; only sightings with four valid corners
-    inside the region count.
-    Tracks merge where their averages lie within ``naive_merge_m``: two cameras whose IPMs disagree by more
-    yield two markings where there is one, which is the method's own failure.
+    Recorded poses are taken at their word. Tracks merge where their averages lie within a metre:
+    two cameras whose IPMs disagree by more yield two markings where there is one, the method's own failure.
     """
-    sightings, options = inputs.sightings, inputs.options.association
+    sightings = inputs.sightings
     cameras = [inputs.drive.cameras[name] for name in sightings.cameras]
     rois = [camera.roi_vehicle for camera in cameras]
     forward = [facing_ipm(ipm[c.info.name], c.roi_vehicle.mean(axis=0)) for c in cameras]
@@ -239,10 +228,10 @@ def _naive_markings(
         tracks,
         sightings,
         _average(tracks, corners_map),
-        floor_m=options.naive_merge_m,
+        floor_m=_NAIVE_MERGE_M,
         gate_sigmas=np.inf,
-        max_distance_m=options.naive_merge_m,
-        shape_tolerance=2 * options.shape_tolerance,
+        max_distance_m=_NAIVE_MERGE_M,
+        shape_tolerance=2 * SHAPE_TOLERANCE,
     )
     average = _average(association, corners_map)
     markings: list[Marking] = []
@@ -289,7 +278,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     known = observability(bundle.problem, solution)
     surface = inputs.optimiser.surface
     if bundle.knots is not None:
-        lanes = draw_lanes(bundle.knots, solution, options.lanes.node_spacing_m)
+        lanes = draw_lanes(bundle.knots, solution)
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]

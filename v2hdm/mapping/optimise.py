@@ -36,7 +36,14 @@ from v2hdm.association.groups import (
 )
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.surface import Paths, Recorded, Surface
-from v2hdm.association.tracks import build_tracks
+from v2hdm.association.tracks import (
+    GATE_SIGMAS,
+    IPM_SIGMA_RAD,
+    MAX_GATE_M,
+    REFINED_SIGMA_RAD,
+    SHAPE_TOLERANCE,
+    build_tracks,
+)  # fmt: skip
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
 from v2hdm.mapping.bundle import (
@@ -57,6 +64,7 @@ from v2hdm.records import (
     BoolArray,
     Calibration,
     Camera,
+    Exclusion,
     FloatArray,
     IntArray,
     Marking,
@@ -64,7 +72,7 @@ from v2hdm.records import (
     Road,
     largest_noise,
 )
-from v2hdm.site.candidates import Candidates, Counts, Exclusion, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
 from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
 from v2hdm.site.parallax import PointViews, measure_parallax
 
@@ -73,21 +81,16 @@ _log = logging.getLogger(__name__)
 _SETTLED_MODEL = "heave"
 """Pose model of the solves between which associations still change: it leaves no error of a pose out."""
 
-_STEEP_SINE = 0.15
-"""Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
+_STEEP_SINE = 0.15  # sine of a ray's depression from which the coarse stage uses it, unless most are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
+_GROUND_ROUNDS = 6  # solves over better and better ground, at most: four are enough for a crown of 4 %
 
-_GROUND_ROUNDS = 6
-"""Solves over better and better ground, at most: four are enough for a crown of 4 %."""
+_LANE_ROUNDS = 3  # solves with lanes: the stated variance of points may be thirty times the true one
 
-_LANE_ROUNDS = 3
-"""Solves with lanes: the stated variance of their points may be thirty times as large as the true one."""
-
-_SETTLED_M = 2e-3
-"""Change of the heights that are seen, root mean square, from which on the ground is settled."""
+_SETTLED_M = 2e-3  # change of the seen heights, root mean square, from which on the ground is settled
 
 
 def silent(step: str) -> None:
@@ -96,22 +99,16 @@ def silent(step: str) -> None:
 
 @dataclass(frozen=True)
 class Optimised:
-    """The outcome of the joint optimisation.
+    """The outcome of the joint optimisation; errors are root mean squares over the markings' points."""
 
-    ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``. Reprojection
-    errors are root mean squares over the points seen of the accepted markings, under the optimised and the
-    initial extrinsics.
-    ``suspicions`` are of the most suspicious markings, the worst first.
-    """
-
-    bundle: Bundle
-    groups: IntArray
+    bundle: Bundle  # the adjusted extrinsics and poses
+    groups: IntArray  # of the markings
     markings: tuple[Marking, ...]
     excluded: tuple[Exclusion, ...]
     calibrations: Mapping[str, Calibration]
-    reprojection_rmse_px: float
-    initial_reprojection_rmse_px: float
-    suspicions: Sequence[Suspicion] = ()
+    reprojection_rmse_px: float  # under the optimised extrinsics
+    initial_reprojection_rmse_px: float  # under the initial ones
+    suspicions: Sequence[Suspicion] = ()  # the worst first
 
 
 class Optimiser:
@@ -148,7 +145,7 @@ class Optimiser:
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
         located = self._locate(self.initial_rig)
-        return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
+        return self._track(self.initial_rig, located, IPM_SIGMA_RAD)
 
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
@@ -177,10 +174,7 @@ class Optimiser:
         progress: Callable[[str], None] = silent,
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
     ) -> Optimised:
-        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude.
-
-        ``find_knots`` gives the knots of lanes that take part, by what is known of the rig without them.
-        """
+        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -199,13 +193,10 @@ class Optimiser:
         return self._conclude(final, bundle, inlier, usable)
 
     def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
-        """Classify the candidates of ``final``, which was solved over the accepted observations only.
+        """Classify the candidates of ``final``, solved over the accepted observations ``inlier`` (K,) only.
 
-        ``ungated`` was over all, of which ``inlier`` (K,) were accepted; ``usable`` (S, 4) says the same per
-        corner.
-
-        Raises:
-            MappingError: no candidate is accepted.
+        ``ungated`` was over all; ``usable`` (S, 4) are the corners accepted. Raises MappingError where no
+        candidate is accepted.
         """
         located = locate(self.sightings, final.rig)
         located.informs[:] &= usable
@@ -303,15 +294,10 @@ class Optimiser:
             return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
-        """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
-
-        ``progress`` is called with the size of the map. In place of :meth:`settle`.
-        """
+        """Map track after track, as the vehicle would, in place of :meth:`settle`; then solve for all."""
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
-            located, options = self._locate(rig), self._options.association
-            direction_rad = options.ipm_sigma_rad if coarse else options.refined_sigma_rad
-            tracks = self._track(rig, located, direction_rad)
+            tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)
             return tracks, self._usable(tracks, rig)
 
         def solve(association: Association, usable: BoolArray, rig: Rig) -> Rig:
@@ -382,25 +368,23 @@ class Optimiser:
         return in_view(association, locate(self.sightings, rig), self.sightings, rig, jitter_rad)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
-        options = self._options.association
-        return build_tracks(self.sightings, located, rig, direction_rad, self._pose_noise, options)
+        return build_tracks(self.sightings, located, rig, direction_rad, self._pose_noise)
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""
-        options = self._options.association
         located = self._locate(rig)
-        tracks = self._track(rig, located, options.refined_sigma_rad)
+        tracks = self._track(rig, located, REFINED_SIGMA_RAD)
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
-        direction_m = options.refined_sigma_rad * range_m**2 / float(np.median(rig.height_m))
+        direction_m = REFINED_SIGMA_RAD * range_m**2 / float(np.median(rig.height_m))
         merged = merge_groups(
             tracks,
             self.sightings,
             fused,
             floor_m=float(np.hypot(self._pose_noise.position_m, direction_m)),
-            gate_sigmas=options.gate_sigmas,
-            max_distance_m=options.max_gate_m,
-            shape_tolerance=options.shape_tolerance,
+            gate_sigmas=GATE_SIGMAS,
+            max_distance_m=MAX_GATE_M,
+            shape_tolerance=SHAPE_TOLERANCE,
         )
         return self._with_all_that_fit(merged, rig)
 
@@ -431,10 +415,7 @@ class Optimiser:
         return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
-        """The solve under the larger of the noise that was stated and that which ``bundle`` shows.
-
-        The positions' stays as stated: images do not see what moves the vehicle and its map alike.
-        """
+        """The solve under the larger of stated and shown noise; that of positions, unseen, as stated."""
         stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
@@ -457,10 +438,7 @@ class Optimiser:
             self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
     def _as_stated(self, bundle: Bundle) -> Problem:
-        """The problem of ``bundle`` from where that ended, with the detector's own covariances.
-
-        What is left of errors that no model knows must not shrink with them.
-        """
+        """The problem of ``bundle`` from where that ended, with the detector's own covariances."""
         seen = bundle.problem.observations
         stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
         return replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated)
@@ -518,8 +496,8 @@ def _scatter(bundle: Bundle) -> FloatArray:
 def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
     """The corners of every group of ``bundle``; one that has lost them all lies where ``ungated`` had it.
 
-    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than stated
-    make the map less certain than the noise model claims.
+    Covariances grow with chi^2 per degree of freedom above one: residuals larger than stated make the map
+    less sure.
     """
     known = bundle.corner_index >= 0
     covariance = np.full((len(known), 8, 8), np.nan)

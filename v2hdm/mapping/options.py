@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from v2hdm.association.options import AssociationOptions
 from v2hdm.errors import ConfigError
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
@@ -13,38 +12,23 @@ from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
 BATCH = "batch"
 INCREMENTAL = "incremental"
 AUTO = "auto"
-MODES = (BATCH, INCREMENTAL)
-"""Values of ``mapping.mode``."""
+MODES = (BATCH, INCREMENTAL)  # values of ``mapping.mode``
 
 PLANE = "plane"
 SURFACE = "surface"
-GROUNDS = (PLANE, SURFACE, AUTO)
-"""Values of ``mapping.ground``."""
+GROUNDS = (PLANE, SURFACE, AUTO)  # values of ``mapping.ground``
 
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """Values of ``mapping.pose_model``: the models of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
 _RANGES = dict.fromkeys(
     (
-        "max_range_m", "loss_scale",
-        "association.ipm_sigma_rad", "association.refined_sigma_rad", "association.gate_sigmas",
-        "association.max_gate_m",
-        "known_sizes.sigma_m", "known_sizes.tolerance",
-        "survey.sigma_m", "survey.reach_m",
+        "max_range_m", "loss_scale", "known_sizes.sigma_m", "known_sizes.tolerance", "survey.sigma_m",
+        "survey.reach_m",
     ),
     POSITIVE,
 ) | dict.fromkeys(
-    (
-        "model_floor_px",
-        "association.max_gap_m", "association.shape_tolerance", "association.naive_merge_m",
-        "acceptance.max_sigma_m",
-        "lanes.max_range_m", "lanes.max_dash_gap_m", "lanes.max_break_m", "lanes.min_length_m",
-        "lanes.min_images",
-    ),
-    NOT_NEGATIVE,
-) | dict.fromkeys(
-    # From half the width of a painted line, 0.1 m: less holds no line's paint.
-    ("lanes.node_spacing_m", "lanes.half_width_m", "lanes.half_length_m"), Within(0.05),
+    ("model_floor_px", "acceptance.max_sigma_m", "lanes.max_range_m", "lanes.min_images"), NOT_NEGATIVE
 ) | {"rounds": Within(1, 100), "acceptance.min_probability": Within(0, 1 - 1e-9, open=True)}  # fmt: skip
 
 
@@ -135,7 +119,6 @@ class MappingOptions:
     loss_scale: float = 2.0
     rounds: int = 2
     device: str = "cpu"
-    association: AssociationOptions = field(default_factory=AssociationOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     lanes: LaneOptions = field(default_factory=LaneOptions)
     known_sizes: SizeOptions = field(default_factory=SizeOptions)
@@ -143,14 +126,9 @@ class MappingOptions:
 
 
 def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -> None:
-    """Refuse values that no mapping can work with.
+    """Raise ConfigError, which names the key, for values that no mapping can work with.
 
-    Args:
-        options: the settings.
-        kinds: classes with four corners that the detector knows; None takes any.
-
-    Raises:
-        ConfigError: A value is out of range; the message names the key.
+    ``kinds`` are classes with four corners that the detector knows; None takes any.
     """
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 

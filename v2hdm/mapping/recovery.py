@@ -35,33 +35,23 @@ from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
-CLEAR_SIGMAS = 4.0
-"""An error of so many sigmas is seen; in one of 400 right drives one of its forty tests exceeds it."""
+CLEAR_SIGMAS = 4.0  # an error so large is seen; in one of 400 right drives one of its forty tests exceeds it
 
+_PRIOR_ODDS = 1 / 400  # that an input is wrong: one drive in ten of a new vehicle has a wrong one of forty
 
-_PRIOR_ODDS = 1 / 400
-"""That an input is wrong: one drive in ten of a new vehicle, say, has a wrong one of forty."""
-
-_DOUBT = 0.05
-"""Probability of a wrong input that a PASS leaves, which speaks of 95 %."""
+_DOUBT = 0.05  # probability of a wrong input that a PASS leaves, which speaks of 95 %
 
 
 @dataclass(frozen=True)
 class _Size:
-    """Sizes of a fault, in its unit.
+    """Sizes of a fault, in its unit."""
 
-    Attributes:
-        least: below it an input is as good as a drive needs it, however sure the drive is.
-        sigma: up to which a drive observes it, were nothing wrong. A less observable fault is nearly what
-            something else can be, and takes up what is left of other errors: k1 on a straight street, say.
-        usual: that it has where an input is wrong: half of all are smaller.
-        most: that is physical. What calls for more is wrong in a way that nobody has foreseen.
-    """
-
-    least: float
+    least: float  # below it an input is as good as a drive needs it, however sure the drive is
+    # up to which a drive observes it, were nothing wrong. A less observable fault is nearly what something
+    # else can be, and takes up what is left of other errors: k1 on a straight street, say.
     sigma: float
-    usual: float
-    most: float
+    usual: float  # that it has where an input is wrong: half of all are smaller
+    most: float  # that is physical. What calls for more is wrong in a way that nobody has foreseen.
 
 
 _SIZES: Mapping[Fault, _Size] = {
@@ -92,18 +82,14 @@ _AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_OBSERVABLE_S = 0.004
-"""Sigma of a clock offset, s, up to which a drive observes it: two of them are 8 ms."""
+CLOCK_OBSERVABLE_S = 0.004  # sigma of a clock offset, s, up to which a drive observes it: two are 8 ms
 
 _CLOCK_CORRECTABLE_S = 0.006
 """Sigma, s, up to which a contradicted clock is put right: a late clock scatters what tells of it."""
 
-_CENTRE_OBSERVABLE_M = 0.1
-"""Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
+_CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, from which a drive needs its survey: it moves the map
 
-_MOST_CORRECTIONS = 4
-"""Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
-
+_MOST_CORRECTIONS = 4  # inputs that may be dropped one by one; with more of them wrong nothing is reliable
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
 """Faults that bend what a plane looks like: one that a surface leaves is the likelier cause."""
@@ -148,10 +134,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outcome:
-    """An optimised camera set with its inputs and the evidence for the checks.
-
-    ``bundle`` holds the adjusted poses.
-    """
+    """An optimised camera set with its inputs, adjusted poses and the evidence for the checks."""
 
     inputs: Inputs
     bundle: Bundle
@@ -159,11 +142,7 @@ class Outcome:
 
 
 def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, Optimised]:
-    """Optimise a drive, as often as inputs have to be dropped.
-
-    Raises:
-        MappingError: there is nothing to map.
-    """
+    """Optimise a drive, as often as inputs have to be dropped; MappingError where there is nothing to map."""
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
     while True:
@@ -222,8 +201,7 @@ def _foreign(
 ) -> tuple[float, float, float]:
     """The likeliest stretch of foreign images, s, and its log odds as the cause of all that is doubtful.
 
-    The tests look at corners, the stretch at which markings are found at all. What it explains of the corners
-    is what a solve without its images leaves less doubtful, as if that had as many of them.
+    It explains of the corners what a solve without its images leaves less doubtful.
     """
     drive, names = inputs.drive, inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
@@ -345,11 +323,7 @@ def is_doubtful(one: ScoreTest) -> bool:
 
 
 def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
-    """The sigmas from which the ``odds`` are, 1 to 1 or others, that the input is off.
-
-    An error is Cauchy about the usual size, which hardly changes within the value's sigma; the p-value, and
-    so the sigmas, say how far in the tail of no error the value lies.
-    """
+    """The sigmas from which the ``odds`` are that an input is off; errors are Cauchy about the usual size."""
     return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
 
 

@@ -1,13 +1,10 @@
 """All images of a drive on one canvas: the mean of what they show, weighted by how finely they show it.
 
-An image counts with the number of its pixels that a pixel of the canvas covers: the determinant of the
-derivative of the homography ``H`` from canvas to image, which is ``det(H) / w^3``, with ``w`` the third
-coordinate of the mapped point. That is proportional to its depth, so that near views outweigh far ones. What
-the image is trusted for is warped with its colours, in one pass.
-
-The canvas is done in sheets, so that memory does not grow with the drive, and each sheet in tiles of which an
-image touches only those that it shows. kornia maps their pixels by homography and lens, and its ``remap``
-samples the image there.
+An image counts with the number of its pixels that a pixel of the canvas covers: ``det(H) / w^3``, H the
+homography from canvas to image and ``w`` the third coordinate of the mapped point, which is proportional to
+its depth. What the image is trusted for is warped with its colours, in one pass. The canvas is done in
+sheets, so that memory does not grow with the drive, and each in tiles of which an image touches only those
+that it shows.
 """
 
 from __future__ import annotations
@@ -46,17 +43,13 @@ from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Tr
 
 @dataclass(frozen=True)
 class Canvas:
-    """``rows`` x ``columns`` square pixels of ``cell_m`` on the ground, seen from above.
+    """Square pixels on the ground, seen from above; north is above where columns rise east."""
 
-    ``corner_map`` (2,) m is the outer corner of the first pixel, ``right_map`` (2,) the unit vector along
-    which columns rise; rows rise at a right angle to it, clockwise. North is above where columns rise east.
-    """
-
-    corner_map: FloatArray
+    corner_map: FloatArray  # (2,) m, outer corner of the first pixel
     cell_m: float
     rows: int
     columns: int
-    right_map: tuple[float, float] = (1.0, 0.0)
+    right_map: tuple[float, float] = (1.0, 0.0)  # unit vector of rising columns
 
     @property
     def canvas_from_map(self) -> FloatArray:
@@ -81,10 +74,7 @@ class Canvas:
 
     @classmethod
     def around(cls, points_map: FloatArray, cell_m: float, multiple_px: int = 1) -> Canvas:
-        """The smallest one, north above, around points (N, 2) m; its edges are multiples of its pixels.
-
-        Rows and columns are filled up to a multiple of ``multiple_px``.
-        """
+        """The smallest one, north above, around points (N, 2) m, by ``multiple_px`` whole pixels."""
         low = np.floor(points_map.min(axis=0) / cell_m)
         high = np.ceil(points_map.max(axis=0) / cell_m)
         columns, rows = (np.ceil((high - low) / multiple_px) * multiple_px).astype(int).tolist()
@@ -104,28 +94,21 @@ _OUTLINE_STEP_PX = 16  # distance of the points by which the outline of what is 
 
 @dataclass(frozen=True)
 class Lens:
-    """One camera: its intrinsics, and how far each pixel is trusted to show the ground.
-
-    ``trust`` (height, width) float32 is 1 within, 0 outside of the camera's ROI and on its own vehicle.
-    ``outline_pinhole_px`` (N, 2) is the convex hull of what is trusted.
-    """
+    """One camera: its intrinsics, and how far each pixel is trusted to show the ground."""
 
     info: CameraInfo
-    trust: np.ndarray
-    outline_pinhole_px: FloatArray
+    trust: np.ndarray  # (height, width) float32, 1 within, 0 outside of the ROI and on its own vehicle
+    outline_pinhole_px: FloatArray  # (N, 2) convex hull of what is trusted
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image: its file, its camera, and the homography (3, 3) of the ground plane of the map.
-
-    The homography's third coordinate is positive in front of the camera. ``on_plane`` gives the points (K, 2)
-    of that plane that are seen where the ground's are, None where it is the plane.
-    """
+    """One image, and the homography of the map's ground plane, positive in front of the camera."""
 
     path: Path
     camera: str
     pinhole_px_from_map: FloatArray
+    # points (K, 2) of that plane seen where the ground's are, None where it is the plane
     on_plane: Callable[[FloatArray], FloatArray] | None = None
 
     def outline_map(self, lens: Lens) -> FloatArray:
@@ -135,10 +118,7 @@ class Shot:
 
 
 def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
-    """The part of a camera's image that shows the ground within its ROI, feathered to its edges.
-
-    The camera sits at ``cam_from_vehicle`` (4, 4); the mask of its own vehicle is left out where it is known.
-    """
+    """The part of an image that shows ground within the ROI, feathered, less the vehicle where known."""
     info = camera.info
     pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle, densified(camera.roi_vehicle, 16))
     inside = np.zeros((info.height + 2, info.width + 2), dtype=np.uint8)
@@ -175,11 +155,10 @@ def adjusted_shots(
     adjusted: Trajectory,
     surface_at: Callable[[FloatArray], Surface | None] = lambda poses: None,
 ) -> list[Shot]:
-    """The images of calibrated cameras under adjusted extrinsics and poses.
+    """The images of calibrated cameras under adjusted extrinsics and poses, in the recorded poses' frame.
 
-    ``clock_s`` is by camera how much later than stamped its images were taken. ``adjusted`` is in the frame
-    of the recorded poses; where the drive's road was not flat, its own have been laid flat. ``surface_at``
-    gives the ground under vehicles at poses (F, 4, 4).
+    ``clock_s`` is by camera how much later than stamped its images were taken; ``surface_at`` gives the
+    ground under vehicles at poses (F, 4, 4).
     """
     images = [image for image in drive.images if image.camera in calibrations]
     taken_s = np.array([image.stamp_s + clock_s[image.camera] for image in images])
@@ -206,14 +185,11 @@ _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
 @dataclass(frozen=True)
 class Sheet:
-    """A finished part of a canvas, its first pixel at (``row``, ``column``).
-
-    ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as
-    finely as a single one shows the farthest ground that it is trusted for, less where more coarsely.
-    """
+    """A finished part of a canvas, its first pixel at (``row``, ``column``)."""
 
     row: int
     column: int
+    # (rows, columns, 4) uint8; alpha 255 where ground is shown as finely as any is trusted for
     rgba: np.ndarray
 
 
@@ -235,11 +211,7 @@ def blend(
     device: str = "cpu",
     progress: Steps | None = None,
 ) -> Iterator[Sheet]:
-    """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
-
-    ``shots`` are in driving order; ``progress`` counts images put onto sheets. Raises DriveError where an
-    image is missing, damaged or of the wrong size.
-    """
+    """The sheets of a canvas that any image shows, in driving order; DriveError where one cannot be read."""
     plan = _plan(canvas, shots, lenses)
     full_weight = _full_weight(canvas, shots, lenses)
     order = [index for _, views in plan for index, _ in views]
@@ -291,10 +263,7 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
 
 
 def _tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
-    """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels.
-
-    Two convex shapes are apart if a side of either parts them; the polygon's box is the tiles' sides.
-    """
+    """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels."""
     low = np.maximum(np.floor((polygon.min(axis=0) - 1) / TILE_PX).astype(int), 0)
     high = np.minimum(np.floor((polygon.max(axis=0) + 1) / TILE_PX).astype(int) + 1, limit)
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
@@ -371,12 +340,7 @@ class _Sums:
         self._sums.index_add_(0, at, values)
 
     def _warp(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
-        """Where the pixels of tiles lie in an image, and how many of its pixels each covers.
-
-        Returns:
-            (3, T, side, side): x and y in [-1, 1] over the cut image, as of ``grid_sample``, and the
-            density in px of the image a px of the sheet.
-        """
+        """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...)."""
         points = (TILE_PX * torch.from_numpy(tiles).to(self._device)[:, None] + self._pixels).float()
         if shot.on_plane is not None:
             points = points + self._across @ self._moved_px(tiles, shot.on_plane, map_from_sheet).to(points)
@@ -400,10 +364,7 @@ class _Sums:
     def _moved_px(
         tiles: np.ndarray, on_plane: Callable[[FloatArray], FloatArray], map_from_sheet: FloatArray
     ) -> Tensor:
-        """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet.
-
-        A tile of 2 cm a pixel is 1.3 m wide, over which ground bends by less than a millimetre.
-        """
+        """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet."""
         corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
         sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
         seen = on_plane(apply_homography(map_from_sheet, corners.astype(np.float64)))

@@ -15,8 +15,7 @@ import numpy as np
 
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
-from v2hdm.errors import ConfigError, DriveError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, DriveError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
@@ -34,9 +33,8 @@ from v2hdm.mosaic.blend import (
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.report import style
-from v2hdm.report.outputs import write_json
 from v2hdm.report.page.facts import read_cameras, read_surface
-from v2hdm.store.files import whole_file
+from v2hdm.store.files import whole_file, write_json
 
 AHEAD_M, ACROSS_M = 12.0, 8.0  # length and width of the ground that is compared
 _CELL_M = 0.01
@@ -111,10 +109,7 @@ _AT_ONCE_BYTES = 1 << 24
 
 @contextmanager
 def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[Callable[[Sheet], None]]:
-    """Put sheets into a cloud-optimised GeoTIFF: JPEG within, overviews and a mask; whole or not at all.
-
-    Raises ConfigError where rasterio is not installed.
-    """
+    """Put sheets into a cloud-optimised GeoTIFF, JPEG within, with a mask; ConfigError without rasterio."""
     rasterio = need("rasterio", "gis", path.name, ConfigError)
     west, _, _, north = canvas.bounds_m
     profile = {

@@ -18,20 +18,16 @@ from v2hdm.io.maps.evidence import read_exclusions
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
-from v2hdm.pipeline.keys import base_files
+from v2hdm.pipeline.config import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, HdMap, Image
 from v2hdm.site.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
-_POSITION_SIGMA_M = 0.02  # sigma of a written pose's height by which its road is laid flat, m
 LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
 
 
 def read_base(path: Path) -> Base:
-    """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
-
-    Raises MapFileError where it is missing, damaged, of an older version, of another method, or FAIL.
-    """
+    """Read an earlier map, and the poses and left-out candidates beside it; MapFileError if unusable."""
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
     if not hd_map.markings:
@@ -47,7 +43,7 @@ def read_base(path: Path) -> Base:
             f"map.base: {path}: does not say how sure its markings are, as maps of older versions and "
             "naive methods; map its drive anew"
         )
-    poses = [lay_flat(read_tum(one), _POSITION_SIGMA_M).trajectory.map_from_vehicle for one in trajectories]
+    poses = [lay_flat(read_tum(one)).trajectory.map_from_vehicle for one in trajectories]
     left_out = read_exclusions(excluded) if excluded.is_file() else []
     candidates = tuple((one.kind, one.position_map, one.sightings) for one in left_out)
     return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), candidates)
@@ -97,10 +93,7 @@ def _as_json(one: Change) -> dict[str, Any]:
 
 
 def write_changes(changes: Changes, hd_map: HdMap, folder: Path) -> None:
-    """Write ``changes.geojson`` into ``folder``.
-
-    A feature is a change: its outline now, or that which it had if it is gone, where the map has it now.
-    """
+    """Write ``changes.geojson``: a feature is an outline now, or that which it had if it is gone."""
     features = []
     for one in changes.changes:
         corners = one.before if one.after is None else one.after

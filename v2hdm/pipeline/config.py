@@ -1,22 +1,25 @@
-"""The settings of a run, and what of them is refused before any long work."""
+"""The settings of a run, what of them is refused before any long work, and the keys of what it makes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.io.maps.formats import check_formats
 from v2hdm.io.safe.texts import shown, take_camera_name, take_name
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.records import Drive, Image
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig
+from v2hdm.store.cache import key_of
+from v2hdm.store.files import file_digest
 
 ACCURACY_GOAL_CM = 5.0  # the 95 % radius, cm, that is asked of a map where nobody states another
 
@@ -132,7 +135,7 @@ def run_name(config: RunConfig) -> str:
 _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
     (Within(0, MOST_PROCESSES), "", "workers"),
     (NOT_NEGATIVE, "", "cache_gb drive.start_s simulate.visit"),
-    (POSITIVE, "drive.", "max_gap_s end_s kitti.camera_height_m kitti.centre_sigma_m kitti.roi_half_width_m"),
+    (POSITIVE, "drive.", "max_gap_s end_s kitti.camera_height_m kitti.centre_sigma_m"),
     (COUNT, "drive.", "limit"),
     (SEED, "simulate.", "seed"),
     (Within(64, 2**13), "simulate.cameras.*.", "width height"),
@@ -173,10 +176,7 @@ _RANGES = {f"{below}{key}": allowed for allowed, below, keys in _KEYS_WITHIN for
 
 
 def admit(config: RunConfig) -> str:
-    """Refuse what cannot work before any long work; returns the run's name.
-
-    Raises ConfigError, which names the key, or DetectorError where ``detector.model`` cannot be used.
-    """
+    """Refuse, by ConfigError with the key, what cannot work before any long work; the run's name."""
     from v2hdm.detection.detector import Detector
     from v2hdm.pipeline.survey import table_of
 
@@ -222,3 +222,62 @@ def check_device(device: str) -> None:
         raise ConfigError(f"device is {shown(device)}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device is 'cuda' but torch sees no GPU: check driver and torch, or set device=cpu")
+
+
+@dataclass(frozen=True)
+class Contents:
+    """SHA-256 of image files, by path."""
+
+    digests: Mapping[Path, str]
+
+    @classmethod
+    def of(cls, drives: Iterable[Drive]) -> Contents:
+        """Digests of all images of some drives; raises DriveError where one cannot be read."""
+        try:
+            return cls({image.path: file_digest(image.path) for drive in drives for image in drive.images})
+        except OSError as failure:
+            raise DriveError(f"{failure.filename}: cannot be read ({failure.strerror})") from None
+
+    def of_images(self, images: Iterable[Image]) -> list[str]:
+        """Digests of some images, in their order."""
+        return [self.digests[image.path] for image in images]
+
+    def key(self, drive: Drive) -> str:
+        """The key of a drive: its records and the content of its images."""
+        return key_of(drive, self.of_images(drive.images))
+
+
+def model_key(options: DetectorOptions) -> str | None:
+    """SHA-256 of the network that a detector uses, None for the shipped one, which is code."""
+    return None if options.model is None else file_digest(Path(options.model))
+
+
+def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
+    """The map, trajectories and exclusions of an earlier map, given as a folder or its ``map.geojson``."""
+    hd_map = path / "map.geojson" if path.is_dir() else path
+    return hd_map, tuple(sorted(hd_map.parent.glob("trajectory*.tum"))), hd_map.parent / "excluded.geojson"
+
+
+def made_of_drives(paths: Sequence[str]) -> str:
+    """Name the maker of a result of the drives at these paths."""
+    return f"v2hdm map of {', '.join(paths)}"
+
+
+def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
+    """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
+    asked = replace(
+        config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True,
+        workers=0, drive=replace(config.drive, path=None, cache=""),
+    )  # fmt: skip
+    files: list[Path] = []
+    if config.map.base is not None:
+        hd_map, trajectories, excluded = base_files(Path(config.map.base))
+        files += [hd_map, *trajectories, excluded]
+    named = (config.mapping.survey.file, config.map.corrections, config.report.background)
+    files += [Path(one) for one in named if one is not None]
+    truths = [drive.truth_dir for drive in drives if drive.truth_dir is not None]
+    files += [path for truth in truths for path in sorted(truth.rglob("*"))]
+    read = [(str(path), file_digest(path)) for path in files if path.is_file()]
+    of_drives = [contents.key(drive) for drive in drives]
+    roots = [drive.root.resolve() for drive in drives]
+    return key_of(code, asked, model_key(config.detector), roots, of_drives, read)

@@ -24,19 +24,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Context:
-    """Surroundings of a run.
+    """Surroundings of a run."""
 
-    By itself the ``cache`` keeps nothing, and detection (``detect``) is by processes of this machine, one per
-    core where ``workers`` is 0. ``accept`` refuses a drive that was read and does not suit what is to be
-    written. ``seconds`` says how long each step took.
-    """
-
-    cache: StageCache = field(default_factory=lambda: StageCache(None))
+    cache: StageCache = field(default_factory=lambda: StageCache(None))  # keeps nothing by itself
     progress: Progress = silent
-    detect: Detect | None = None
+    detect: Detect | None = None  # in place of processes of this machine
+    # refuses a drive that does not suit what is to be written
     accept: Callable[[Drive], None] = lambda drive: None
-    workers: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
+    workers: int = 0  # 0 takes one per core
+    seconds: dict[str, float] = field(default_factory=dict)  # how long each step took
 
     @property
     def processes(self) -> int:

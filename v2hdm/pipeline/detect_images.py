@@ -151,8 +151,8 @@ class _Rough:
     def road(self, frame: Frame) -> RoadDetector:
         """The detector for the next image; it says what the mounting is taken to be.
 
-        Of a ``folder``, some images all over it are looked at for their horizon before the first; else the
-        1st, 2nd, 4th, 8th, ... image: a stream repeats itself, and so the time for it is soon none.
+        Of a ``folder``, some images all over it show the horizon before the first; else the 1st, 2nd, 4th,
+        8th, ... do.
         """
         self._shown += 1
         if self._estimate is None:

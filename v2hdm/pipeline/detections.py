@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache import key_of
 
@@ -35,11 +35,7 @@ def detect_in_pieces(
     context: Context,
     detect: Detect = detect_images,
 ) -> list[ImageDetections]:
-    """Detect in every image of a drive, in the drive's order, where that is not known yet.
-
-    ``detect`` takes the place of processes of this machine. Raises V2hdmError as
-    :func:`v2hdm.detection.batch.detect_all`.
-    """
+    """Detect in every image of a drive, in its order, where that is not known yet, by ``detect``."""
     cache, progress = context.cache, context.steps("detect")
     detector_key = cache.key(options, model_key(options))
     masks = cache.get_or_make(

@@ -20,15 +20,11 @@ CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both
 
 @dataclass(frozen=True)
 class Judgement:
-    """The figures of a run.
+    """The figures of a run."""
 
-    ``metrics`` goes into ``metrics.json``; ``headlines`` are sentences for a reader; ``truth`` is
-    None on a real drive.
-    """
-
-    metrics: Mapping[str, Any]
-    headlines: Sequence[str]
-    truth: Truth | None
+    metrics: Mapping[str, Any]  # for ``metrics.json``
+    headlines: Sequence[str]  # sentences for a reader
+    truth: Truth | None  # None on a real drive
 
 
 def evaluate(drive: Drive, methods: CameraSets) -> Judgement:

@@ -12,8 +12,8 @@ from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
+from v2hdm.pipeline.config import Contents
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
 from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 
@@ -22,15 +22,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Inspection:
-    """A drive as it is mapped, its cameras as it describes them, and all findings before the run.
+    """A drive as it is mapped, its cameras as it describes them, and all findings before the run."""
 
-    In ``drive`` the clocks that the ground contradicts are corrected, and cameras begin where the ground puts
-    them; ``ground`` is of each visit, by camera, what the bare ground says.
-    """
-
-    drive: Drive
+    drive: Drive  # clocks corrected by the ground, cameras where it puts them
     given: Mapping[str, Camera]
-    ground: tuple[Mapping[str, GroundEstimate], ...]
+    ground: tuple[Mapping[str, GroundEstimate], ...]  # by session and camera, what bare ground says
     findings: tuple[Finding, ...]
 
     @property

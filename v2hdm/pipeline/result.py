@@ -25,7 +25,7 @@ from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration,
 from v2hdm.io.drive import ReadOptions
 from v2hdm.io.drive.of_result import told_of
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
-from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions, write_residuals
+from v2hdm.io.maps.evidence import write_exclusions, write_residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.io.maps.formats import check_crs, with_data, write_map
 from v2hdm.io.maps.geojson import write_geojson
@@ -34,15 +34,14 @@ from v2hdm.io.trajectory import write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.camera_sets import BEST
+from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
-from v2hdm.pipeline.keys import Contents, made_of_drives
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
-from v2hdm.report.outputs import write_json
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_text, write_json
 from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
 
@@ -71,11 +70,9 @@ _HEADER = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
 def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None:
     """Write ``trajectory.tum`` and ``trajectory_sigma.csv``, a line for each time of an image.
 
-    Of joined drives each has its own, such as ``trajectory_monday.tum``.
-
-    The poses are in the frame of the recorded ones, whose road is not flat: each is the recorded pose of that
-    time, moved as the solve has moved the flat one. ``seen`` says whether a marking was seen then; where none
-    was, the pose is the recorded one and its sigmas those that the drive states.
+    Of joined drives each has its own, such as ``trajectory_monday.tum``. Poses are in the frame of the
+    recorded ones, whose road is not flat: moved as the solve has moved the flat ones. ``seen`` says whether a
+    marking was seen then; else pose and sigmas are those of the drive.
     """
     for number, visit in enumerate(drive.visits):
         own = poses.visit == number
@@ -255,11 +252,8 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | 
         write_changes(best.changes, best.hd_map, folder)
     if result.check_points is not None:
         write_check_points(result.check_points, folder / "check_points.csv")
-    excluded = [
-        ExcludedMarking(one.kind, one.position_map, one.sightings, one.reason, name)
-        for name, methods in result.methods.items()
-        for one in methods[BEST].excluded
-    ]
+    sets = result.methods.items()
+    excluded = [replace(one, cameras=name) for name, methods in sets for one in methods[BEST].excluded]
     write_exclusions(excluded, folder / "excluded.geojson", drive.origin, drive.road)
     for name in best.calibrations:
         image = _fullest_image(drive, name, result.detections)

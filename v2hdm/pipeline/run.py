@@ -20,18 +20,25 @@ from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.formats import check_crs
 from v2hdm.io.safe.texts import take_name
-from v2hdm.pipeline.config import NO_DRIVE, RunConfig, admit, run_name
+from v2hdm.pipeline.config import (
+    NO_DRIVE,
+    Contents,
+    RunConfig,
+    admit,
+    base_files,
+    made_of_drives,
+    result_key,
+    run_name,
+)
 from v2hdm.pipeline.context import Context, log_file, logging_to
-from v2hdm.pipeline.keys import Contents, base_files, made_of_drives, result_key
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
-from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of
+from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of, prune_to_limit
 from v2hdm.store.folders import note_use
 from v2hdm.store.inputs import note_input
 from v2hdm.store.lock import HOST
-from v2hdm.store.pruning import prune_to_limit
 from v2hdm.store.remote import RemoteFolder, is_url, place_of
 from v2hdm.store.results import drop_result, files_of_result, is_whole, locked_folder, result_folder
 from v2hdm.verdict.verdict import Verdict
@@ -78,7 +85,7 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     """The result of a run in the place that its settings name, and whether it was there already.
 
     ``work`` makes a result in folders of this machine; a finished one of the same is taken where ``take``
-    says so. Raises V2hdmError as ``work``; or a store does not work, or holds what is not ours.
+    says so.
     """
     output = place_of(config.output, "output=")
     if is_url(config.cache):
@@ -97,10 +104,7 @@ def note_finished(result: RunResult, key: str, cache: StageCache) -> None:
 
 
 def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
-    """The result of a run where it lies in its folder already, whole, and made of the same; else None.
-
-    Nothing is refused here: the run that follows reports what cannot be read.
-    """
+    """The result of a run if it lies in its folder, whole, and made of the same; else None."""
     try:
         folder = Path(config.output) / run_name(config)
         entry = _noted(folder, cache)

@@ -53,11 +53,7 @@ def table_of(options: SurveyOptions) -> SurveyTable | None:
 
 
 def take_survey(drive: Drive, options: MappingOptions) -> Survey:
-    """The survey of a drive, before anything is estimated.
-
-    Raises DriveError where the file cannot be read, or none of its points is where the drive could see it;
-    says how else the file may be meant.
-    """
+    """The survey of a drive, before anything is estimated; DriveError where it cannot be this drive's."""
     table = table_of(options.survey)
     if table is None:
         return Survey(options)
@@ -122,10 +118,7 @@ def _check_near(
 
 
 def _places(tree: KDTree, at: FloatArray, reach_m: float) -> int:
-    """How many of a tree's places points have within reach, each by its nearest.
-
-    Points that a wrong unit heaps up on one spot have a single one.
-    """
+    """How many of a tree's places points have within reach: those heaped up on one spot have a single one."""
     off_m, nearest = tree.query(at)
     return len(np.unique(nearest[off_m <= reach_m]))
 

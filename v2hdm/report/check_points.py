@@ -160,11 +160,7 @@ def compare(
     joint: JointCovariance,
     route_map: FloatArray,
 ) -> CheckTable:
-    """Hold check points against the corners of a map that lie within ``reach_m`` of them.
-
-    :func:`v2hdm.io.maps.surveyed.match` decides of which corner a point is. ``route_map`` (F, 2) is where the
-    vehicle was.
-    """
+    """Hold check points against the corners of a map within ``reach_m``; ``route_map`` (F, 2) was driven."""
     corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 2)
     positions = np.array([point.position_map for point in points]).reshape(-1, 2)
     off_m, nearest = KDTree(corners).query(positions)

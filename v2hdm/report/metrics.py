@@ -27,19 +27,14 @@ FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unocclud
 
 @dataclass(frozen=True)
 class MarkingMetrics:
-    """Mapped markings of one class, or of all, against the true ones.
-
-    ``false_markings`` have no true counterpart, ``expected`` are the true ones driven past within the region
-    of interest and ``recall`` their mapped share. ``corner_bias_m`` is the length of the corners' mean error
-    vector; it and the RMSE are nan where nothing matched.
-    """
+    """Mapped markings of one class, or of all, against the true ones; nan where nothing matched."""
 
     markings: int
-    false_markings: int
-    expected: int
-    recall: float
+    false_markings: int  # without a true counterpart
+    expected: int  # true ones driven past within the region of interest
+    recall: float  # their mapped share
     corner_rmse_m: float
-    corner_bias_m: float
+    corner_bias_m: float  # length of the corners' mean error vector
 
 
 @dataclass(frozen=True)
@@ -51,11 +46,7 @@ class ExtrinsicMetrics:
 
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
-    """Which true markings (J,) the cameras saw whole inside their region of interest.
-
-    Whole means: all corners inside the camera's ROI at the true pose, at least
-    :data:`FULLY_VISIBLE` of the area unoccluded, in at least :data:`MIN_SIGHTINGS` images.
-    """
+    """Which true markings (J,) the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
     corners_map = np.array([marking.corners_map for marking in truth.map.markings]).reshape(-1, 4, 2)
     sightings = np.zeros(len(corners_map), dtype=int)
     for i, image in enumerate(drive.images):
@@ -134,18 +125,13 @@ LATERAL_GATE_M = 0.3  # a mapped lane this near to a true one maps it
 
 @dataclass(frozen=True)
 class LaneMetrics:
-    """Mapped lane lines against the true ones.
-
-    ``mean_lateral_error_m`` is over the mapped length that lies within :data:`LATERAL_GATE_M` of a
-    true line, ``mapped_fraction`` the share of the visible true length with a mapped line that
-    near, ``false_length_m`` the mapped length without a true line beside it.
-    """
+    """Mapped lane lines against the true ones, near within :data:`LATERAL_GATE_M`."""
 
     lanes: int
     length_m: float
-    mean_lateral_error_m: float
-    mapped_fraction: float
-    false_length_m: float
+    mean_lateral_error_m: float  # of mapped length near a true line
+    mapped_fraction: float  # of the visible true length, with a mapped line near
+    false_length_m: float  # mapped without a true line near
 
 
 def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
@@ -180,11 +166,7 @@ def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
 
 
 def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
-    """Distance (N,) of points to a densely sampled line, the samples joined by their tangent.
-
-    The two nearest samples span the local line, so the result is lateral to far below the
-    sampling step.
-    """
+    """Distance (N,) of points to a densely sampled line, between its two nearest samples: lateral."""
     if not len(points):
         return np.empty(0)
     if len(line) < 2:
@@ -240,8 +222,7 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
 def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArray | None) -> dict[str, float]:
     """How far an extrinsic (4 x 4) moved from its start and, where known, how far it is from truth.
 
-    The turns are those of the camera about the vehicle's axes (deg): yaw to the left, pitch nose
-    down, roll to the right.
+    Turns are about the vehicle's axes, deg: yaw to the left, pitch nose down, roll to the right.
     """
     turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
     yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)

@@ -110,10 +110,7 @@ _SMALL_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 def save_grid(
     path: Path, image: np.ndarray, camera: Camera, mountings: Mapping[str, FloatArray], caption: str
 ) -> None:
-    """Draw horizon, metric ground grid and ROI into an image (H, W, 3) BGR, as recorded.
-
-    ``mountings`` are ``cam_from_vehicle`` (4 x 4) by a name of :data:`PENS`.
-    """
+    """Draw horizon, ground grid and ROI, by ``mountings`` of :data:`PENS`, into an image (H, W, 3) BGR."""
     canvas = image.copy()
     legend: list[tuple[Pen | None, str]] = [(None, caption)]
     for number, (name, cam_from_vehicle) in enumerate(mountings.items()):

@@ -31,18 +31,10 @@ PAINT = "#dfe4e8"  # filling of true markings
 GRID = "#e6eaed"
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
-WORDS = {
-    "CNI": ("orange", "dashed"),
-    "ENI": ("vermillion", "dotted"),
-    "Opt": ("blue", "solid"),
-    "ONI": ("green", "dash-dotted"),
-}
-"""Colour and line of each method in words, the same in every figure: they differ without colour, too."""
+WORDS = {"CNI": "orange", "ENI": "vermillion", "Opt": "blue", "ONI": "green"}
+"""Colour of each method in words, the same in every figure."""
 
-METHOD = {method: OKABE_ITO[colour] for method, (colour, _) in WORDS.items()}
-
-LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
-
+METHOD = {method: OKABE_ITO[colour] for method, colour in WORDS.items()}
 
 RC: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -62,21 +54,13 @@ RC: dict[Any, Any] = {
 
 @contextmanager
 def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Iterator[Figure]:
-    """A figure that is saved to ``path`` (whole or not at all) when the block ends.
-
-    It has a canvas of its own and never touches pyplot's global state.
-    """
+    """A figure, with a canvas of its own, that is saved to ``path``, whole, when the block ends."""
     with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
         FigureCanvasAgg(fig)
         yield fig
         with whole_file(path) as partial:
             fig.savefig(partial, format="png")
-
-
-def set_map_axes(axes: Axes) -> None:
-    """Axes of the map frame: as long east as north."""
-    axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
 
 
 def set_image_axes(axes: Axes, left: float, right: float, bottom: float, top: float) -> None:
@@ -96,8 +80,3 @@ def draw_arrows(
     key_px = max(step for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9)) * power
     size = {"size": mpl.rcParams["font.size"] - 1}
     axes.quiverkey(drawn, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", fontproperties=size)
-
-
-def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
-    """Show the square about a point (2,) that reaches ``half`` to each side."""
-    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))

@@ -24,7 +24,6 @@ METHODS: Mapping[str, str] = {
 }
 """The methods of the paper (IROS 2023), in the order of its tables."""
 
-
 _Column = tuple[str, int, float]  # key in metrics.json, digits behind the point, factor
 AGAINST_TRUTH: Mapping[str, _Column] = {
     "recall": ("recall", 3, 1.0),

@@ -20,13 +20,7 @@ import numpy as np
 
 from v2hdm.catalogue import SHIPPED
 from v2hdm.errors import MapFileError, V2hdmError, one_line
-from v2hdm.io.maps.corrections import (
-    Correction,
-    correction_of,
-    entry_of,
-    read_corrections,
-    write_corrections,
-)
+from v2hdm.io.maps.corrections import Correction, correction_of, entry_of, read_corrections, write_corrections
 from v2hdm.records import Drive
 from v2hdm.report.page.document import json_text, page_text
 from v2hdm.report.page.facts import Facts, read_facts
@@ -86,10 +80,7 @@ def _key(one: Correction, facts: Facts) -> str | None:
 
 
 def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingHTTPServer, str, Session]:
-    """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its corrections.
-
-    Raises MapFileError where the folder is no result with a map, or ``path`` holds something else.
-    """
+    """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its corrections."""
     facts = read_facts(folder, drive)
     if facts.hd_map is None:
         raise MapFileError(f"{folder}: has no map to look at; mend its drive and map it again")

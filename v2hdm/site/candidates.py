@@ -12,15 +12,12 @@ from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.quadrilateral import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_UNSEEN_M2 = 1e4
-"""Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
+_UNSEEN_M2 = 1e4  # variance of a corner that was not seen, m^2: infinite beside the size of a site
 
+# Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too small.
 CORRELATION = 0.2
-"""Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
-small."""
 
 _KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
-
 
 _OTHER_EDGE_M = 0.3
 """Sigma, m, of where a sighting sees an edge of the same marking that others do not: a worn end's, as in the
@@ -29,10 +26,7 @@ posterior; what lies farther off is of something else."""
 
 @dataclass(frozen=True)
 class Candidates:
-    """Corners ``corners_map`` (G, 4, 2), m, of G candidates and their joint covariances (G, 8, 8), m^2.
-
-    A corner that was not seen has the variance :data:`_UNSEEN_M2` and lies anywhere near the others.
-    """
+    """Corners (G, 4, 2), m, and joint covariances (G, 8, 8), m^2; of unseen ones :data:`_UNSEEN_M2`."""
 
     corners_map: FloatArray
     covariance_m2: FloatArray
@@ -41,10 +35,7 @@ class Candidates:
     def seen(
         cls, corners_map: FloatArray, covariance_m2: FloatArray, about: FloatArray | float = 0.0
     ) -> Candidates:
-        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where one was not seen.
-
-        One without any corner lies at its ``about`` (G, 2).
-        """
+        """Candidates of corners and covariances that are nan if unseen; ``about`` (G, 2) without any."""
         unseen = np.isnan(corners_map[..., 0]) | np.isnan(corners_map[..., 1])
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
@@ -74,36 +65,20 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Counts:
-    """How often G candidates were seen, each (G,).
+    """How often G candidates were seen, each (G,)."""
 
-    ``images`` with accepted observations; ``observations`` of corners, how many are ``agreeing`` with the
-    solution, and the mean of the detector's ``log_odds`` of these; ``easy_views``, images with the whole
-    candidate in easy view, those where it was ``found``, and of these the ones in which each corner is a
-    point that agrees, ``pointed`` (G, 4); ``as_symbol``, images in which a symbol lies on it.
-    """
-
-    images: IntArray
-    observations: IntArray
-    agreeing: IntArray
-    log_odds: FloatArray
-    easy_views: IntArray
-    found: IntArray
-    pointed: IntArray
-    as_symbol: IntArray
+    images: IntArray  # with accepted observations
+    observations: IntArray  # of corners
+    agreeing: IntArray  # of these, with the solution
+    log_odds: FloatArray  # mean of the detector's, of these
+    easy_views: IntArray  # images with the whole candidate in easy view
+    found: IntArray  # of these, where it was found
+    pointed: IntArray  # (G, 4) of these, where each corner is a point that agrees
+    as_symbol: IntArray  # images in which a symbol lies on it
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
         """The candidates at ``rows``."""
         return Counts(*(values[rows] for values in vars(self).values()))
-
-
-@dataclass(frozen=True)
-class Exclusion:
-    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
-
-    kind: str
-    position_map: FloatArray
-    sightings: int
-    reason: str
 
 
 def with_dissent(
@@ -118,11 +93,9 @@ def with_dissent(
     """The candidates (G,), less certain where sightings contradict what ``fused`` ones agree on.
 
     The joint solution rejected R corners: the ``corner`` (R,) of candidate ``group`` (R,), which sighting
-    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2).
-
-    Most images may see where bright paint ends, and the nearest ones a worn end beyond it. Either is right in
-    proportion to its information, not to a power of it: images of one view err alike. A mixture of two places
-    has the variance p (1 - p) of their distance squared; p is small. Corners of one sighting go together.
+    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2). Either is right
+    in proportion to its information, since images of one view err alike; a mixture of two places has the
+    variance p (1 - p) of their distance squared. Corners of one sighting go together.
     """
     off = seen_map - candidates.corners_map[group, corner]
     away_m = np.linalg.norm(off, axis=1)
@@ -144,12 +117,11 @@ def with_dissent(
 
 
 def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: FloatArray) -> Candidates:
-    """The solved candidates (G,), with the errors that all images of a corner share.
+    """The solved candidates (G,), with the errors that all images of a corner share, as of a worn end.
 
-    A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
-    are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
-    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says. Where the
-    images of a corner scatter more than others do, by ``scatter`` (G, 4), they know as much less of it.
+    Of errors that are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey
+    Sampling, 1965): about r times a single image's, as in ``fused``. ``scatter`` (G, 4) makes a corner less
+    known.
     """
     seen = np.maximum(fused.seen, 1)
     share = scatter - 1 + CORRELATION * seen * scatter
@@ -161,8 +133,7 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: Floa
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
 
 
-_LARGEST = 1e9
-"""Variance of residuals, in squared sigmas, beyond which (and below whose inverse) all are alike."""
+_LARGEST = 1e9  # variance of residuals, squared sigmas, beyond which (and below whose inverse) all are alike
 
 _PRIOR_FREEDOM = (1.0, 1e4)
 """Between these is the freedom of the prior of a variance: from tails as heavy as Cauchy's to none."""
@@ -173,8 +144,7 @@ _LEAST_TO_COMPARE = 3  # variances from which they have a spread
 def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, float]:
     """Scale and freedom of the inverse-gamma prior of variances (M,), each estimated with ``freedom`` (M,).
 
-    By moments of their logarithms (Smyth, Linear models and empirical Bayes methods, 2004, section 6.2); of
-    fewer than three nothing is known, and none is too large.
+    By moments of their logarithms (Smyth, 2004, section 6.2); of fewer than three nothing is known.
     """
     if len(variance) < _LEAST_TO_COMPARE:
         return _LARGEST, _PRIOR_FREEDOM[1]
@@ -187,11 +157,7 @@ def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, fl
 
 
 def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
-    """How many times as large as usual the variance of corners' (G, 4) images is, at least once.
-
-    By sums of their ``squared`` residuals (G, 4), in sigmas, over ``freedom`` (G, 4) degrees: each variance
-    is a mean of its own and of what those of all corners say.
-    """
+    """How many times the usual the variance (G, 4) of corners' images is, at least once, by all corners'."""
     known = freedom > 0
     scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])
     after = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))

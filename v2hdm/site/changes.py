@@ -87,48 +87,33 @@ def fused_markings(
     return by_old, by_new
 
 
-_DRIFT_OVER_M = 30.0
-"""Distance over which the error that a map's markings share fades, m, where the map does not say."""
+_DRIFT_OVER_M = 30.0  # distance over which the error that markings share fades, m, where the map does not say
 
-_LIKELY = 0.5
-"""Probability from which a marking is reported as moved, gone or new paint: the likelier of the two."""
+_LIKELY = 0.5  # probability from which a marking is reported as moved, gone or new: the likelier of two
 
-_LEAST_PAIRED = 0.3
-"""Share of the markings that a drive looked at which it finds again at least, if the site is the same."""
+_LEAST_PAIRED = 0.3  # least share of the markings looked at that a drive finds again, if the site is the same
 
 _LOOKED = 3  # easy views from which a drive has looked at a place for that share
 
 
 @dataclass(frozen=True)
 class Base:
-    """An earlier map, and from where its drives looked.
-
-    ``hd_map`` has ids. ``poses`` (F, 4, 4) are those of its images, (0, 4, 4) where they are not known;
-    ``left_out`` are the class, place (2,) and sightings of candidates that it was not sure of.
-    """
+    """An earlier map, with ids, and from where its drives looked."""
 
     hd_map: HdMap
-    poses: FloatArray
-    left_out: tuple[tuple[str, FloatArray, int], ...] = ()
+    poses: FloatArray  # (F, 4, 4) of its images, (0, 4, 4) where not known
+    left_out: tuple[tuple[str, FloatArray, int], ...] = ()  # class, place (2,), sightings of candidates
 
 
 def update_map(
     base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
 ) -> tuple[HdMap, Changes, IntArray, IntArray]:
-    """Bring the ``base`` map up to date; returns it and what changed.
+    """Bring the ``base`` map up to date with ``made``, the new drive's own map, in the same frame.
 
-    Lastly the ids in it of the M markings of ``made`` (M,), 0 for one that it does not have, and where each
-    corner (M, 4) stands in its order.
-
-    Args:
-        base: the earlier map.
-        made: the new drive's own map, in the same frame.
-        observer: the new drive.
-        mapped: (S,) which sightings are of the markings of ``made``.
-        drift_over_m: distance over which the error of the drive's poses fades, m.
-
-    Raises:
-        MappingError: the drive finds too little of the map again to be of its site.
+    Returns it, what changed, the ids in it of the M markings of ``made`` (M,), 0 for none, and where each
+    corner (M, 4) stands in its order. ``mapped`` (S,) are the sightings of ``made``, ``drift_over_m`` is the
+    way over which the poses' error fades. Raises MappingError where the drive finds too little of the map
+    again.
     """
     old, new = base.hd_map.markings, made.markings
     of_old = Errors.of(old, base.hd_map.drift_over_m or _DRIFT_OVER_M)

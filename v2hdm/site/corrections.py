@@ -9,12 +9,11 @@ import numpy as np
 
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
-from v2hdm.records import FloatArray, HdMap, IntArray
-from v2hdm.site.candidates import Candidates, Exclusion
+from v2hdm.records import Exclusion, FloatArray, HdMap, IntArray
+from v2hdm.site.candidates import Candidates
 
 _SAME_M = 0.4  # how far the middle of a candidate may be from that which a person saw, m
-MAX_OVERLAP = 0.2
-"""Share of the smaller one's area from which two outlines are of the same paint: markings never overlap."""
+MAX_OVERLAP = 0.2  # share of the smaller area from which two outlines are of one paint: none overlap
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,7 @@ class Stated:
 
     @classmethod
     def of(cls, corrections: Sequence[Correction], corners_map: FloatArray, kinds: Sequence[str]) -> Stated:
-        """The corrections of candidates with corners (G, 4, 2), each of the nearest one, of its class first.
-
-        All candidates on rejected paint are rejected: another reading of it would take its place.
-        """
+        """The corrections of candidates (G, 4, 2), of the nearest, its class first; all on rejected paint."""
         rejected: dict[int, str] = {}
         kept: dict[int, Correction] = {}
         for one in corrections:

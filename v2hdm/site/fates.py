@@ -1,9 +1,8 @@
 """Which marking of a new map is which of an old one: the likeliest of all that may have happened to them.
 
-Of a marking of the old map, the new drive may have seen it where it was, seen it elsewhere because it was
-painted anew there, or not seen it: because it is gone, because no image showed its place, or because it was
-missed. A marking of the new map that is none of the old one is new paint, or was missed before. Each has a
-likelihood; how often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
+An old marking was seen where it was, or elsewhere because it was painted anew there, or not: it is gone, no
+image showed its place, or it was missed. A new one that is none of the old is new paint, or was missed
+before. How often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
 prior), and one assignment makes all of it as likely as can be.
 """
 
@@ -23,16 +22,14 @@ from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions
 
-_MOVED_SIGMA_M = 0.5
-"""Sigma of how far a marking is painted from where it was, m a coordinate: a new line of the same bay."""
+_MOVED_SIGMA_M = 0.5  # sigma of how far a marking is painted from its old place, m a coordinate: a new line
 
 _TURNED_SIGMA_RAD = 0.2  # sigma of how far it is turned then, rad
 _REACH_M = 4 * _MOVED_SIGMA_M  # markings farther apart are never one, m
 _OTHER_SHAPE_M = 0.1
 """Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
 
-_MISREAD_M = 0.3
-"""Sigma of an end or corner that one of two drives has taken from another edge, m, as in the site model."""
+_MISREAD_M = 0.3  # sigma of an end or corner that one of two drives took from another edge, m
 
 _MISREAD_SHARE = 0.05  # share of markings of which one of two drives has misread an end or a corner
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
@@ -46,10 +43,7 @@ STAYED, MOVED = range(2)
 
 @dataclass(frozen=True)
 class Watched:
-    """Log likelihoods (N,) of the images of N places where the drive's map has nothing.
-
-    ``there`` if the marking is there, ``bare`` if it is not.
-    """
+    """Log likelihoods (N,) of images of places where the map has nothing, if there is a marking, if not."""
 
     there: FloatArray
     bare: FloatArray
@@ -62,10 +56,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Pair:
-    """An old and a new marking that are one: the old one's corner c is the new one's (c + ``turn``) mod 4.
-
-    ``moved`` is the probability that it was painted elsewhere.
-    """
+    """An old and a new marking that are one, corner c (c + ``turn``) mod 4, ``moved`` by probability."""
 
     old: int
     new: int
@@ -75,33 +66,25 @@ class Pair:
 
 @dataclass(frozen=True)
 class Decision:
-    """The fates of the markings.
+    """The fates of the markings."""
 
-    ``pairs`` were seen again; ``gone`` are the probabilities by old marking that was not, ``fresh`` those by
-    new marking that has no partner, that it is new paint. ``shift`` is how the maps lie to each other.
-    """
-
-    pairs: tuple[Pair, ...]
-    gone: dict[int, float]
-    fresh: dict[int, float]
-    shift: Shift
+    pairs: tuple[Pair, ...]  # seen again
+    gone: dict[int, float]  # probability, by old marking not seen again
+    fresh: dict[int, float]  # that a new marking without partner is new paint
+    shift: Shift  # how the maps lie to each other
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off.
-
-    ``off`` (P, 8), m, has the ``noise`` (P, 8, 8), m^2, of both; ``basis`` (P, 8, 8) has rows for two shifts,
-    the turn, in which it counts ``arm_m`` (P,) times, and five deformations.
-    """
+    """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off."""
 
     old: IntArray
     new: IntArray
     turn: IntArray
-    off: FloatArray
-    noise: FloatArray
-    basis: FloatArray
-    arm_m: FloatArray
+    off: FloatArray  # (P, 8) m
+    noise: FloatArray  # (P, 8, 8) m^2, of both
+    basis: FloatArray  # (P, 8, 8) rows of two shifts, the turn and five deformations
+    arm_m: FloatArray  # (P,) how often the turn counts
 
     def __len__(self) -> int:
         return len(self.old)
@@ -129,8 +112,8 @@ def decide(
 ) -> Decision:
     """Decide what became of ``old`` markings of an earlier map, and what the ``new`` ones of a drive are.
 
-    ``of_old`` and ``of_new`` are their errors; ``watched_now`` is how often the new drive looked at the old
-    markings that it has not mapped, ``watched_before`` the earlier drive at the places of the new ones.
+    ``watched_now`` is how often the new drive looked at the old markings that it has not mapped,
+    ``watched_before`` the earlier drive at the places of the new ones.
     """
     candidates = _candidates(old, new, of_old, of_new)
     shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))

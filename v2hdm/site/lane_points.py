@@ -29,25 +29,21 @@ from v2hdm.records import (
     IntArray,
     LaneDetection,
 )
-from v2hdm.site.options import LaneOptions
 
-CENTRE_SIGMA_PX = 1.0
-"""Noise of a detected centre point across its line: about a cell of the network's output."""
+NODE_SPACING_M = 0.5  # between the vertices of a polyline
+HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # across and along a line, of the neighbourhood that is averaged
 
-OWN_SIGMA_M = 0.01
-"""Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
+CENTRE_SIGMA_PX = 1.0  # noise of a detected centre point across its line: a cell of the network's output
+
+OWN_SIGMA_M = 0.01  # sigma of a point beyond its pixel's, m: the nearest image must not outvote all others
 
 _TANGENT_REACH = 2  # points to either side whose difference gives a point's direction
-_GUIDE_RANGE = 1.8
-"""Whole lines are followed so many times farther than paint is mapped: they only say what is one line."""
+_GUIDE_RANGE = 1.8  # whole lines are followed so many times farther than paint: they only say what is one
 
 
 @dataclass(frozen=True)
 class Guides:
-    """Whole lines as single images saw them, gaps of dashes included: which paint is one line.
-
-    ``points_map`` (G, 2) m; ``line`` (G,) that a point is of, an index into ``image_of_line`` (L,).
-    """
+    """Whole lines as single images saw them, gaps included: points (G, 2), m, their lines and images."""
 
     points_map: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -56,38 +52,29 @@ class Guides:
 
 @dataclass(frozen=True)
 class LaneCloud:
-    """P points on lane paint.
+    """P points on lane paint."""
 
-    ``points_map`` (P, 2) m, unit ``tangent`` (P, 2) of either sense, ``weight`` (P,) = 1 / variance
-    across the line in 1 / m^2, ``image`` (P,) that a point was seen in, ``dash`` (P,) whether its
-    detection was a dash; beside them the ``guides``. Images show them at pinhole pixels ``points_px`` (P, 2)
-    and row shares (P,); ``jacobian`` (P, 2, 2) is that of a point by its pixel.
-    """
-
-    points_map: FloatArray
-    tangent: FloatArray
-    weight: FloatArray
-    image: IntArray
-    dash: BoolArray
+    points_map: FloatArray  # (P, 2) m
+    tangent: FloatArray  # (P, 2) unit, of either sense
+    weight: FloatArray  # (P,) 1 / variance across the line, 1 / m^2
+    image: IntArray  # (P,) that it was seen in
+    dash: BoolArray  # (P,) its detection was one
     guides: Guides = field(default_factory=Guides)
-    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (P, 2) pinhole
     row_share: FloatArray = field(default_factory=lambda: np.zeros(0))
+    # (P, 2, 2) of a point by its pixel
     jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
 
 @dataclass(frozen=True)
 class ImageGround:
-    """How each image of a drive maps to the ground; nan for images of cameras that are not used.
+    """How each image of a drive maps to the ground; nan for images of cameras that are not used."""
 
-    ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3). Where shutters roll,
-    ``moved_map`` (I, 2, 3) takes a point of the ground (x, y, 1) to how far it seems to move with the vehicle
-    during the read-out. ``flattened_px`` moves pinhole pixels (P, 2) of images (P,) to where these would show
-    the same on the plane z = 0.
-    """
-
-    map_from_pinhole_px: FloatArray
-    centre_map: FloatArray
+    map_from_pinhole_px: FloatArray  # (I, 3, 3)
+    centre_map: FloatArray  # (I, 3) of the camera
+    # (I, 2, 3) from (x, y, 1) to its motion with the vehicle during read-out, if any
     moved_map: FloatArray | None = None
+    # moves pinhole px (P, 2) of images (P,) to where z = 0 would show the same
     flattened_px: Callable[[IntArray, FloatArray], FloatArray] = lambda image, points_px: points_px
 
     @classmethod
@@ -114,10 +101,7 @@ class ImageGround:
         return replace(self, moved_map=out)
 
     def at_rows(self, points_map: FloatArray, image: IntArray, row_share: FloatArray) -> FloatArray:
-        """Points (..., 2) that images (...) show at rows (...), by the poses at which these were read.
-
-        To first order in the motion: the second is under a millimetre.
-        """
+        """Points (..., 2) of images (...) by the poses at which their rows were read, to first order."""
         if self.moved_map is None:
             return points_map
         motion = self.moved_map[image]
@@ -128,10 +112,7 @@ class ImageGround:
 def ground_by_ipm(
     drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray], rig: Rig
 ) -> ImageGround:
-    """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are.
-
-    Of ``rig``, over the same cameras, only the read-out times and twists are looked at.
-    """
+    """By an IPM per camera and the recorded poses, and of ``rig`` read-out times and twists alone."""
     rows, camera = _rows(drive, list(ipm))
     poses = np.stack([drive.images[i].map_from_vehicle for i in rows])
     forward = [facing_ipm(ipm[name], drive.cameras[name].roi_vehicle.mean(axis=0)) for name in ipm]
@@ -172,10 +153,7 @@ def collect_lane_points(
     max_range_m: float,
     jitter_rad: float,
 ) -> LaneCloud:
-    """Back-project all lane detections of the images that ``ground`` covers, up to ``max_range_m``.
-
-    ``jitter_rad`` of viewing direction goes into the weights, so that near points count for more.
-    """
+    """Back-project lane detections up to ``max_range_m``; near ones count more by a direction's jitter."""
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
     lanes = _lanes(detections, ground, whole=False)
     if not lanes:
@@ -277,20 +255,16 @@ _THIN_SPACINGS = 0.7  # spacings of nodes within which the best supported one su
 
 @dataclass(frozen=True)
 class Nodes:
-    """N points on the ridges.
+    """N points on the ridges."""
 
-    ``points_map`` (N, 2), unit ``tangent`` (N, 2) of either sense, ``images`` (N,) that support a
-    node and ``dash`` (N,), the share of its points that were seen as a dash.
-    """
-
-    points_map: FloatArray
-    tangent: FloatArray
-    images: IntArray
-    dash: FloatArray
+    points_map: FloatArray  # (N, 2)
+    tangent: FloatArray  # (N, 2) unit, of either sense
+    images: IntArray  # (N,) that support a node
+    dash: FloatArray  # (N,) share of its points seen as a dash
 
 
-def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
-    """Nodes on the ridges of ``cloud``, about ``options.node_spacing_m`` apart."""
+def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
+    """Nodes on the ridges of ``cloud`` that so many images show, about :data:`NODE_SPACING_M` apart."""
     # A seed for each cell of position and direction.
     angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
     place = np.floor(cloud.points_map / _SEED_CELL_M)
@@ -298,20 +272,20 @@ def find_nodes(cloud: LaneCloud, options: LaneOptions) -> Nodes:
     seeds = np.unique(cell, axis=0, return_index=True)[1]
     points, tangent = cloud.points_map[seeds], cloud.tangent[seeds]
     # Pairs of seed and point of the cloud that may ever lie in its neighbourhood.
-    reach_m = float(np.hypot(options.half_length_m, 2 * options.half_width_m))
+    reach_m = float(np.hypot(_HALF_LENGTH_M, 2 * HALF_WIDTH_M))
     apart = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
     pairs = apart["i"].astype(np.int64), apart["j"].astype(np.int64)
     for _ in range(_ITERATIONS):
-        points, tangent = _shift(points, tangent, cloud, pairs, options)
+        points, tangent = _shift(points, tangent, cloud, pairs)
     along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= options.node_spacing_m) & (np.abs(across) <= 0.5 * options.half_width_m)
+    near = (np.abs(along) <= NODE_SPACING_M) & (np.abs(across) <= 0.5 * HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
     seed, point = pairs[0][near], pairs[1][near]
     shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
     images, total = np.bincount(shown, minlength=len(points)), np.bincount(seed, minlength=len(points))
     dash = np.bincount(seed, cloud.dash[point].astype(float), len(points)) / np.maximum(total, 1)
-    supported = np.flatnonzero(images >= options.min_images)
-    kept = supported[_thin(points[supported], tangent[supported], images[supported], options)]
+    supported = np.flatnonzero(images >= least_images)
+    kept = supported[_thin(points[supported], tangent[supported], images[supported])]
     return Nodes(points[kept], tangent[kept], images[kept], dash[kept])
 
 
@@ -328,19 +302,15 @@ def _coordinates(
 
 
 def _shift(
-    points: FloatArray,
-    tangent: FloatArray,
-    cloud: LaneCloud,
-    pairs: tuple[IntArray, IntArray],
-    options: LaneOptions,
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Move each seed across its line onto the weighted regression line of its neighbourhood."""
     along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= options.half_length_m) & (np.abs(across) <= options.half_width_m)
+    near = (np.abs(along) <= _HALF_LENGTH_M) & (np.abs(across) <= HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
     x, y = along[near], across[near]
     # Gaussian across, so that of two lines within reach the nearer one wins.
-    kernel = np.exp(-0.5 * (2.0 * y / options.half_width_m) ** 2) * (1 - (x / options.half_length_m) ** 2)
+    kernel = np.exp(-0.5 * (2.0 * y / HALF_WIDTH_M) ** 2) * (1 - (x / _HALF_LENGTH_M) ** 2)
     weight = cloud.weight[pairs[1][near]] * kernel
     count = len(points)
 
@@ -352,17 +322,17 @@ def _shift(
     # A little stiffness keeps the direction where all neighbours lie at one place.
     spread = wxx - wx**2 / safe + 1e-3 * safe
     slope = np.clip((wxy - wx * wy / safe) / np.maximum(spread, 1e-12), -0.5, 0.5)
-    offset = np.clip((wy - slope * wx) / safe, -options.half_width_m, options.half_width_m)
+    offset = np.clip((wy - slope * wx) / safe, -HALF_WIDTH_M, HALF_WIDTH_M)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     turned = tangent + slope[:, None] * normal
     return points + offset[:, None] * normal, turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
-def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: LaneOptions) -> IntArray:
+def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray:
     """Indices of the best supported nodes, no two closer than .7 of the spacing along or beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
-    reach_m = _THIN_SPACINGS * options.node_spacing_m
+    reach_m = _THIN_SPACINGS * NODE_SPACING_M
     near = cKDTree(points).query_ball_point(points, reach_m)
     alive = np.ones(len(points), dtype=bool)
     kept = []
@@ -374,5 +344,5 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: La
         offset = points[others] - points[node]
         across = offset[:, 1] * tangent[node, 0] - offset[:, 0] * tangent[node, 1]
         same = np.abs(tangent[others] @ tangent[node]) >= _SAME_DIRECTION
-        alive[others[same & (np.abs(across) <= 0.5 * options.half_width_m)]] = False
+        alive[others[same & (np.abs(across) <= 0.5 * HALF_WIDTH_M)]] = False
     return np.array(kept, dtype=np.int64)

@@ -18,9 +18,11 @@ from scipy.spatial import cKDTree
 
 from v2hdm.geometry.planar import angle_between, length_along, points_along
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
-from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
+from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
 
+_MAX_DASH_GAP_M, _MAX_BREAK_M = 9.0, 3.0  # longest gap of two dashes, break in solid paint, that is bridged
+_LEAST_PIECE_M = 2.0  # length of a lane line at least
 _SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # cosine from which two nodes are of one line
 _MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings of nodes
 _MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
@@ -48,28 +50,25 @@ class Path:
         return replace(self, points_map=self.points_map[::-1]) if turn else self
 
 
-def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
+def string_nodes(nodes: Nodes) -> list[Path]:
     """String nodes into paths that never fork: linked are mutually nearest ones ahead and behind."""
     if not len(nodes.points_map):
         return []
     return [
         Path(nodes.points_map[path], float(nodes.dash[path].mean()), float(np.median(nodes.images[path])))
-        for path in _walk(_mutual_links(nodes, _MAX_LINK_SPACINGS * options.node_spacing_m))
+        for path in _walk(_mutual_links(nodes, _MAX_LINK_SPACINGS * NODE_SPACING_M))
         if len(path) >= 2
     ]
 
 
-def join_paths(paths: list[Path], options: LaneOptions) -> list[Path]:
-    """Join paths end to end where both ends lie on one arc, shortest gaps first.
-
-    Gaps up to ``max_dash_gap_m`` are bridged between dashed pieces, up to ``max_break_m`` otherwise.
-    """
+def join_paths(paths: list[Path]) -> list[Path]:
+    """Join paths end to end where both ends lie on one arc, shortest gaps first."""
     joined = []
-    for run in _runs(len(paths), _joints(paths, options)):
+    for run in _runs(len(paths), _joints(paths)):
         own = [paths[path].turned(backwards) for path, backwards in run]
         pieces = [own[0].points_map]
         for before, after in itertools.pairwise(own):
-            pieces += [_bridge(before.points_map, after.points_map, options.node_spacing_m), after.points_map]
+            pieces += [_bridge(before.points_map, after.points_map, NODE_SPACING_M), after.points_map]
         joined.append(_merged(np.concatenate(pieces), own))
     return joined
 
@@ -116,7 +115,7 @@ def _walk(links: IntArray) -> list[IntArray]:
     return paths
 
 
-def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int, int]]:
+def _joints(paths: list[Path]) -> list[tuple[int, int, int, int]]:
     """Pairs of path ends (path, end, path, end) that fit, by growing gap; end 0 first, 1 last."""
     if len(paths) < 2:
         return []
@@ -124,11 +123,11 @@ def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int
     outward = np.array([[_outward(path.points_map[::-1]), _outward(path.points_map)] for path in paths])
     outward = outward.reshape(-1, 2)
     dashed = np.repeat([path.dash > 0.5 for path in paths], 2)
-    pairs = cKDTree(end).query_pairs(max(options.max_dash_gap_m, options.max_break_m), output_type="ndarray")
+    pairs = cKDTree(end).query_pairs(max(_MAX_DASH_GAP_M, _MAX_BREAK_M), output_type="ndarray")
     a, b = pairs[:, 0], pairs[:, 1]
     gap = end[b] - end[a]
     gap_m = np.linalg.norm(gap, axis=1)
-    limit_m = np.where(dashed[a] & dashed[b], options.max_dash_gap_m, options.max_break_m)
+    limit_m = np.where(dashed[a] & dashed[b], _MAX_DASH_GAP_M, _MAX_BREAK_M)
     leaving = angle_between(outward[a], gap)
     arriving = angle_between(gap, -outward[b])
     # The chord of an arc meets both tangents at one angle.
@@ -198,8 +197,8 @@ _FIRST, _LAST = 0, 1
 _DIRECTION_LENGTH_M = 5.0  # a bridge leaves a piece in about the direction of so much of its end
 
 
-def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> list[Path]:
-    """The paths, those joined that ``options.min_images`` images saw as one line, shortest gaps first."""
+def bridge_paths(paths: list[Path], guides: Guides, least_images: int) -> list[Path]:
+    """The paths, those joined that ``least_images`` images saw as one line, shortest gaps first."""
     if not len(guides.points_map):
         return paths
     tree = cKDTree(guides.points_map)
@@ -208,7 +207,7 @@ def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> lis
         bridged = False
         for a, end_a, b, end_b in _gaps(np.stack([_ends(path) for path in paths])).tolist():
             before, after = paths[a].turned(end_a == _FIRST), paths[b].turned(end_b == _LAST)
-            between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, options)
+            between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, least_images)
             if between is not None:
                 points = np.concatenate([before.points_map, between, after.points_map])
                 rest = [path for k, path in enumerate(paths) if k not in (a, b)]
@@ -246,17 +245,17 @@ def _end_direction(points: FloatArray) -> FloatArray:
 
 
 def _course_between(
-    start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, options: LaneOptions
+    start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, least_images: int
 ) -> FloatArray | None:
     """Vertices (N, 2) between two ends, where the lines seen run; None unless enough images saw one."""
     first, last = (np.unique(guides.line[tree.query_ball_point(end, _PASSES_M)]) for end in (start, stop))
     common = np.intersect1d(first, last)
-    if len(np.unique(guides.image_of_line[common])) < options.min_images:
+    if len(np.unique(guides.image_of_line[common])) < least_images:
         return None
     gap = stop - start
     gap_m = float(np.linalg.norm(gap))
     ahead = gap / gap_m
-    count = max(int(np.ceil(gap_m / options.node_spacing_m)), 1)
+    count = max(int(np.ceil(gap_m / NODE_SPACING_M)), 1)
     at = np.linspace(0.0, gap_m, count + 1)
     courses = []
     for line in common:
@@ -276,21 +275,18 @@ _LEAST_LENGTH_M = 6.0
 
 
 def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
-    """Polylines along the lane paint of ``cloud``, vertices ``options.node_spacing_m`` apart.
-
-    Dashes of one line become one lane of kind ``lane_dash`` that runs on across their gaps.
-    """
+    """Polylines along the lane paint, vertices half a metre apart; dashes of a line are one lane."""
     if len(cloud.points_map) < 2:
         return ()
-    paths = join_paths(string_nodes(find_nodes(cloud, options), options), options)
+    paths = join_paths(string_nodes(find_nodes(cloud, options.min_images)))
     return tuple(
         Lane(
             LANE_DASH if path.dash > 0.5 else LANE_LINE,
-            _resample(path.points_map, options.node_spacing_m),
+            _resample(path.points_map, NODE_SPACING_M),
             round(path.images),
         )
-        for path in bridge_paths(paths, cloud.guides, options)
-        if path.length_m >= options.min_length_m
+        for path in bridge_paths(paths, cloud.guides, options.min_images)
+        if path.length_m >= _LEAST_PIECE_M
         and path.length_m * path.images >= _LEAST_LENGTH_M * options.min_images
     )
 

@@ -27,8 +27,7 @@ from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 
-Grey = Callable[[int], NDArray[np.float32]]
-"""The grey values (H, W) of an image, by its number in the drive."""
+Grey = Callable[[int], NDArray[np.float32]]  # the grey values (H, W) of an image, by its number in the drive
 
 _INSIDE = np.linspace(0.2, 0.8, 7)
 """Where along either side an outline's inside is sampled: off its edges, which a pose's error blurs."""
@@ -39,11 +38,9 @@ _MOST_LEARNED = 40  # markings of a drive that its paint and its ground are lear
 _ASIDE_M = 1.3  # how far beside a marking bare ground is looked for, m
 _CLEAR_M = 1.0  # distance from all known paint that makes ground bare, m
 _LEAST_LEARNED = 8  # places from which the drive's own paint or ground is known; with fewer nothing is said
-_HIDDEN_SIGMA = 0.5
-"""Sigma of the contrast, log ratio of grey values, of whatever else stands before the ground."""
+_HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of whatever else hides the ground
 
-_HIDDEN_SHARE = 0.5
-"""Share of the markings which are there and not found that are hidden; the others are worn."""
+_HIDDEN_SHARE = 0.5  # share of the markings there and not found that are hidden; the others are worn
 
 _STRANGE_SHARE = 0.05  # share of bare places that are not: a stain, the edge of a shadow
 _LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
@@ -87,10 +84,7 @@ def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 def learn_paint(
     observer: Observer, markings: Sequence[Marking], paint_map: FloatArray
 ) -> Mapping[str, Paint]:
-    """By class the contrast of paint and of bare ground in a drive; classes of too few markings are left out.
-
-    ``markings`` are of the drive's own map; ``paint_map`` (N, 2) are places where there is, or was, paint.
-    """
+    """By class, of enough markings, the contrast of paint, at ``paint_map`` (N, 2), and of bare ground."""
     out = {}
     paint = cKDTree(paint_map)
     for kind in sorted({one.kind for one in markings}):
@@ -121,12 +115,10 @@ def _robust(values: FloatArray) -> tuple[float, float]:
 _MOST_SQUARED = 25.0
 """Squared distance of a sighting's corners from a place, in sigmas, up to which it shows what is there."""
 
-_NEAR_M = 12.0
-"""Distance from the camera, m, within which markings are found at about one rate, as those of a map say."""
+_NEAR_M = 12.0  # distance from the camera, m, within which markings are found at about one rate
 
 _SAME_PLACE_M = 0.05  # a marking that has one of its class nearer than this is there, m
-_REACH_M = 2.0
-"""How far the middle of a sighting may be from a place's centre, m: of a dash one may see an end only."""
+_REACH_M = 2.0  # how far a sighting's middle may be from a place's centre, m: one may see a dash's end only
 
 
 @dataclass(frozen=True)
@@ -144,11 +136,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Observer:
-    """The observations of a drive: its ``sightings``, images and cameras, under a ``rig``.
-
-    ``jitter_rad`` is how far the attitude of a pose is off. ``grey`` gives its images, None where they are
-    not to be had.
-    """
+    """The observations of a drive under a ``rig``; ``grey`` gives its images, None if not to be had."""
 
     sightings: Sightings
     views: Views

@@ -1,12 +1,10 @@
 r"""The errors that markings of a map share, how two maps therefore lie to each other, and lines carried over.
 
-A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of
-the receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the
-ground with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markings at the distance d. So the
-markings that two maps have in common tell how the maps are shifted against each other, everywhere near to
-them; and averaging many markings does not average away what they share.
-
-Lane lines and symbols of an earlier map stay where the new drive has none.
+Beside its own error a corner has one that it shares with its surroundings: the receiver's drift, which fades
+along the route, and a survey's. It is a Gaussian process over the ground with the covariance :math:`\sigma_a
+\sigma_b \exp(-d / l)` for two markings at the distance d: common markings tell how two maps are shifted near
+to them, and averaging many does not average it away. Lane lines and symbols of an earlier map stay where the
+new drive has none.
 """
 
 from __future__ import annotations
@@ -21,27 +19,21 @@ from scipy.spatial import cKDTree
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
-_UNKNOWN_SIGMA_M = 0.02
-"""Sigma of a corner of a map that states none, m a coordinate: a marking drawn by hand over an image."""
+_UNKNOWN_SIGMA_M = 0.02  # sigma of a corner whose map states none, m a coordinate: drawn over an image
 
 _LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
 
-SHIFT = np.tile(np.eye(2), (4, 1))
-"""How the stacked corners (8,) move with a shift (2,)."""
+SHIFT = np.tile(np.eye(2), (4, 1))  # how the stacked corners (8,) move with a shift (2,)
 
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors of M markings, taken apart.
+    """The errors of M markings, taken apart."""
 
-    ``centres_map`` (M, 2), m; ``own_m2`` (M, 8, 8) covariances of each marking's own errors; ``shared_m2``
-    (M,) variances, a coordinate, of the shift that it shares with its surroundings, over about ``over_m``, m.
-    """
-
-    centres_map: FloatArray
-    own_m2: FloatArray
-    shared_m2: FloatArray
-    over_m: float
+    centres_map: FloatArray  # (M, 2) m
+    own_m2: FloatArray  # (M, 8, 8) of each marking's own errors
+    shared_m2: FloatArray  # (M,) a coordinate, of the shift shared with its surroundings
+    over_m: float  # how far that is shared
 
     @classmethod
     def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
@@ -86,18 +78,14 @@ def _positive(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Shift:
-    """How a new map lies to an old one, by P pairs of markings that both have.
-
-    ``old`` and ``new`` (P,) are the pairs' markings; ``off_map`` (P, 2) how far the new one is from the old,
-    of the covariance ``noise_m2`` (P, 2, 2) by their own errors.
-    """
+    """How a new map lies to an old one, by P pairs of markings that both have."""
 
     of_old: Errors
     of_new: Errors
-    old: IntArray
-    new: IntArray
-    off_map: FloatArray
-    noise_m2: FloatArray
+    old: IntArray  # (P,)
+    new: IntArray  # (P,)
+    off_map: FloatArray  # (P, 2) of the new one from the old
+    noise_m2: FloatArray  # (P, 2, 2) of that, by their own errors
 
     @cached_property
     def _inverse(self) -> FloatArray:
@@ -114,11 +102,7 @@ class Shift:
         return np.asarray((self._inverse @ self.off_map.ravel()).reshape(-1, 2))
 
     def without_itself(self, pair: int) -> tuple[FloatArray, FloatArray]:
-        """Mean (2,) and covariance (2, 2) of the maps' shift at a pair, by all other pairs.
-
-        Leave-one-out prediction of a Gaussian process (Rasmussen and Williams, Gaussian Processes for Machine
-        Learning, section 5.4.2).
-        """
+        """Mean (2,) and covariance (2, 2) of the shift at a pair, by all others (leave one out)."""
         own = slice(2 * pair, 2 * pair + 2)
         spread = np.linalg.inv(self._inverse[own, own])
         mean = self.off_map[pair] - spread @ self._weighed[pair]
@@ -163,8 +147,7 @@ class Shift:
         return gain @ self._weighed.ravel(), (covariance + covariance.T) / 2
 
 
-_SAME_LINE_M = 0.3
-"""Distance of two maps' lines up to which they are one, m: two lines side by side lie twice as far apart."""
+_SAME_LINE_M = 0.3  # distance up to which two maps' lines are one, m: two side by side are twice as far
 
 _LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier line, from which it is that line
 
@@ -172,10 +155,7 @@ _LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier lin
 def updated_lanes(
     old: Sequence[Lane], new: Sequence[Lane], shift: Shift, number: Callable[[], int]
 ) -> tuple[Lane, ...]:
-    """The lines of both maps: an earlier one keeps its id, and its course where the new drive has none of it.
-
-    ``shift`` is how the maps lie to each other; ``number`` gives a fresh id.
-    """
+    """The lines of both maps: an earlier one keeps its id, and its course where the new drive has none."""
     before = [replace(one, points_map=_moved(one.points_map, shift, of_old=True)) for one in old]
     pieces: list[list[Lane]] = [[] for _ in before]
     added = []

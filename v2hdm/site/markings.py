@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import beta, f
 
 from v2hdm.errors import MappingError
-from v2hdm.records import FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Candidates, Counts, Exclusion, variance_prior
+from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
+from v2hdm.site.candidates import Candidates, Counts, variance_prior
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -37,10 +37,7 @@ _CLUTTER_BY = (
 
 @dataclass(frozen=True)
 class Classified:
-    """G candidates, and of each the reason why it is no marking of the map, None if it is one.
-
-    ``misfit`` (G,) is that of the posterior.
-    """
+    """G candidates, the reason why each is no marking of the map, if so, and the posterior's misfit (G,)."""
 
     kind: tuple[str, ...]
     candidates: Candidates
@@ -54,11 +51,7 @@ class Classified:
         return np.flatnonzero([reason is None for reason in self.verdict])
 
     def markings(self) -> tuple[Marking, ...]:
-        """The markings of the map, one for each accepted candidate.
-
-        Raises:
-            MappingError: there is none.
-        """
+        """The markings of the map, one for each accepted candidate; MappingError where there is none."""
         if not len(self.accepted):
             reasons = [exclusion.reason for exclusion in self.exclusions()]
             commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
@@ -100,10 +93,10 @@ def classify(
     parallax: Parallax,
     options: AcceptanceOptions,
 ) -> Classified:
-    """Decide which of the ``solved`` candidates are markings of the map, and where their corners are.
+    """Decide which ``solved`` candidates are markings of the map, and where their corners are.
 
-    They are of the classes ``kind`` (G,), by their place in ``kinds``; ``counted`` says how often candidates
-    of corners (G, 4, 2) were seen, and ``parallax`` which of them lie on the ground.
+    Of classes ``kind`` (G,) in ``kinds``; ``counted`` says how often they were seen, ``parallax`` whether on
+    the ground.
     """
     first = posterior(solved, kind, counted(np.where(solved.known[..., None], solved.corners_map, np.nan)))
     names, number = [kinds[one] for one in kind], kind.copy()
@@ -158,8 +151,7 @@ def _covered(found: Posterior, standing: IntArray) -> IntArray:
 JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""
 
-_NEIGHBOUR_M = 10.0
-"""How far apart markings are compared, m: about a vehicle's length, over which it manoeuvres."""
+_NEIGHBOUR_M = 10.0  # how far apart markings are compared, m: a vehicle's length, over which it manoeuvres
 
 _FARTHEST_M = 15.0  # a marking without another one within so many metres has no relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
@@ -170,9 +162,8 @@ def with_relative_sigma(
 ) -> tuple[Marking, ...]:
     """The markings (M,) with what each contributes to the error of the distance to one about 10 m away.
 
-    To the errors of the adjustment comes what the marking's own covariance has beyond it: an error of its
-    paint, which it shares with no other. ``corner_index`` (M, 4) numbers their corners in the solution, -1
-    for one that was not seen; ``joint`` is of corners of the solution.
+    To the errors of the adjustment comes that of its own paint. ``corner_index`` (M, 4) numbers their corners
+    in the solution, -1 for one that was not seen; ``joint`` is of these.
     """
     seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
     if not len(seen):
@@ -216,18 +207,13 @@ _LISTED = 10  # markings that are listed: as many as a user looks at
 
 @dataclass(frozen=True)
 class Suspicion:
-    """How unlikely the marking of id ``marking`` is, were it like the others of its class.
-
-    P-values: ``p_shape`` of how far it is from the shape of its class under the posterior predictive (1 where
-    the class has none), ``p_residuals`` of its accepted observations, ``p_sightings`` of the share
-    ``disputed`` of its observations that the joint solution rejected.
-    """
+    """How unlikely the marking of an id is, by p-values, were it like the others of its class."""
 
     marking: int
-    p_shape: float
-    p_residuals: float
-    p_sightings: float
-    disputed: float
+    p_shape: float  # under the posterior predictive, 1 for a class without shape
+    p_residuals: float  # of its accepted observations
+    p_sightings: float  # of the share ``disputed``
+    disputed: float  # of its observations that the joint solution rejected
 
     @property
     def p(self) -> float:
@@ -238,10 +224,7 @@ class Suspicion:
 def most_suspicious(
     accepted: IntArray, misfit: FloatArray, squared: FloatArray, counts: Counts
 ) -> Sequence[Suspicion]:
-    """The most suspicious of the ``accepted`` (M,) of G candidates, the worst first.
-
-    ``misfit`` (G,) are p-values of shapes, ``squared`` (G,) the sums of squared residuals, in sigmas.
-    """
+    """The most suspicious of the ``accepted`` (M,), the worst first, by p-values of shapes and residuals."""
     seen, agreed = counts.observations[accepted], counts.agreeing[accepted]
     freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two an observation, less those of four corners
     # Beside its freedom a variance has an inverse-gamma prior, so that it follows Fisher's F distribution.

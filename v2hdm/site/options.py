@@ -22,8 +22,7 @@ class AcceptanceOptions:
     corrections: list[Correction] = field(default_factory=list)
 
 
-AFTER, JOINT = "after", "joint"
-"""Values of ``mapping.lanes.model``."""
+AFTER, JOINT = "after", "joint"  # values of ``mapping.lanes.model``
 
 
 @dataclass(kw_only=True)
@@ -32,19 +31,9 @@ class LaneOptions:
 
     ``model`` is ``after``: lanes are drawn under the finished adjustment; or ``joint``: they take part in it
     as cubic splines, and each vertex states its sigma.
-    ``max_range_m`` from the camera; ``node_spacing_m`` between the vertices of a polyline;
-    ``half_width_m`` across and ``half_length_m`` along bound the neighbourhood that is averaged;
-    ``max_dash_gap_m`` is the longest gap between two dashes of one line and ``max_break_m`` the
-    longest break in solid paint that is bridged. A piece needs ``min_length_m`` and, at each
-    vertex, ``min_images``.
+    Paint counts up to ``max_range_m`` from the camera, and a vertex needs ``min_images`` that show it.
     """
 
     model: str = AFTER
     max_range_m: float = 12.0
-    node_spacing_m: float = 0.5
-    half_width_m: float = 0.3
-    half_length_m: float = 0.8
-    max_dash_gap_m: float = 9.0
-    max_break_m: float = 3.0
-    min_length_m: float = 2.0
     min_images: int = 3

@@ -1,10 +1,9 @@
 """Whether candidates lie on the ground: how much nearer they come as the vehicle goes on.
 
-Laid on the ground, a point of the ground comes nearer by as much as the vehicle moves. A point half as high
-as the camera (one metre up, for a camera two metres up) seems to come twice as much nearer, one that moves
-along with the vehicle, or belongs to it, not at all. With the camera at c, the ray from below it to where a
-point is seen on the ground is r = a - s c, and s = 1 on the ground. Images tell s as far as the vehicle has
-moved between them: a standing one tells nothing.
+Laid on the ground, a point of the ground comes nearer by as much as the vehicle moves, one half as high as
+the camera by twice as much, one that moves along with the vehicle not at all. With the camera at c, the ray
+from below it to where a point is seen on the ground is r = a - s c, and s = 1 on the ground. Images tell s as
+far as the vehicle has moved between them.
 """
 
 from __future__ import annotations
@@ -27,11 +26,9 @@ NOT_ON_GROUND = "stands above the ground, or moves"
 _ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
 """Mean and sigma of s of what is no marking: half as high as the camera, or moving along with the vehicle."""
 
-_UNEVEN = 0.1
-"""Sigma of s on the ground: a bump of a tenth of the camera's height, or edges fitted worse from afar."""
+_UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poorer fits from afar
 
-_ONE_VIEW_M = 0.1
-"""Way, m, within which images show one view, so that they err alike: the same texture lies along an edge."""
+_ONE_VIEW_M = 0.1  # way, m, within which images show one view and err alike: the same texture by an edge
 
 _POSE_SIGMAS = 4.0  # how far apart, in sigmas, the recorded positions of one place may be
 _LEVEL_RAD = 1e-5  # sigma, rad, of the attitude where it is taken for exact
@@ -42,21 +39,16 @@ _ANY_SLOPE = 10.0  # sigma of s before any image: nothing comes nearer much fast
 
 @dataclass(frozen=True)
 class PointViews:
-    """N sightings of P points each, by sighting: which of G candidates, by which camera, and from where.
+    """N sightings of P points each, by sighting."""
 
-    ``points_map`` (N, P, 2), m, on the ground have the covariances ``covariance_m2`` (N, P, 2, 2) beside what
-    the errors ``pose_sigma`` (N, 6) of the poses do to them; ``ray_map`` (N, P, 2) leads there from below the
-    camera, which is ``height_m`` (N,) up. Of points that are not ``used`` (N, P) nothing counts.
-    """
-
-    group: IntArray
+    group: IntArray  # (N,) of the candidate
     camera: IntArray
-    points_map: FloatArray
-    ray_map: FloatArray
-    covariance_m2: FloatArray
-    used: BoolArray
-    height_m: FloatArray
-    pose_sigma: FloatArray
+    points_map: FloatArray  # (N, P, 2) m, on the ground
+    ray_map: FloatArray  # (N, P, 2) there from below the camera
+    covariance_m2: FloatArray  # (N, P, 2, 2) beside that of poses
+    used: BoolArray  # (N, P) else nothing counts
+    height_m: FloatArray  # (N,) of the camera
+    pose_sigma: FloatArray  # (N, 6) of the poses' errors
 
     @classmethod
     def of_corners(
@@ -67,10 +59,7 @@ class PointViews:
         variance_factor: float,
         pose_sigma: Sequence[PoseSigma],
     ) -> PointViews:
-        """The corners that ``located`` says are informative; ``pose_sigma`` is of each visit.
-
-        Their covariances are ``variance_factor`` times as stated.
-        """
+        """The corners that ``located`` says are informative, covariances ``variance_factor`` times."""
         used = association.in_group_order(located.informs)
         rows = np.flatnonzero((association.group >= 0) & used.any(axis=1))
         corners, rays, covariance = (
@@ -92,10 +81,7 @@ class PointViews:
 
 @dataclass(frozen=True)
 class Parallax:
-    """How G candidates seem to move: ``slope`` (G, P) is s of each point, 1 on the ground.
-
-    Its covariance is ``covariance`` (G, P, P).
-    """
+    """How G candidates seem to move: ``slope`` (G, P), s of each point, 1 on the ground, and covariance."""
 
     slope: FloatArray
     covariance: FloatArray
@@ -122,8 +108,7 @@ class Parallax:
 def measure_parallax(views: PointViews, count: int) -> Parallax:
     """Estimate s of the points of each of ``count`` candidates by weighted least squares.
 
-    Beside it, where they lie and a roll and pitch that is wrong in all images alike are unknown.
-    Residuals larger than stated make s less certain.
+    Where they lie, and a roll and pitch that is wrong in all images alike, are unknown, too.
     """
     group, used, each = views.group, views.used, views.used.shape[1]
     total, slopes = 2 * each, slice(2 * each, 3 * each)
@@ -182,10 +167,7 @@ def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatAr
 
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
-    """Derivative (N, P, 2, 6) of ground points at the ends of rays (N, P, 2) by the states of a pose.
-
-    The order is that of :data:`v2hdm.adjust.POSE_STATES`; rotations are about the camera and the map's axes.
-    """
+    """Derivative (N, P, 2, 6) of ground points at the ends of rays (N, P, 2), by :data:`POSE_STATES`."""
     x, y = ray[..., 0], ray[..., 1]
     one, none, h = np.ones_like(x), np.zeros_like(x), np.broadcast_to(height_m[:, None], x.shape)
     columns = (
@@ -200,11 +182,7 @@ def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
 
 
 def _views(views: PointViews, centre: FloatArray) -> tuple[IntArray, IntArray]:
-    """The view (N,) of each sighting, by number, and how many images each view has.
-
-    A camera's images of a candidate are one view until the camera, at ``centre`` (N, 2), has moved on by more
-    than :data:`_ONE_VIEW_M` and what the poses may be off.
-    """
+    """The view (N,) of each sighting, and images of each: one until the camera (N, 2) has moved on enough."""
     reach_m = _ONE_VIEW_M + _POSE_SIGMAS * views.pose_sigma[:, 0]
     begun: dict[tuple[int, int], int] = {}
     first: list[int] = []

@@ -41,11 +41,9 @@ _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 
 _KINDS = len(_PRIOR_COUNT)
 
-_SIZE_SIGMA_M = 1.0
-"""Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
+_SIZE_SIGMA_M = 1.0  # sigma of a side, m, of a marking of its own size: any paint on a road is within it
 
-_LENGTH_SIGMA_M = 0.3
-"""Sigma, m, of the length of paint rolled by the metre, before the drive says: a tenth of a dash's."""
+_LENGTH_SIGMA_M = 0.3  # sigma, m, of the length of paint by the metre before the drive says: a tenth of it
 
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
@@ -62,20 +60,15 @@ _SERIES_TURN_RAD, _SERIES_BESIDE_M = 1.0, 0.5
 """Most that a line turns by from one dash to the next, a bend of 6 m radius where they are 6 m apart, and how
 far at most they lie beside an arc between them: lines are farther apart."""
 
-_SERIES_UNEVEN = (
-    0.2  # share by which the distances to the dash before and to the next differ where none lacks
-)
+_SERIES_UNEVEN = 0.2  # share by which the ways to the dash before and to the next differ where none lacks
 _SERIES_STRETCH = 1.5  # most by which a bend stretches or shrinks a line: 4 m beside a middle of 12 m radius
 _SERIES_LEAST = 3  # dashes of their class's length that others follow: enough for a median
 
-_MISPLACED_M = 0.3
-"""Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
+_MISPLACED_M = 0.3  # sigma, m, of a worn end or a corner from another edge (17 worn ends: .08 to .74 m)
 
-_WORN_SHARE = 0.5
-"""The same as a share of the length, where a whole stretch is worn away: any part of a marking may be."""
+_WORN_SHARE = 0.5  # the same as a share of the length, where a stretch is worn away: any part may be
 
-_CUT_SHARE = 0.1
-"""Share of the breadth, one sigma, by which a corner of a piece lies off its sides: cuts are not parallel."""
+_CUT_SHARE = 0.1  # share of the breadth, sigma, by which a corner of a piece lies off its sides: cuts slant
 
 _RUN_ON_M = 1.0  # sigma, m, of an end that runs on into other paint: letters and lines are about as long
 
@@ -92,11 +85,9 @@ _BARE_FOUND = (0.05, 10.0)
 
 _CLUTTER_REPEATS = 0.7  # probability that clutter which some images have shown is shown by one more
 
-_AGREEING = (0.93, 0.6)
-"""Share of the observations of a marking, and of clutter, that agree with the joint solution."""
+_AGREEING = (0.93, 0.6)  # share of the observations of a marking, and of clutter, that agree with the solve
 
-CORNERS_OF_IMAGE = 4.0
-"""Observations that err together: those of one image."""
+CORNERS_OF_IMAGE = 4.0  # observations that err together: those of one image
 
 _UNDER_SYMBOL = (0.02, 0.5)
 """Share of the images of a marking, and of part of a symbol, in which a symbol lies on it.
@@ -109,8 +100,7 @@ _ODDS, _ODDS_SIGMA, _ODDS_FREEDOM = (5.0, 2.5), 1.2, 4.0
 port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members' about it (1.0 of the
 diamonds) and their degrees of freedom in Student's t distribution, since worn ones are among them."""
 
-_OTHER_ODDS = (1.5, 1.5)
-"""Mean and sigma of the same of anything else (fourteen candidates of a rendered port)."""
+_OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same of anything else (14 candidates of a rendered port)
 
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
@@ -130,19 +120,13 @@ _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECO
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of G candidates.
+    """The posterior of G candidates."""
 
-    ``probability`` (G, 8) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
-    of a marking. ``evidence`` (G, 5) speaks for a marking and against clutter, in nats: the shape, how many
-    images show it, how many of its easy views, how well they agree, and how it looks to the detector.
-    ``misfit`` (G,) is the p-value of its deviation from its class's nearest shape, 1 if the class has none.
-    """
-
-    probability: FloatArray
-    log_odds: FloatArray
-    candidates: Candidates
-    evidence: FloatArray
-    misfit: FloatArray
+    probability: FloatArray  # (G, 8) of each kind
+    log_odds: FloatArray  # (G,) of being a marking
+    candidates: Candidates  # with the corners of a marking
+    evidence: FloatArray  # (G, 5) nats for a marking: shape, images, easy views, agreement, look
+    misfit: FloatArray  # (G,) p-value of the deviation from its class's nearest shape, 1 without
 
 
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
@@ -230,10 +214,7 @@ def _geometric(images: IntArray, stay: float) -> FloatArray:
 
 
 def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
-    """Log likelihood (N,) that markings are ``found`` (N,) times in so many ``easy_views`` (N,).
-
-    ``rate`` is that of their class. Some are worn or hidden, and are found at any rate.
-    """
+    """Log likelihood (N,) of ``found`` (N,) in ``easy_views`` (N,), by the class's ``rate`` or any rate."""
     usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
     neglected = _rates(found, easy_views, 1.0, 1.0)
     both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
@@ -253,24 +234,18 @@ def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) ->
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One hypothesis on N ``candidates``.
-
-    In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
-    laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced`` (..., 8,
-    8), only along each of the K columns of ``one_way`` (N, 8, K) if given: paint wears inwards, and runs on
-    outwards. ``beside`` (N,) is the log likelihood of what else is known of them.
-    """
+    """One hypothesis on N candidates."""
 
     kind: int
     log_prior: float
     candidates: Candidates
-    directions: FloatArray
-    residual: FloatArray
-    scatter: FloatArray
-    misplaced: FloatArray
+    directions: FloatArray  # (N, 5, 8) in which deviations count
+    residual: FloatArray  # (N, 5) from where a shape was laid
+    scatter: FloatArray  # (..., 8, 8) of painted corners
+    misplaced: FloatArray  # (..., 8, 8) by all images
     paint_m2: float
-    one_way: FloatArray | None
-    beside: FloatArray | float
+    one_way: FloatArray | None  # (N, 8, K) or only along these: paint wears inwards
+    beside: FloatArray | float  # (N,) log likelihood of what else is known
 
     @cached_property
     def formal(self) -> FloatArray:
@@ -356,8 +331,8 @@ def _hypotheses(
 ) -> list[_Hypothesis]:
     """All that N candidates may be, given the shapes of their class.
 
-    ``weight`` and ``other_length`` (N,) are the probabilities so far of being a marking, and one of another
-    length; ``vague`` (N, 4) is the log likelihood ratio of views that do not agree on a corner's place.
+    ``weight`` and ``other_length`` (N,) are probabilities of being a marking, and of another length;
+    ``vague`` (N, 4) the log likelihood ratio of views that disagree on a corner.
     """
     space = _Space(candidates, share, paint)
     total, ragged = sum(shape.share for shape in shapes), np.zeros(len(candidates))
@@ -375,18 +350,9 @@ def _hypotheses(
 
 
 def _add_shape(
-    space: _Space,
-    shape: Shape,
-    part: float,
-    weight: FloatArray,
-    other_length: FloatArray,
-    vague: FloatArray,
+    space: _Space, shape: Shape, part: float, weight: FloatArray, other_length: FloatArray, vague: FloatArray
 ) -> FloatArray:
-    """Add the hypotheses of one shape of the class, a ``part`` of it; arguments as for :func:`_hypotheses`.
-
-    Returns:
-        The log likelihood (N,) that what is no marking has ends as ragged as these.
-    """
+    """Add the hypotheses of one shape, a ``part`` of the class; log likelihood (N,) of as ragged clutter."""
     candidates, share = space.candidates, space.share
     laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
     scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
@@ -464,8 +430,8 @@ def _worn_evidence(
 ) -> list[FloatArray]:
     """Log likelihood ratios (N,) that an end is worn rather than sound, by how far images disagree on it.
 
-    ``ends`` (N, 8) are motions inwards of two corners by 1 m each, in opposite pairs; what moves a pair alike
-    shifts the whole marking and does not count. ``weight`` (N,) says who is a marking.
+    ``ends`` (N, 8) move two corners by 1 m inwards, in opposite pairs, of which what both share does not
+    count.
     """
     whole = candidates.known.all(axis=1)
     variance = [
@@ -480,11 +446,7 @@ def _worn_evidence(
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on its place.
-
-    They are as few for a sound one as for all corners of markings; for every second worn or hidden one any
-    share of them is as likely.
-    """
+    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on it."""
     found = np.maximum(counts.found[:, None], counts.pointed)
     vague = found - counts.pointed
     rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
@@ -544,11 +506,10 @@ def _in_series(
 def _other_lengths(
     candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Sigma, m, of other lengths, and the log likelihood ratio (N,) of one as others have it.
+    """Sigma, m, of other lengths, and the log likelihood ratio (N,) of one as others have it, to its own.
 
-    That is beside a length of its own: of paint that has another length with the probabilities ``weight``
-    (N,) each may be repeated (a Dirichlet process). ``shorter`` (N, 8) moves corners so that paint gets
-    shorter by 1 m.
+    Paint of another length, by ``weight`` (N,), may be repeated (a Dirichlet process); ``shorter`` (N, 8)
+    shortens it by 1 m.
     """
     off_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     own_m2 = _along(candidates.covariance_m2, shorter, shorter)

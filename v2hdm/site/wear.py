@@ -1,11 +1,10 @@
 """How much of its paint each marking has left, as the nearest images show it.
 
-An image is decoded to linear light, in which a pixel half on paint and half on ground lies half way, and
-divided by the ground beside the marking, so that neither exposure nor light matters. A cell may be lit as the
-ground of either side: the edge of a shadow often lies across a marking. Only images that show all corners of
-a marking count, and each cell takes their median. The cells are then explained as a mixture of full paint,
-bare ground and cells part of each; how bright full paint is over its ground is the marking's own, with a
-prior from all markings of its class: dirt dims paint that is whole.
+An image is decoded to linear light, in which a pixel half on paint lies half way, and divided by the ground
+beside the marking; a cell may be lit as either side's, as the edge of a shadow often lies across. Each cell
+takes the median of the images that show all corners. The cells are then a mixture of full paint, bare ground
+and cells part of each; how bright full paint is over its ground is the marking's own, with a prior from all
+of its class: dirt dims paint that is whole.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ _VIEWS = (2, 6)  # fewest and most images of a marking: the errors of more repea
 _GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
 """Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
 
-_INDEPENDENT = 12.0
-"""Cells that count as independent: flakes, stains and the blur of images span many."""
+_INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the blur of images span many
 
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
 _ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
@@ -78,11 +76,7 @@ class Cells:
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
     def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit the cells by each of :data:`_CONTRASTS`, were it that of full paint.
-
-        Returns the log likelihoods, the shares of paint, and the sigmas of these for want of knowing which
-        cells are paint, and for images that disagree.
-        """
+        """Log likelihoods by contrast, shares of paint, and these ones' sigmas by cells and images."""
         every = np.clip(np.median(self.contrasts, axis=0).reshape(3, -1), -0.5, 4.0)
         cells = every[:, None, :: -(-every.shape[1] // _FITTED)]
         paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
@@ -119,10 +113,8 @@ def with_wear(
     """``hd_map`` with the share of paint that each marking has left, where two images or more show it near.
 
     ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W),
-    ``shown`` are the pairs of an image's index and a marking's that nothing hides there, ``surface`` the
-    ground where it is no plane.
-    A marking that the ``earlier`` map has, by its id, states the change, and keeps what that says where this
-    drive did not look.
+    ``shown`` are the pairs of an image's index and a marking's that nothing hides there. A marking that the
+    ``earlier`` map has, by its id, states the change, and keeps what that says where this drive did not look.
     """
     cells = [Cells.of(one.corners_map) for one in hd_map.markings]
     ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))

@@ -4,6 +4,8 @@ An entry is a file, ``<cache>/stages/<stage>/<key>.v2hdm``, written whole or not
 checksum whenever it is read: a damaged one counts as absent. Its time of change is that of its last use.
 Several processes, on several machines, may share a cache. Its bytes hold no name of a class or function: the
 type that the reader asks for decides what they become, so that nothing in a file can choose code to run.
+
+Of what is ours in a cache folder, and not in use, that which was unused for longest goes first.
 """
 
 from __future__ import annotations
@@ -12,20 +14,23 @@ import hashlib
 import logging
 import os
 import platform
+import re
 import secrets
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
 import numpy as np
 
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, need
 from v2hdm.store.files import file_digest
-from v2hdm.store.lock import HOST, STAGES, in_use
+from v2hdm.store.folders import LIST, is_stale, remove_ours, size_of
+from v2hdm.store.lock import HOST, STAGES, in_use, unused_before
 
 _log = logging.getLogger(__name__)
 _Value = TypeVar("_Value")
@@ -51,19 +56,13 @@ class CodecError(ValueError):
 
 
 def encode(value: Any) -> bytes:
-    """The bytes of dataclasses, enumerations, paths, numpy arrays and plain values.
-
-    Equal values of one type and order have equal bytes. Raises TypeError for what cannot be kept.
-    """
+    """The bytes of dataclasses, enumerations, paths, numpy arrays, plain values; TypeError for others."""
     data: bytes = _encoder().encode(value)
     return data
 
 
 def decode(data: bytes, kind: type[_Value]) -> _Value:
-    """The value of type ``kind`` that :func:`encode` made ``data`` of; arrays are laid out row by row.
-
-    Raises CodecError where the bytes are of no such value.
-    """
+    """The value of type ``kind`` that :func:`encode` made ``data`` of; CodecError where it is none."""
     codec = _codec()
     try:
         value: _Value = codec.msgpack.decode(data, type=kind, dec_hook=_special)
@@ -187,10 +186,7 @@ class StageCache:
     def put(
         self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[Line] | None = None
     ) -> _Value:
-        """Keep ``value`` under ``key`` and return it as :meth:`get` will.
-
-        Where nothing can be written, a warning says so, once.
-        """
+        """Keep ``value`` under ``key`` and return it as :meth:`get` will; a warning where it cannot."""
         content, path = encode(value), self.path(stage, key)
         partial = path.with_name(f".{HOST}-{secrets.token_hex(8)}.part")
         try:
@@ -242,3 +238,73 @@ def recorded() -> Iterator[list[Line]]:
         yield recorder.lines
     finally:
         logger.removeHandler(recorder)
+
+
+_ENTRY = re.compile(rf"[0-9a-f]{{64}}{re.escape(ENDING)}")
+_PARTIAL = re.compile(r"\.[\w.-]+[.-][0-9a-f]{8,16}\.part")
+
+DRIVES = "drives and imports"  # kind of the folders, beside the stages of the entries
+LEFT = "left by killed runs"  # kind of what was never finished
+
+
+@dataclass(frozen=True)
+class Item:
+    """One thing that a cache keeps: its kind, size in bytes, last use (s since 1970), and its end."""
+
+    kind: str
+    path: Path
+    size: int
+    used_s: float
+    remove: Callable[[], None]
+
+
+def items_of(cache: Path) -> list[Item]:
+    """Everything that is ours in a cache, what was not used for longest first."""
+    found = []
+    for path in (cache / STAGES).glob("*/*"):
+        kind = path.parent.name if _ENTRY.fullmatch(path.name) else LEFT
+        if (kind == LEFT and not _PARTIAL.fullmatch(path.name)) or not path.is_file():
+            continue
+        with suppress(OSError):  # another process has removed it
+            about, remove = path.stat(), partial(path.unlink, missing_ok=True)
+            found.append(Item(kind, path, about.st_size, about.st_mtime, remove))
+    for folder in cache.glob(".*.part"):
+        with suppress(OSError):
+            if _PARTIAL.fullmatch(folder.name) and folder.is_dir() and is_stale(folder):
+                left = sum(one.stat().st_size for one in folder.rglob("*"))
+                found.append(Item(LEFT, folder, left, folder.stat().st_mtime, partial(shutil.rmtree, folder)))
+    for listing in cache.glob(f"*/{LIST}"):
+        folder, size = listing.parent, size_of(listing.parent)
+        with suppress(OSError):
+            if size is not None:
+                used_s = listing.stat().st_mtime
+                found.append(Item(DRIVES, folder, size, used_s, partial(remove_ours, folder)))
+    return sorted(found, key=lambda item: (item.used_s, item.path))
+
+
+def prune(cache: Path, limit: float) -> list[Item]:
+    """Remove what was unused for longest until the rest has ``limit`` bytes, and all that killed runs left.
+
+    Returns what was removed. More than the limit stays where runs in progress use it.
+    """
+    before_s, items, removed = unused_before(cache), items_of(cache), []
+    size = sum(item.size for item in items)
+    for item in items:
+        if item.used_s >= before_s or (size <= limit and item.kind != LEFT):
+            continue
+        with suppress(OSError):  # not ours to remove: on a shared folder, another user's
+            item.remove()
+            size -= item.size
+            removed.append(item)
+    return removed
+
+
+def prune_to_limit(cache: Path, limit_gb: float) -> None:
+    """Prune a cache to a limit in GB, and log what went."""
+    removed = prune(cache, limit_gb * 1e9)
+    if removed:
+        size_gb = sum(item.size for item in removed) / 1e9
+        _log.info(
+            "%s: removed %d entries of %.1f GB that were not used for longest (cache_gb=%g)",
+            cache, len(removed), size_gb, limit_gb,
+        )  # fmt: skip

@@ -10,9 +10,12 @@ import csv
 import difflib
 import hashlib
 import io
+import json
+import math
 import re
 import secrets
 import sys
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -89,11 +92,34 @@ def replace_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def xml_text(root: ET.Element, blanks: str = " ", before: str = "") -> str:
+    """An XML file of ``root``, indented by ``blanks`` a level; ``before`` stands in front of it."""
+    ET.indent(root, blanks)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{before}{ET.tostring(root, encoding="unicode")}\n'
+
+
 def replace_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     """Write ``rows`` to ``path`` as CSV, as :func:`whole_file` does."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     replace_text(path, text.getvalue())
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write strict JSON, whole; figures that do not exist (nan) are left out of their object."""
+    replace_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items() if not _is_nan(item)}
+    if isinstance(value, (list, tuple)):
+        return [None if _is_nan(item) else _finite(item) for item in value]
+    return value.item() if hasattr(value, "item") else value
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def file_digest(path: Path) -> str:
@@ -103,11 +129,7 @@ def file_digest(path: Path) -> str:
 
 
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
-    """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.safe.texts.read_yaml`.
-
-    Raises ``error`` when the file is missing, has a syntax error (with its line) or holds anything but a
-    mapping.
-    """
+    """The mapping at the top of a YAML file, whose keys are texts; else raises ``error``, with the line."""
     content = read_yaml(path, error)
     if not isinstance(content, dict):
         raise error(f"{path}: expected 'key: value' entries, got {shown(content)}; see its description")

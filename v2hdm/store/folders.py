@@ -37,10 +37,7 @@ _STALE_S = 3600.0  # a folder that nothing was written to for so long was left b
 
 
 def note_use(folder: Path) -> None:
-    """Record that a folder is in use now, and list what in it is ours where that was never done.
-
-    A folder that cannot be written is used as it is. The folder's cache is in use, too, from now on.
-    """
+    """Note that a folder and its cache are in use now, and list its files where that was never done."""
     use_until_exit(folder.parent)
     with suppress(OSError):
         if (folder / LIST).is_file():
@@ -56,10 +53,7 @@ def size_of(folder: Path) -> int | None:
 
 
 def remove_ours(folder: Path) -> None:
-    """Remove our files from a folder, and the folder where nothing else is in it.
-
-    Those at its top go first: without them it is neither a drive nor an import. Raises OSError.
-    """
+    """Remove our files from a folder, those at its top first, and what is empty then. Raises OSError."""
     for path in sorted(_ours(folder), key=lambda path: (len(path.parts), path)):
         path.unlink(missing_ok=True)
     (folder / LIST).unlink(missing_ok=True)
@@ -122,10 +116,7 @@ def _listed(folder: Path) -> dict[str, Any]:
 
 
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
-    """Where the import of a stream of some source files belongs: named by a hash of all that it is made of.
-
-    Raises DriveError where a source cannot be looked at.
-    """
+    """The folder of an import of some files, by a hash of all that it is made of; DriveError as by stat."""
     try:
         stats = [(file.name, file.stat()) for file in files]
     except OSError as failure:
@@ -151,10 +142,7 @@ def is_whole(folder: Path) -> bool:
 
 @contextmanager
 def new_entry(folder: Path) -> Iterator[Path]:
-    """A hidden folder to fill, which takes the place of the entry ``folder`` when the block succeeds.
-
-    What killed processes have left is removed. Raises DriveError where nothing can be written.
-    """
+    """A hidden folder to fill, which becomes the entry ``folder``, whole; DriveError where it cannot."""
     partial = folder.with_name(f".{folder.name}.{_WRITER}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -59,10 +59,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def warn_if_changed(path: Path, data: bytes) -> None:
-    """Warn, once, of a file of a result that holds other ``data`` than we wrote: edited, or damaged.
-
-    It is read all the same: a map that was corrected by hand is a map.
-    """
+    """Warn, once, of a file of a result that holds other ``data`` than we wrote; it is read all the same."""
     with suppress(OSError, RuntimeError):
         path, digest, written = path.resolve(), hashlib.sha256(data).hexdigest(), set()
         folder = next((one for one in path.parents[:_DEEPEST] if (one / LIST).is_file()), None)

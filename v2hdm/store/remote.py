@@ -19,8 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, need
 from v2hdm.store.files import file_digest
 from v2hdm.store.inputs import LIST
 
@@ -62,10 +61,7 @@ class RemoteFile:
 
 
 class RemoteFolder:
-    """The objects below one URL, by what their names are there.
-
-    Whatever fails raises a :class:`ConfigError` that names the URL; what speaks to the store has tried again.
-    """
+    """The objects below one URL, by their names there; what fails is a :class:`ConfigError` with the URL."""
 
     def __init__(self, files: Any, root: str, url: str, option: str) -> None:
         """``files`` is the file system of fsspec, ``root`` the path of ``url`` there."""
@@ -73,10 +69,7 @@ class RemoteFolder:
 
     @classmethod
     def at(cls, url: str, option: str) -> RemoteFolder:
-        """The objects below a URL.
-
-        Raises ConfigError where it names no store that we know, or what speaks to it is not installed.
-        """
+        """The objects below a URL; ConfigError where it names no store, or its package is missing."""
         protocol, rest = url.split("://", 1)
         if protocol not in _PACKAGES:
             known = ", ".join(f"{one}://" for one in _PACKAGES if one != _MEMORY)
@@ -117,10 +110,7 @@ class RemoteFolder:
         self._put(name, content, "overwrite")
 
     def create(self, name: str, content: bytes | Path) -> bool:
-        """Put an object where there is none of that name; whether there was none.
-
-        Where an earlier try may have worked whose answer was lost, the object there is compared.
-        """
+        """Put an object where there was none of that name, or the same, put by an earlier try; else False."""
         try:
             self._put(name, content, "create")
         except FileExistsError:
@@ -208,11 +198,7 @@ def is_whole_at(place: RemoteFolder) -> bool:
 
 
 def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
-    """Our objects that are at a place where ``writer`` may put a result.
-
-    Raises ConfigError where there are objects and none is ours, one of ours was changed, or another writer
-    has begun to put a result there.
-    """
+    """Our objects at a place where ``writer`` may put a result; ConfigError where it may not."""
     there = place.listed()
     found = {name: _entries(place, name, place.read(name)) for name in (LIST, UNFINISHED) if name in there}
     if there and not found:

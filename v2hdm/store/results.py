@@ -63,10 +63,7 @@ class _Target:
             ) from None
 
     def listed(self, made: str | None = None) -> dict[str, list[str]] | None:
-        """Digests of our files by name, the last one last; None if it is empty, an error if not ours.
-
-        Only of those that were ``made`` so, where that is given; an error where all were made otherwise.
-        """
+        """Digests of our files by name, of those ``made`` so if given; None if empty, else ConfigError."""
         if not self.path.exists() or not any(self.path.iterdir()):
             return None
         if not (self.path / LIST).is_file():
@@ -235,11 +232,7 @@ def _report_dropped(folder: Path, listed: Mapping[str, object], new: Path) -> No
 
 @contextmanager
 def added_to(folder: Path, option: str) -> Iterator[Path]:
-    """A finished result to write further files into, each listed before it is there.
-
-    Raises ConfigError where the folder is no result of ours, a file that is to be replaced in it is not ours,
-    it cannot be written, or another process is writing it.
-    """
+    """A finished result to write further files into, each listed before it is there; else ConfigError."""
     with _locked(folder, option) as there:
         with there.explained():
             if there.listed() is None:
@@ -326,19 +319,13 @@ def _locked(folder: Path, option: str) -> Iterator[_Target]:
 
 @contextmanager
 def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
-    """Where ``folder`` leads, which no other process of ours writes within this block.
-
-    Raises ConfigError where one does already, which it names, or the folder is nothing that can be replaced.
-    """
+    """Where ``folder`` leads, which no other process of ours writes within this block; else ConfigError."""
     with _locked(folder, option) as there:
         yield there.path
 
 
 def files_of_result(folder: Path) -> dict[str, str]:
-    """SHA-256 of our files in a result folder by their names; none where it is no result.
-
-    Raises ConfigError where its list is damaged.
-    """
+    """SHA-256 of our files in a result folder by name, if any; ConfigError where its list is damaged."""
     return {name: digests[-1] for name, digests in (_Target(folder, "output=").listed() or {}).items()}
 
 

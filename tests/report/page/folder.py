@@ -11,7 +11,7 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import Trajectory
 from v2hdm.io.drive.writing import write_drive
-from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, write_exclusions, write_residuals
+from v2hdm.io.maps.evidence import Residuals, write_exclusions, write_residuals
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
 from v2hdm.records import (
@@ -22,13 +22,14 @@ from v2hdm.records import (
     Camera,
     CameraInfo,
     Drive,
+    Exclusion,
     HdMap,
     Image,
     Lane,
     Marking,
     Symbol,
 )
-from v2hdm.report.outputs import write_json
+from v2hdm.store.files import write_json
 from v2hdm.store.results import result_folder
 
 INFO = CameraInfo("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))
@@ -96,7 +97,7 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
     drive = _write_drive(folder / "drive", name, hd_map, poses, cam_from_vehicle)
     with result_folder(folder / "result") as result:
         write_geojson(hd_map, result / "map.geojson", verdict(status))
-        excluded = [ExcludedMarking(kind, np.array([8.0, 2.0]), 2, f"its place is unsure {NASTY}", "front")]
+        excluded = [Exclusion(kind, np.array([8.0, 2.0]), 2, f"its place is unsure {NASTY}", "front")]
         write_exclusions(excluded, result / "excluded.geojson", None, None)
         calibration = Calibration(INFO, cam_from_vehicle, np.diag([4e-6] * 3 + [1e-8] * 3))
         write_calibration(calibration, result / "calibration_front.yaml", clock_s=(0.001, 0.0005))

@@ -26,12 +26,12 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
 from v2hdm.io.maps.evidence import COLUMNS
 from v2hdm.records import DIAMOND, GeodeticOrigin, Marking
-from v2hdm.report.outputs import write_json
 from v2hdm.report.page import document as document_module
 from v2hdm.report.page import pictures
 from v2hdm.report.page.document import document, write_page
 from v2hdm.report.page.facts import ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, ellipses, layers
+from v2hdm.store.files import write_json
 
 
 @pytest.fixture(scope="module")

@@ -31,10 +31,7 @@ _BLOCK = 512
 
 
 def jacobians(residual: Tensor, leaves: Sequence[Tensor]) -> list[Tensor]:
-    """Derivatives (..., m, w) of residuals (..., m), each by its own row of the leaves (..., w).
-
-    One backward pass each of the m columns.
-    """
+    """Derivatives (..., m, w) of residuals (..., m), each by its own row of the leaves (..., w)."""
     rows = [
         torch.autograd.grad(column.sum(), leaves, retain_graph=True, materialize_grads=True)
         for column in residual.unbind(-1)
@@ -129,10 +126,7 @@ class TorchEngine(Engine):
     def cost_and_gradient(
         self, base: Estimate, step: Tensor, robust: Loss
     ) -> tuple[Estimate, dict[str, float], Gradient]:
-        """The cost where the cameras of ``base`` are moved by tangents (C, 6), and its gradient.
-
-        Returns the estimate with the cameras moved, the cost by name, and the gradient by ``step``.
-        """
+        """The cameras moved by tangents (C, 6), the cost there by name, and its gradient by ``step``."""
         arrays = self.arrays
         leaves = [leaf(one) for one in (step, base.frame_state, base.corners_map, base.clock_s)]
         tangent, state, corners_map, clock_s = leaves

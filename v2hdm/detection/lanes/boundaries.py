@@ -4,14 +4,12 @@ A hidden Markov model on rows of the image, from far to near. Its states are *en
 *dash*; the rates at which one becomes another are per metre of ground. The evidence of a row is two log odds
 of the network: of the surest crossing on the line and of the surest paint about it. The forward and backward
 pass (L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each
-state on each row and the likelihood of the line over that of ground without one. Two lines that are painted
-side by side are the strands of one double line: it runs along their middle where both are present, else
-along the one that is.
+state on each row and the likelihood of the line over that of ground without one. Two lines side by side may
+be strands of one double line, along the middle of those present.
 
-How probable it is that a line is one of a lane is a logistic function of its features: first of each line
-alone, then with its span and among the others of its image. A road's lines run beside each other, a lane
-apart: kerbs, joints and edges of shadows run closer. The weights, in ``lane_score.json``, belong to the
-network. ``python -m train.ship`` fits them to renders which no benchmark shows.
+How probable it is that a line is one of a lane is a logistic function of its features: first of each alone,
+then with its span and among the others of its image, which run a lane apart; kerbs, joints and shadows run
+closer. Its weights, in ``lane_score.json``, belong to the network; ``python -m train.ship`` fits them.
 """
 
 from __future__ import annotations
@@ -31,8 +29,7 @@ from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, FloatArray, IntAr
 
 _DRAWN_STEP_PX = 8.0  # rows of the image from one point of a line to the next, px
 _ENDED, _GAP, _SOLID, _DASH = range(4)
-_DASH_STAGES = 3
-"""Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
+_DASH_STAGES = 3  # stages of a dash: its length is Erlang's distribution, scattered by 58 % of the mean
 
 _STATES = _DASH + _DASH_STAGES
 _DASH_M, _GAP_M = 3.6, 5.1
@@ -53,11 +50,9 @@ _HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
 _ACROSS = np.linspace(-1.0, 1.0, 7)
 """Paint of a line is looked for so far to either side of its curve, at so many places."""
 
-_CROSSING_M = 0.3
-"""Lines that lie so far to the left of another one here and so far to its right there cross it."""
+_CROSSING_M = 0.3  # lines that lie so far left of another one here and so far to its right there cross it
 
-_DOUBLE_M = 0.75
-"""Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
+_DOUBLE_M = 0.75  # lines nearer than this are one boundary: two strands if both show paint abreast, else one
 
 _LEAST_ABREAST_M = 1.0  # both strands of a double line show paint on so much ground abreast
 _ONE_LINE_M = 0.12  # lines nearer to each other than this are one
@@ -186,12 +181,7 @@ def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
 
 
 def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Probability of each state (N, T, S) and log likelihood (N,) of all rows.
-
-    Args:
-        likelihood: Logarithms of those of each row in each state (N, T, S).
-        step_m: Ground from each row to the next (N, T - 1).
-    """
+    """Probabilities of states (N, T, S) and log likelihood (N,), by that of rows, ``step_m`` apart."""
     values, right, left, shares = _modes()
     move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
     evidence = np.exp(likelihood)
@@ -259,10 +249,7 @@ def _shown(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
 
 
 def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | None:
-    """A line's points in the image, near to far, with their standard deviations; None if it has not two.
-
-    A double line is drawn along its middle where both strands are present, and along the one that goes on.
-    """
+    """A line's points in the image, near to far, with their standard deviations; None if fewer than two."""
     assert line.span is not None
     camera, below, present = image.camera, line.span.below, line.span.present
     along, sigma = _followed(points, line, image, below)
@@ -288,10 +275,7 @@ def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | No
 def _followed(
     points: LinePoints, line: Line, image: LaneImage, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a line is along the horizon and its standard deviation (N,), px, ``at`` (N,) px below it.
-
-    The mean of the points around, weighted, and of the curve, as good as lines follow curves.
-    """
+    """Where a line is along the horizon and its sigma (N,), px, ``at`` (N,) px below: points and curve."""
     phi = image.horizon.basis(at)
     curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
     members = line.members

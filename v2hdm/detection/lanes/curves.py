@@ -4,14 +4,12 @@ Below the horizon such an arc is u = a + b v + c / v, u along the horizon and v 
 pinhole px: the image of a straight line (a, b) and, to second order, of its curvature (c); see A. Guiducci,
 "Parametric model of the perspective projection of a road with applications to lane keeping and 3D road
 reconstruction", CVIU 73 (1999). It is linear in a, b and c: what points say of it adds up, and whether two
-groups of points are one line has a closed answer.
+groups of points are one line has a closed answer. Lines along one road share a, their vanishing point, and c.
 
-Crossings are linked from row to row into chains, near ones first: near the vehicle lines are far apart, so
-that each is known by the time they run together. Chains and pieces of paint are then joined as long as they
-are more likely one line than two, the likeliest pair first (Bayesian hierarchical clustering). A far dash
-joins a near one by the curve that both suggest and by the road that they lie along. Lines painted along a
-road are parallel: of u = a + b v + c / v (:mod:`v2hdm.detection.lanes.curves`) they share a, their vanishing
-point, and c; only b, the place beside the camera, is each one's own.
+Crossings are linked from row to row into chains, near ones first, where lines are far apart. Chains and
+pieces of paint are then joined as long as they are more likely one line than two, the likeliest pair first
+(Bayesian hierarchical clustering); a far dash by the curve that both suggest and the road that they lie
+along.
 """
 
 from __future__ import annotations
@@ -26,28 +24,23 @@ from v2hdm.detection.camera import Horizon, RoadCamera
 from v2hdm.detection.network import AnchorRow, NetworkOutput
 from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 
-NEIGHBOURS = 3.0
-"""Points of one line err together: that many are worth as much as one."""
+NEIGHBOURS = 3.0  # points of one line err together: that many are worth as much as one
 
 _MODEL_SIGMA_M = 0.02  # by how much painted lines leave the curve
 
 
 @dataclass(frozen=True)
 class LaneImage:
-    """One image in which lines of lanes are looked for.
-
-    ``rows`` are its row anchors, near to far, ``row_step_px`` apart, twice as far where half the resolution
-    is looked at; ``paint`` are the centre lines of its lane paint, points ``paint_step_m`` apart;
-    ``output`` is the network's, if it is known; ``score`` are the weights and biases that lines are scored
-    by, if not the shipped ones.
-    """
+    """One image in which lines of lanes are looked for."""
 
     camera: RoadCamera
+    # anchors, near to far, ``row_step_px`` apart, twice as far at half the resolution
     rows: Sequence[AnchorRow]
-    paint: Sequence[LaneDetection] = ()
-    output: NetworkOutput | None = None
+    paint: Sequence[LaneDetection] = ()  # centre lines of its lane paint, points ``paint_step_m`` apart
+    output: NetworkOutput | None = None  # the network's, if it is known
     paint_step_m: float = 0.5
     row_step_px: float = 8.0
+    # weights and biases of lines, if not the shipped ones
     score: Mapping[str, tuple[FloatArray, float]] | None = None
 
     @property
@@ -58,14 +51,10 @@ class LaneImage:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior knowledge of a line: ``mean`` (3,) and ``information`` (3, 3) of a, b and c.
+    """Prior knowledge of a line's a (from ``centre_px``), b and c; of P at once (P, 1, ...)."""
 
-    Here and in :class:`Evidence` a counts from the horizon's ``centre_px``. Several at once are (P, 1, 3) and
-    (P, 1, 3, 3).
-    """
-
-    mean: FloatArray
-    information: FloatArray
+    mean: FloatArray  # (3,)
+    information: FloatArray  # (3, 3)
 
     @classmethod
     def several(cls, priors: Sequence[Prior]) -> Prior:
@@ -81,22 +70,18 @@ class Prior:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence of N groups of points for their lines, each summed up.
+    """The evidence of N groups of points for their lines, as weighted sums: that of the same line adds."""
 
-    ``information`` (N, 3, 3), ``moment`` (N, 3) and ``square`` (N,) are the weighted sums of the outer
-    products of the basis, of basis times u, and of u squared. That of the same line adds.
-    """
-
-    information: FloatArray
-    moment: FloatArray
-    square: FloatArray
+    information: FloatArray  # (N, 3, 3) of outer products of the basis
+    moment: FloatArray  # (N, 3) of basis times u
+    square: FloatArray  # (N,) of u squared
 
     @classmethod
     def of(cls, phi: FloatArray, u: FloatArray, sigma: FloatArray, ends: Sequence[int]) -> Evidence:
         """Groups of points, one after the other; group n ends at ``ends[n]``, none is empty.
 
-        ``phi`` (M, 3) is the basis at the points, ``u`` (M,) their place along the horizon from its
-        ``centre_px`` and ``sigma`` (M,) the standard deviation of that, px.
+        ``phi`` (M, 3) is the basis there, ``u`` (M,) their place along the horizon from its centre, ``sigma``
+        (M,) px.
         """
         weighted = phi * (sigma**-2.0)[:, None]
         terms = np.column_stack(
@@ -114,10 +99,7 @@ class Evidence:
         )
 
     def log_evidence(self, prior: Prior) -> FloatArray:
-        """Log probability (N,) of each group as one line of that prior, up to a constant per point.
-
-        Of several priors it is (P, N).
-        """
+        """Log probability (N,), of P priors (P, N), of each group as one line, up to a constant per point."""
         moment = self.moment - (self.information @ prior.mean[..., None])[..., 0]
         square = self.square - ((self.moment + moment) * prior.mean).sum(axis=-1)
         gain, log_determinant = _completed_square(self.information + prior.information, moment)
@@ -150,10 +132,7 @@ class Curve:
 
 
 def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """For positive matrices A (..., 3, 3) and vectors m (..., 3): m' inv(A) m (...) and log det A (...).
-
-    By Cholesky written out: LAPACK takes ten times as long for as many small matrices.
-    """
+    """M' inv(A) m and log det A of A (..., 3, 3), m (..., 3), by hand: LAPACK takes ten times as long."""
     pivot0, below10, below20 = (information[..., k, 0] for k in range(3))
     l10, l20 = below10 / pivot0, below20 / pivot0
     pivot1 = information[..., 1, 1] - l10 * below10
@@ -167,22 +146,16 @@ def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[Floa
 
 @dataclass(frozen=True)
 class LinePoints:
-    """N points of an image that lines may run through.
+    """N points of an image that lines may run through."""
 
-    ``points_px`` (N, 2) recorded px; ``along`` and ``below`` (N,) their place about the horizon and ``phi``
-    (N, 3) the basis of curves there; ``sigma_px`` (N,) of each along the horizon; ``odds`` (N,) log odds;
-    ``ground`` (N, 2), vehicle frame; ``is_paint`` (N,): on the centre line of a piece of paint, not a
-    crossing of a row anchor.
-    """
-
-    points_px: FloatArray
-    along: FloatArray
-    below: FloatArray
-    phi: FloatArray
-    sigma_px: FloatArray
-    odds: FloatArray
-    ground: FloatArray
-    is_paint: BoolArray
+    points_px: FloatArray  # (N, 2) recorded px
+    along: FloatArray  # (N,) place along the horizon
+    below: FloatArray  # (N,) and below it
+    phi: FloatArray  # (N, 3) the basis of curves there
+    sigma_px: FloatArray  # (N,) along the horizon
+    odds: FloatArray  # (N,) log odds
+    ground: FloatArray  # (N, 2), vehicle frame
+    is_paint: BoolArray  # (N,) on the centre line of a piece of paint, not a crossing of a row anchor
 
     @classmethod
     def of(
@@ -226,35 +199,26 @@ class LinePoints:
 
 @dataclass(frozen=True)
 class Span:
-    """A line on T rows of the image, ``below`` (T,) px below the horizon, from far to near.
+    """A line on T rows of the image, from far to near."""
 
-    ``present`` and ``painted`` (T,) are probabilities that it has not ended and that it shows paint there,
-    ``length_m`` (T,) is the ground that each row stands for and ``log_likelihood`` that of the line over that
-    of ground without one.
-    """
-
-    below: FloatArray
-    present: FloatArray
-    painted: FloatArray
-    length_m: FloatArray
-    log_likelihood: float
+    below: FloatArray  # (T,) px below the horizon
+    present: FloatArray  # (T,) probability that it has not ended
+    painted: FloatArray  # (T,) and that it shows paint there
+    length_m: FloatArray  # (T,) the ground that each row stands for
+    log_likelihood: float  # over that of ground without a line
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line: its curve and the indices of its ``members`` among the points.
-
-    ``paint_m`` is the paint on it, ``log_ratio`` that of its probabilities along the road and anyhow, and
-    ``strand`` the other line of a double one.
-    """
+    """A line by its curve."""
 
     curve: Curve
-    members: IntArray
-    paint_m: float
-    log_ratio: float
+    members: IntArray  # indices among the points
+    paint_m: float  # the paint on it
+    log_ratio: float  # of its probabilities along the road and anyhow
     log_odds: float = 0.0
     span: Span | None = None
-    strand: Line | None = None
+    strand: Line | None = None  # the other line of a double one
 
 
 _MIN_CHAIN = 3

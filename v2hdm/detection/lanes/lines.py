@@ -29,10 +29,9 @@ def trace_lanes(
 ) -> list[LaneDetection]:
     """The centre lines of lane paint with its score, a point every ``step_m`` on the ground, near to far.
 
-    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are
-    taken to the ground by the camera's initial IPM and averaged there, so perspective does not pull
-    the centre. Cuts through the slanted ends, narrower than the rest, are left out. A blob of two
-    lines that touch gives one row of points for each branch.
+    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are averaged on
+    the ground, so that perspective does not pull the centre. Cuts through slanted ends are left out; of two
+    lines that touch each has points.
     """
     branches = [(paint, edges) for paint in paints for edges in _branches(paint[0].blob)]
     if not branches:
@@ -132,8 +131,7 @@ LEAST_LOG_ODDS = -0.5
 """Lines less sure are not given. A bound of -1.4 gives .7 points more of TuSimple's accuracy and 40 % more
 false lines on renders."""
 
-_DOUBTFUL = 1.5
-"""Lines by so much in log odds less sure than is asked for alone may be sure enough among the others."""
+_DOUBTFUL = 1.5  # lines so much less sure, in log odds, than is asked for alone may be sure among the others
 
 _SIGMA_PX = (0.4, 2.7)
 """Crossings err by s + t / exp(log odds), in px of the resolution looked at; measured on renders."""

@@ -35,20 +35,13 @@ COMMANDS: Mapping[str, str] = {
 
 
 def check_weights(folder: Path = FOLDER) -> None:
-    """Refuse fitted files that do not belong together. Files are read once per process.
-
-    Raises DetectorError where a file is missing, is not the one of the manifest, or goes with another
-    network.
-    """
+    """Raise DetectorError for fitted files that do not belong together; they are read once per process."""
     if (problem := _problem(folder)) is not None:
         raise DetectorError(problem)
 
 
 def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
-    """One line for the user of a network that the judge was not fitted to; None for the shipped one.
-
-    Raises DetectorError where there is no such file.
-    """
+    """One line on a network that the judge was not fitted to; None for ours. DetectorError without a file."""
     path = Path(model)
     if not path.is_file():
         raise DetectorError(f"{path}: no such detector model; give the path of an ONNX file")
@@ -61,10 +54,7 @@ def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
 
 
 def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
-    """The content of ``manifest.json``: ``commit``, and ``files`` by name.
-
-    Raises DetectorError where it is missing or damaged.
-    """
+    """The content of ``manifest.json``: ``commit``, ``files`` by name; raises DetectorError where damaged."""
     path = folder / MANIFEST_FILE.name
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -65,9 +65,8 @@ class IntrinsicsFormat:
 def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
     """The intrinsics of one camera, from a file of any format of :data:`INTRINSICS`.
 
-    ``camera`` is needed where the file holds several; ``name_by`` says in errors how the user names it.
-    Raises DriveError when the file is missing, damaged or of no known format, the camera is not in it or not
-    named among several, or its lens is beyond ours.
+    ``camera`` is needed where there are several; ``name_by`` says how the user names it. Raises DriveError
+    when the file is damaged or of no known format, the camera not in it, or its lens beyond ours.
     """
     if path.suffix.lower() == ".bin":
         raise DriveError(f"{path}: is binary; write the model as text (model_converter --output_type TXT)")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
-from v2hdm.geometry.mounting import cam_from_mounting
+from v2hdm.geometry.ipm import cam_from_mounting, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.io.safe.fields import recorded_distance

@@ -75,10 +75,7 @@ def read_provenance(path: Path) -> Provenance:
 
 
 def trusted_calibrations(path: Path) -> dict[str, Calibration]:
-    """The calibrations in a result folder, or the one of a file, by camera.
-
-    Raises MapFileError when there is none, one is damaged, or the verdict on its drive is FAIL.
-    """
+    """The calibrations in a result folder, or of a file, by camera; MapFileError where none, or FAIL."""
     files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
     if not files:
         raise MapFileError(f"{path}: no calibration_*.yaml in it; give a result of map or calibrate ground")
@@ -99,11 +96,7 @@ def read_camera_info(path: Path) -> CameraInfo:
 
 
 def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
-    """The intrinsics in the entries of a ``camera_info`` file (``camera_calibration_parsers``' YAML).
-
-    Raises DriveError when an entry is missing or damaged, the distortion model is unknown or has another
-    number of coefficients, or the lens cannot be undone.
-    """
+    """The intrinsics in the entries of a ``camera_info`` file; raises DriveError where one is wrong."""
     check_keys(content, _INFO, _IGNORED, where, DriveError)
     model = take_text(content["distortion_model"], f"{where}: distortion_model", DriveError)
     expected = _coefficients_of(model, where, "convert the calibration to")
@@ -150,10 +143,7 @@ def take_matrix(content: object, where: str) -> FloatArray:
 
 
 def info_of(fields: Any, name: str, where: str) -> CameraInfo:
-    """The intrinsics in a ``CameraInfo`` message of ROS 1 or 2.
-
-    Raises DriveError when it is not calibrated, cut to a region, or of an unknown model.
-    """
+    """The intrinsics of a ``CameraInfo`` message; DriveError if not calibrated, cut, or an unknown model."""
     intrinsic = np.array(getattr(fields, "k", getattr(fields, "K", None)), dtype=np.float64).reshape(3, 3)
     distortion = np.array(getattr(fields, "d", getattr(fields, "D", None)), dtype=np.float64).ravel()
     model = _MODELS.get(fields.distortion_model, fields.distortion_model)

@@ -20,7 +20,7 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import euler_from_rotation, inverse, quaternion_from_rotation
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.records import Calibration, CameraInfo, FloatArray
-from v2hdm.store.files import dump_yaml, replace_text
+from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 VEHICLE_FRAME = "base_link"
 _UNUSED = 1e-12  # distortion coefficients and skews below this move no point by a millionth of a pixel
@@ -114,9 +114,8 @@ def urdf(calibration: Calibration, about: Provenance) -> str:
     ET.SubElement(joint, "child", link=frame)
     xyz, rpy = vehicle_from_cam[:3, 3].tolist(), euler_from_rotation(vehicle_from_cam[:3, :3]).tolist()
     ET.SubElement(joint, "origin", xyz=" ".join(map(repr, xyz)), rpy=" ".join(map(repr, rpy)))
-    ET.indent(robot, "  ")
     comment = _comments(calibration, about).replace("--", "- -")
-    return f'<?xml version="1.0"?>\n<!--\n{comment}-->\n{ET.tostring(robot, encoding="unicode")}\n'
+    return xml_text(robot, "  ", f"<!--\n{comment}-->\n")
 
 
 def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
@@ -171,10 +170,7 @@ CALIBRATION_FORMATS: Mapping[str, tuple[str, Callable[[Calibration, Provenance],
 def write_calibration_as(
     name: str, calibration: Calibration, about: Provenance, folder: Path, stem: str
 ) -> Path:
-    """Write one of :data:`CALIBRATION_FORMATS` to ``<folder>/<stem>_<ending>``, atomically; returns the path.
-
-    Raises MapFileError when the format cannot describe this camera.
-    """
+    """Write a calibration to ``<folder>/<stem>_<ending>``, atomically; MapFileError for another lens."""
     ending, text_of = CALIBRATION_FORMATS[name]
     path = folder / f"{stem}_{ending}"
     replace_text(path, text_of(calibration, about))

@@ -21,19 +21,16 @@ _POSES = (
     "a log of poses, with the antenna's place, m forward, left, up of the ground under the rear axle: "
     "{nmea: route.nmea, lever_arm_m: [1.2, 0, 1.8]}"
 )
-_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""Least times of this century, by their unit; smaller ones are s."""
+_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # least times of this century, by their unit; smaller: s
 
 
 def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str, str]:
-    """Write the ``drive.yaml`` of a recording into ``folder``, or say what is missing.
+    """Write the ``drive.yaml`` of a bag, a video or a folder of images, or say what is missing.
 
-    ``source`` is a bag, a video or a folder of images; ``settings`` are ``KEY=VALUE`` with dotted keys and
-    values in YAML, in which names of files count from the working directory. What is missing is returned by
-    its key, with what to give; nothing is written then, nor where the drive cannot be read.
-
-    Raises:
-        DriveError: for a source of no kind, a setting that is none, a ``drive.yaml`` that exists.
+    ``settings`` are ``KEY=VALUE`` with dotted keys and values in YAML, in which names of files count from the
+    working directory. What is missing is returned by its key, with what to give; nothing is written into
+    ``folder`` then, nor where the drive cannot be read. Raises DriveError for a source of no kind, a setting
+    that is none, a ``drive.yaml`` that exists.
     """
     where = folder / DRIVE_FILE
     if where.exists():

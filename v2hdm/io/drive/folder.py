@@ -57,10 +57,7 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
 
 
 def read_description(content: dict[str, Any], path: Path, where: str, options: ReadOptions) -> Drive:
-    """Read the drive that the ``content`` of a ``drive.yaml`` describes (docs/drive-format.md).
-
-    File names are relative to ``path``; ``where`` names the description in errors.
-    """
+    """Read the drive that the ``content`` of a ``drive.yaml`` describes, with files relative to ``path``."""
     check_keys(content, *_DRIVE_KEYS, where, DriveError)
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
     entries = {take_camera_name(name, f"{where}: cameras", DriveError): one for name, one in entries.items()}

@@ -27,16 +27,10 @@ class KittiOptions:
     Attributes:
         camera_height_m: height of the camera above the road (KITTI's nominal 1.65 m).
         centre_sigma_m: how well the published calibration places the camera, per axis.
-        roi_near_m: where the trusted ground begins, ahead of the camera.
-        roi_far_m: where it ends.
-        roi_half_width_m: how far it extends to either side of the camera.
     """
 
     camera_height_m: float = 1.65
     centre_sigma_m: float = 0.05
-    roi_near_m: float = 5.0
-    roi_far_m: float = 20.0
-    roi_half_width_m: float = 6.0
 
 
 @dataclass(kw_only=True)
@@ -91,7 +85,7 @@ def assemble_drive(
 ) -> Drive:
     """The drive of its ``recorded`` poses: the road laid flat, every image of ``files`` posed and checked.
 
-    ``where`` names the poses in errors; ``mount_rad`` is the sensor's turn where the poses have lost it.
+    ``mount_rad`` is the sensor's turn where the poses have lost it.
     """
     assert drive.recorded is not None
     check_trajectory(drive.recorded, drive.origin, where)

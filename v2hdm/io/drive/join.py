@@ -34,7 +34,7 @@ from v2hdm.records import (
 
 _log = logging.getLogger(__name__)
 
-_GUESS_SIGMA_RAD = 0.015  # of the direction of a guessed mounting, as ``mapping.association.ipm_sigma_rad``
+_GUESS_SIGMA_RAD = 0.015  # of the direction of a guessed mounting, as :mod:`v2hdm.association.tracks` has it
 _GUESS_SIGMA_M = 0.3  # of a coordinate of a guessed camera centre that nobody has surveyed
 _SAME_RIG_SIGMAS = 4.0  # guesses that differ by more, in the sigmas of both, are of two mountings
 _SAME_LENS = 1e-3  # intrinsics that differ by less, px at the image's border, are of one lens

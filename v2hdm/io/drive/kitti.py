@@ -79,6 +79,7 @@ class _Entries:
 _CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _OXTS_COLUMNS = 30
+_ROI_M = np.array([[5.0, -6.0], [20.0, -6.0], [20.0, 6.0], [5.0, 6.0]])  # trusted ground, from the camera
 _POSE_NOISE = PoseNoise(
     position_m=0.032,
     position_drift_m=0.03,
@@ -200,8 +201,7 @@ def _read_stamps(path: Path) -> FloatArray:
 
 def _mount(info: CameraInfo, cam_from_vehicle: FloatArray, options: KittiOptions) -> Camera:
     centre_vehicle = np.asarray(np.linalg.inv(cam_from_vehicle)[:3, 3], dtype=np.float64)
-    near, far, half = options.roi_near_m, options.roi_far_m, options.roi_half_width_m
-    roi = np.array([[near, -half], [far, -half], [far, half], [near, half]]) + centre_vehicle[:2]
+    roi = _ROI_M + centre_vehicle[:2]
     prior = CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m))
     ipm = {"estimated": ipm_from_extrinsic(info, cam_from_vehicle)}
     return Camera(info, ipm, "estimated", roi, prior)

@@ -58,10 +58,7 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
 
 
 def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:
-    """The drive of the result in ``folder``, as :func:`drive_of`; refused where it is gone, or several.
-
-    ``what`` says what is made of one drive alone.
-    """
+    """The drive of a result, as :func:`drive_of`; refused if gone or several, ``what`` being of one."""
     drive = drive_of(folder, path)
     if drive is None:
         raise DriveError(f"{folder}: its drive is not where it was; give its folder with --drive")

@@ -1,13 +1,10 @@
-"""The road under a drive, and the drive's poses with that road laid flat into z = 0.
+"""The road under a drive, and the drive's poses with that road laid flat into z = 0, the mapper's ground.
 
-The mapper's ground is the plane z = 0. Grade, cross-fall, ramps and height do not concern the markings' plan,
-but the vehicle's attitude relative to the road does: one degree of pitch moves a ground point at 15 m by 2.4
-m for a camera 1.65 m up.
-
-The recorded up-axis, smoothed over a few metres, gives the road's slope. Integrated along the path it must
-give the heights; where it does not, the sensor is not level or the vehicle squats, and the difference is the
-vehicle's and not the road's. Only this difference is smoothed over a longer way, so that short ramps are not
-blurred.
+Slopes and height do not concern the markings' plan, but the vehicle's attitude relative to the road does: one
+degree of pitch moves a ground point at 15 m by 2.4 m for a camera 1.65 m up. The recorded up-axis, smoothed
+over a few metres, gives the road's slope. Integrated along the path it must give the heights; where it does
+not, the sensor is not level or the vehicle squats, and the difference, smoothed over a longer way so that
+short ramps are not blurred, is the vehicle's.
 """
 
 from __future__ import annotations
@@ -52,22 +49,18 @@ _HALF_WIDTH_M = 3.5  # ground to either side of the path that counts for unevenn
 
 @dataclass(frozen=True)
 class Laid:
-    """Poses with the road laid flat: z = 0, plan and heading as recorded, roll, pitch relative to the road.
-
-    ``road`` is the recorded ground, None where it was recorded as the plane z = 0; ``mount_rad`` (2,) are
-    roll (left side up) and pitch (nose down) of the sensor on the vehicle, which ``trajectory`` no longer
-    has.
-    """
+    """Poses with the road laid flat: z = 0, plan and heading as recorded, attitude relative to the road."""
 
     trajectory: Trajectory
-    road: Road | None
-    mount_rad: FloatArray
+    road: Road | None  # as recorded, None for the plane z = 0
+    mount_rad: FloatArray  # (2,) roll (left side up), pitch (nose down) of the sensor, taken off
 
 
-def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
+def lay_flat(recorded: Trajectory, position_sigma_m: float = 0.02) -> Laid:
     """Lay the road under poses ``map_from_vehicle`` flat into z = 0, recorded with ``position_sigma_m``.
 
-    Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road.
+    Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road. The
+    usual sigma is for the poses of a result.
     """
     poses = recorded.map_from_vehicle
     up = poses[:, :3, 2]
@@ -123,10 +116,7 @@ def log_road(laid: Laid, where: Path) -> None:
 def _fit(
     stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights (N,) and slopes (N, 2) of the ground, and the mount (2,) forward and left, agreed upon.
-
-    By the recorded heights (N,) and the up-axes (N, 2, 3) of :func:`_with_mount`.
-    """
+    """Heights (N,), slopes (N, 2) of the ground and the mount (2,), by heights (N,) and leans (N, 2, 3)."""
     road = local_lines(stations, leans.reshape(len(leans), 6), _ROAD_M).reshape(leans.shape)
     # Heights along the route over a ground of these slopes, from zero at its start.
     steps = np.diff(stations.points_map, axis=0)
@@ -155,10 +145,7 @@ def _mount(leans: FloatArray) -> FloatArray:
 
 
 def _with_mount(lean: FloatArray, yaw: FloatArray, measured: BoolArray) -> FloatArray:
-    """Slopes (P, 2, 3) by map x and y: recorded, and the change by a unit of mount forward and left.
-
-    ``lean`` (P, 2) is the recorded floor's, forward and left; only ``measured`` (2,) directions have a mount.
-    """
+    """Slopes (P, 2, 3) by map x and y: recorded, and the change by a unit of mount forward and left."""
     directions = (np.tile(unit, (len(yaw), 1)) for unit in np.diag(measured.astype(np.float64)))
     return np.stack([_turned(lean, yaw), *(-_turned(direction, yaw) for direction in directions)], axis=2)
 
@@ -178,15 +165,11 @@ def _turned(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Stations:
-    """Places (N, 2) along a route, each the mean of the successive poses within a metre.
+    """Places along a route, each the mean of the successive poses within a metre."""
 
-    ``first`` (N + 1,) are indices of the stations' first poses, and the number of poses; ``path_m`` (N,) the
-    way.
-    """
-
-    first: np.ndarray
-    points_map: FloatArray
-    path_m: FloatArray
+    first: np.ndarray  # (N + 1,) indices of the stations' first poses, and the number of poses
+    points_map: FloatArray  # (N, 2)
+    path_m: FloatArray  # (N,) the way
 
     def mean(self, values: FloatArray) -> FloatArray:
         """Means (N, ...) over the poses of each station of their ``values`` (P, ...)."""
@@ -263,23 +246,16 @@ def _means(values: FloatArray, first: np.ndarray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Unevenness:
-    """The ground's worst deviation ``value_m`` from the plane beneath the vehicle, ``distance_m`` away.
-
-    Roll and pitch of ``sigma`` rad are worth ``sigma * distance_m`` there, too. The vehicle is at ``at_map``
-    (2,), ``station_m`` along the route.
-    """
+    """The ground's worst deviation from the plane beneath the vehicle, at a distance."""
 
     value_m: float
     distance_m: float
-    at_map: FloatArray
-    station_m: float
+    at_map: FloatArray  # (2,) the vehicle
+    station_m: float  # along the route
 
 
 def unevenness(road: Road, reach_m: float) -> Unevenness:
-    """The worst deviation of the ground, over distance, between half of ``reach_m`` and all of it.
-
-    The ground is known along the path by its heights, beside it by its slope, so that its cross-fall counts.
-    """
+    """The worst deviation of the ground, over distance, between half of ``reach_m`` and all of it."""
     station_m = length_along(road.points_map)
     # Unit vectors to the left of the path, zero where it is a point.
     ahead = np.gradient(road.points_map, axis=0) if len(station_m) > 1 else np.zeros((1, 2))

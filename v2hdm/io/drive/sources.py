@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError
-from v2hdm.extras import need
+from v2hdm.errors import DriveError, need
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles

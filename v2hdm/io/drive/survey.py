@@ -61,39 +61,30 @@ _NEARLY = 0.8  # likeness (:mod:`difflib`) from which an unknown column counts a
 
 @dataclass(frozen=True)
 class SurveyedPoint:
-    """A point of a survey, in the map.
-
-    ``position_map`` (2,) m with ``sigma_m`` (2,) along the map's axes, and ``height_m`` above its origin,
-    None where unknown. ``is_check`` holds it out of the adjustment, to check the map by.
-    """
+    """A point of a survey, in the map."""
 
     id: str
-    position_map: FloatArray
-    sigma_m: FloatArray
-    height_m: float | None = None
-    is_check: bool = False
+    position_map: FloatArray  # (2,) m
+    sigma_m: FloatArray  # (2,) along the map's axes
+    height_m: float | None = None  # above its origin, None where unknown
+    is_check: bool = False  # held out of the adjustment, to check the map by
     description: str = ""
 
 
 @dataclass(frozen=True)
 class SurveyTable:
-    """N points as a file states them.
-
-    ``coordinates`` (N, 2) are in the order of the frame's columns, ``height_m`` (N,) is nan where not stated,
-    ``sigma_m`` (N, 2) east and north. ``crs`` is None for the system of the drive; ``geoid_m`` is the geoid's
-    height above the ellipsoid, for heights that count from the sea.
-    """
+    """N points as a file states them."""
 
     path: Path
     frame: Frame
-    coordinates: FloatArray
-    height_m: FloatArray
-    sigma_m: FloatArray
+    coordinates: FloatArray  # (N, 2) in the order of the frame's columns
+    height_m: FloatArray  # (N,) nan where not stated
+    sigma_m: FloatArray  # (N, 2) east and north
     ids: tuple[str, ...]
     is_check: tuple[bool, ...]
     descriptions: tuple[str, ...]
-    crs: str | None = None
-    geoid_m: float | None = None
+    crs: str | None = None  # None for the system of the drive
+    geoid_m: float | None = None  # above the ellipsoid, for heights above the sea
 
 
 def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: float) -> SurveyTable:
@@ -131,12 +122,11 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
 
 
 def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedPoint, ...]:
-    """The points of ``table`` in the map of a drive with that ``origin``.
+    """The points of ``table`` in the map of a drive with that ``origin``, at whose height unknown ones are.
 
-    Eastings and northings become latitudes and longitudes, and these local metres, over the earth's centre,
-    without the grid's scale and convergence. A point without a height is at the origin's. Sigmas stay: a
-    grid's north is a few degrees off at most. Raises DriveError when the drive has no origin that the
-    coordinates need, they are of another datum, or outside of their system.
+    Grids become local metres over the earth's centre, without scale and convergence; sigmas stay. Raises
+    DriveError when the drive has no origin that the coordinates need, they are of another datum, or outside
+    of their system.
     """
     positions, height_m = table.coordinates, table.height_m
     if table.frame is not Frame.MAP:

@@ -22,10 +22,7 @@ LANE_VISIBLE = ("lane", "vertex")
 
 
 def read_truth(drive: Drive) -> Truth:
-    """The ground truth of ``drive``, its rows in the order of ``drive.images``.
-
-    Raises DriveError when the drive has none or it is damaged, MapFileError when its map is.
-    """
+    """The ground truth of ``drive``, its rows in the order of ``drive.images``; raises DriveError without."""
     if drive.joined:
         return _joined_truth(drive)
     folder = drive.truth_dir

@@ -50,15 +50,11 @@ class PoseSettings:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Poses ``map_from_vehicle`` as a drive has them.
-
-    ``noise`` holds those fields of :class:`PoseNoise` that the source states; ``origin`` is the map's place
-    on the earth, None where the poses are the map's own.
-    """
+    """Poses ``map_from_vehicle`` as a drive has them."""
 
     trajectory: Trajectory
-    noise: Mapping[str, float]
-    origin: GeodeticOrigin | None
+    noise: Mapping[str, float]  # the fields of :class:`PoseNoise` that the source states
+    origin: GeodeticOrigin | None  # None where the poses are the map's own
 
 
 _Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
@@ -82,8 +78,7 @@ def read_poses(
     """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
 
     File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
-    attitudes further apart than ``max_gap_s`` are not interpolated across, ``where`` names the key in errors,
-    and ``read_topic`` reads the topic of the drive's bag that is named, if one is.
+    and ``read_topic`` reads the named topic of the drive's bag.
     """
     if isinstance(content, str):
         return Recorded(read_tum(root / content), {}, origin)
@@ -129,9 +124,8 @@ def assemble(
 ) -> Recorded:
     """The vehicle's poses in the map, from the ``readings`` of the source ``where``.
 
-    Without an ``origin`` the first position is that of a source which has a place on the earth. Attitudes
-    further apart than ``max_gap_s`` are not interpolated across. Raises DriveError for positions without a
-    heading, of an antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
+    Without an ``origin`` it is the first position. Raises DriveError for positions without a heading, of an
+    antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
     """
     if readings.antenna and settings.lever_arm_m is None:
         raise DriveError(

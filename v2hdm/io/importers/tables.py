@@ -40,34 +40,24 @@ SIGMA_OF_QUALITY_M: Mapping[int, float] = {
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Attitudes over time.
+    """Attitudes over time."""
 
-    ``stamp_s`` (A,) rise strictly; ``rotation`` (A, 3, 3) leads from the sensor to x east, y north, z up of
-    the true or grid north at the place, or to the map itself; ``sigma_rad`` (A,) is the heading's, nan if not
-    stated.
-    """
-
-    stamp_s: FloatArray
-    rotation: FloatArray
-    sigma_rad: FloatArray
+    stamp_s: FloatArray  # (A,) rising strictly
+    rotation: FloatArray  # (A, 3, 3) from the sensor to east, north, up of the place, or the map
+    sigma_rad: FloatArray  # (A,) of the heading, nan if not stated
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Positions over time, and attitudes, if any, perhaps at other times.
+    """Positions over time, and attitudes, if any, perhaps at other times."""
 
-    ``points`` (P, 3) are x, y, z in m of the map or a projected system, or, where ``geodetic``, latitude and
-    longitude in degrees and height above the ellipsoid in m. ``stamp_s`` (P,) rise strictly. ``sigma_m`` (P,)
-    is a horizontal coordinate's, nan where it is not stated, infinite where there was no fix. ``antenna``
-    marks positions of an antenna, which seldom sits at the vehicle's origin.
-    """
-
-    stamp_s: FloatArray
+    stamp_s: FloatArray  # (P,) rising strictly
+    # (P, 3) x, y, z in m, or latitude, longitude (deg), ellipsoidal height (m) where ``geodetic``
     points: FloatArray
     geodetic: bool
-    sigma_m: FloatArray
+    sigma_m: FloatArray  # (P,) of a horizontal coordinate, nan where not stated, infinite without a fix
     attitudes: Attitudes | None
-    antenna: bool = field(default=False)
+    antenna: bool = field(default=False)  # which seldom sits at the vehicle's origin
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
@@ -153,8 +143,7 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
 def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The names in the first line of a CSV file, and the cells of each further line with its number.
 
-    The first of ``separators`` that the line of names holds separates the cells, else blanks do. ``#`` before
-    the names is dropped; further lines that begin with it are comments. A line is one ``thing``.
+    The first of ``separators`` in the line of names separates cells, else blanks do; ``#`` begins a comment.
     """
     text = read_text(path, DriveError)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]

@@ -24,10 +24,7 @@ _AT_ONCE = 64  # neighbouring vertices that are compared with the segments aroun
 
 @dataclass(frozen=True)
 class ClosedLane:
-    """A stretch of a lane between two lines, in the direction of the first line that bounds it.
-
-    ``left`` and ``right`` are a line's number, and its vertices in the order of that direction.
-    """
+    """A stretch of a lane between two lines, each its number and vertices, in the first one's direction."""
 
     left: tuple[int, IntArray]
     right: tuple[int, IntArray]
@@ -217,10 +214,7 @@ class _Segments:
         return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
 
     def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
-        """For each vertex (N,) of a line, the line met first on its left (1) or right (-1), -1 for none.
-
-        With the vertex of that line nearest to the meeting, and its distance, m.
-        """
+        """The line first met left (1) or right (-1) of each vertex (N,), -1 for none; its vertex; m away."""
         tangent = np.gradient(line, axis=0)
         normal = side * np.column_stack([-tangent[:, 1], tangent[:, 0]])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)

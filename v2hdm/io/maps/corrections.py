@@ -26,8 +26,7 @@ from v2hdm.store.files import (
 )
 
 ACCEPTED, REJECTED, CORRECTED = "accepted", "rejected", "corrected"
-SIGMA_M = 0.02
-"""How well a person places a corner beside the others of its marking, m: a pixel of a mosaic."""
+SIGMA_M = 0.02  # how well a person places a corner beside the others of its marking, m: a pixel of a mosaic
 
 _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the next run (docs/report.md).\n"
 _MOST = 100_000

@@ -13,7 +13,7 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.features import ground_height_m
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
-from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Road
+from v2hdm.records import BoolArray, Exclusion, FloatArray, GeodeticOrigin, IntArray, Road
 from v2hdm.store import files
 
 FILE = "residuals.csv"  # in a result folder
@@ -106,19 +106,8 @@ def read_residuals(path: Path) -> Residuals:
     return Residuals(tuple(images), cameras, stamps, *known, table[:, 3:5], table[:, 5:7], table[:, 7])
 
 
-@dataclass(frozen=True)
-class ExcludedMarking:
-    """A candidate that the map of ``cameras`` left out: its class, where (2,) in the map, and why."""
-
-    kind: str
-    position_map: FloatArray
-    sightings: int
-    reason: str
-    cameras: str
-
-
 def write_exclusions(
-    excluded: Sequence[ExcludedMarking], path: Path, origin: GeodeticOrigin | None, road: Road | None
+    excluded: Sequence[Exclusion], path: Path, origin: GeodeticOrigin | None, road: Road | None
 ) -> None:
     """Write a FeatureCollection of points, atomically; ``cameras`` names the camera set of each."""
     features = []
@@ -132,7 +121,7 @@ def write_exclusions(
     write_features(path, features, origin, {})
 
 
-def read_exclusions(path: Path) -> list[ExcludedMarking]:
+def read_exclusions(path: Path) -> list[Exclusion]:
     """Read the file of :func:`write_exclusions`; raises MapFileError where it is missing or damaged."""
     features = files.load_json(path, MapFileError).get("features")
     if not isinstance(features, list):
@@ -148,5 +137,5 @@ def read_exclusions(path: Path) -> list[ExcludedMarking]:
         )
         at = files.take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
         sightings = files.take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
-        excluded.append(ExcludedMarking(kind, at, int(sightings), reason, cameras))
+        excluded.append(Exclusion(kind, at, int(sightings), reason, cameras))
     return excluded

@@ -28,27 +28,20 @@ _AT_ONCE = 1024  # points whose distances to all stations are held in memory tog
 
 @dataclass(frozen=True)
 class Feature:
-    """A marking, a symbol or a lane as file formats see it.
-
-    ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one. A closed
-    one is a marking of four corners unless it is a ``symbol``, of which only ``place_sigma_m`` may be known.
-    ``heights_m`` (N,) are those of the ground there in the map frame, None where it is the plane z = 0.
-    ``covariance_m2`` (2N, 2N) is that of the stacked points, ``vertex_sigma_m`` (N,) how well a lane's
-    vertices are known across it, ``heights_sigma_m`` (N,) the heights; None where that is not known.
-    """
+    """A marking, a symbol or a lane as file formats see it; None is not known."""
 
     id: int
     kind: str
-    points_map: FloatArray
+    points_map: FloatArray  # (N, 2) m, corners of a closed feature, vertices of an open one
     sightings: int
-    closed: bool
-    heights_m: FloatArray | None = None
-    covariance_m2: FloatArray | None = None
+    closed: bool  # a marking of four corners unless a ``symbol``
+    heights_m: FloatArray | None = None  # (N,) of the ground, None for z = 0
+    covariance_m2: FloatArray | None = None  # (2N, 2N) stacked
     relative_sigma_m: float | None = None
-    heights_sigma_m: FloatArray | None = None
+    heights_sigma_m: FloatArray | None = None  # (N,)
     symbol: bool = False
-    place_sigma_m: float | None = None
-    vertex_sigma_m: FloatArray | None = None
+    place_sigma_m: float | None = None  # of a symbol
+    vertex_sigma_m: FloatArray | None = None  # (N,) of a lane, across it
     paint: PaintLeft | None = None
 
     @property

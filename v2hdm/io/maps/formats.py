@@ -11,14 +11,12 @@ import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, V2hdmError, need
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
 from v2hdm.io.maps.geojson import write_geojson
@@ -42,13 +40,11 @@ _TEXT, _REAL, _WHOLE = 1000, 1040, 1071
 _COLOURS = 6  # AutoCAD's first colours, red to magenta, take turns
 
 
-def write_dxf(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
-) -> None:
+def write_dxf(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
     """Write ``hd_map`` as DXF, atomically: metres, a layer per class, closed 3D polylines for markings.
 
-    They are local, or of the ``grid``, which the drawing's custom properties name with datum and epoch. A DXF
-    has no place for the ``verdict``. Raises ConfigError when ``ezdxf`` is not installed.
+    They are local, or of the ``grid``, which the drawing's custom properties name with datum and epoch.
+    Raises ConfigError when ``ezdxf`` is not installed.
     """
     ezdxf = need("ezdxf", "gis", "the format dxf", ConfigError)
     document = ezdxf.new("R2010", units=ezdxf.units.M)
@@ -88,13 +84,11 @@ COLUMNS: tuple[str, ...] = (
 of point 3 of the same feature. Empty where it is not known."""
 
 
-def write_csv(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
-) -> None:
+def write_csv(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
     """Write ``hd_map`` as CSV, atomically: a row per corner or vertex, every number at full precision.
 
     Coordinates in a ``grid``, rounded to 0.1 mm, take the place of longitude and latitude, which its last
-    columns name. A CSV has no place for the ``verdict``.
+    columns name.
     """
     columns, about = [*COLUMNS], {} if grid is None else grid.stated
     if grid is not None:
@@ -137,21 +131,20 @@ class Format:
     write: Callable[..., None]
     needs: str | None = None
     takes_crs: bool = True
-    metres: str = ""
-    """The format's name where it holds nothing but metres."""
+    states_verdict: bool = False
+    metres: str = ""  # the format's name where it holds nothing but metres
 
 
 FORMATS: Mapping[str, Format] = {
-    "geojson": Format("{name}.geojson", write_geojson),
+    "geojson": Format("{name}.geojson", write_geojson, states_verdict=True),
     "csv": Format("{name}.csv", write_csv),
-    "gpkg": Format("{name}.gpkg", write_geopackage, "pyogrio"),
+    "gpkg": Format("{name}.gpkg", write_geopackage, "pyogrio", states_verdict=True),
     "lanelet2": Format("{name}_lanelet2/lanelet2_map.osm", write_lanelet2, takes_crs=False),
     "dxf": Format("{name}.dxf", write_dxf, "ezdxf", metres="DXF"),
     "qgis": Format("{name}.qgs", write_qgis, "pyogrio"),
     "opendrive": Format("{name}.xodr", write_opendrive, takes_crs=False),
     "landxml": Format("{name}.xml", write_landxml, metres="LandXML"),
 }
-
 
 GROUND_FORMATS: Mapping[str, Format] = {
     "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio", takes_crs=False),
@@ -227,12 +220,10 @@ def write_map(
                 "mapping.ground=surface, or auto where it is no plane", path.name,
             )  # fmt: skip
             continue
-        write = _ALL[chosen].write
-        if chosen == "lanelet2":
-            write = partial(write_lanelet2, projector=projector)
-        elif chosen in grids:
-            write = partial(write, grid=grids[chosen])
-        write(hd_map, path, verdict)
+        more: dict[str, Any] = {"projector": projector} if chosen == "lanelet2" else {}
+        more |= {"verdict": verdict} if _ALL[chosen].states_verdict else {}
+        more |= {"grid": grids[chosen]} if chosen in grids else {}
+        _ALL[chosen].write(hd_map, path, **more)
         written.append(path)
         if chosen == "geojson" and hd_map.origin is None and crs is None:
             _log.warning(

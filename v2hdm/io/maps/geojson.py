@@ -1,11 +1,10 @@
 """Writing an HD map as GeoJSON (RFC 7946), without loss.
 
-With a geodetic origin the geometry is WGS84 longitude and latitude, as the RFC demands, and any GIS shows the
-map in its place. Without one it is local metres, as the foreign member ``v2hdm`` states under
-``coordinates``. The properties ``corners_map`` and ``points_map`` hold the local coordinates at full
-precision, ``heights_m`` the ground's heights in the map frame. With heights or an origin, positions have a
-third coordinate, in m: above the ellipsoid, or above the local z = 0. In another system it has the member
-``crs`` of GeoJSON 2008, by which GDAL goes, and ``v2hdm`` names it.
+With a geodetic origin the geometry is WGS84, as the RFC demands; without one local metres, as the foreign
+member ``v2hdm`` states; in another system that and ``crs`` of GeoJSON 2008, by which GDAL goes, name it. The
+properties ``corners_map`` and ``points_map`` hold the local coordinates at full precision, ``heights_m`` the
+ground's heights in the map frame. With heights or an origin, positions have a third coordinate, in m: above
+the ellipsoid, or above the local z = 0.
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
@@ -63,10 +62,7 @@ AnyArray = NDArray[Any]
 def write_geopackage(
     hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
 ) -> None:
-    """Write ``hd_map`` to ``path``, atomically, with the ``verdict`` on the run that made it.
-
-    Raises ConfigError when ``pyogrio`` is not installed, MapFileError when GDAL cannot write there.
-    """
+    """Write ``hd_map`` and the ``verdict``, atomically; MapFileError when GDAL cannot write there."""
     raw = need("pyogrio.raw", "gis", "the format gpkg", ConfigError)
     features = features_of(hd_map)
     about: dict[str, Any] = {"frame": "map"}

@@ -7,28 +7,21 @@ points ``northing easting height``. Its ``Feature`` of properties holds sighting
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from v2hdm import __version__
 from v2hdm.geometry.geodetic import LOCAL, Grid
 from v2hdm.io.maps.features import features_of, properties_of
 from v2hdm.records import HdMap
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_text, xml_text
 
 _NAMESPACE = "http://www.landxml.org/schema/LandXML-1.2"
 
 
-def write_landxml(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
-) -> None:
-    """Write ``hd_map`` as LandXML, atomically, in metres of the ``grid``, else of the map's own frame.
-
-    A LandXML file has no place for the ``verdict``.
-    """
+def write_landxml(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+    """Write ``hd_map`` as LandXML, atomically, in metres of the ``grid``, else of the map's own frame."""
     grid = grid or Grid(LOCAL, hd_map.origin)
     now = datetime.now(UTC)
     stamp = {"date": now.strftime("%Y-%m-%d"), "time": now.strftime("%H:%M:%S")}
@@ -56,5 +49,4 @@ def write_landxml(
             if not isinstance(value, list):
                 text = f"{value:.5g}" if isinstance(value, float) else str(value)
                 ET.SubElement(about, "Property", {"label": key, "value": text})
-    ET.indent(root, " ")
-    replace_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n')
+    replace_text(path, xml_text(root))

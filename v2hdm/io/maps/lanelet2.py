@@ -1,13 +1,11 @@
 """Writing an HD map as Lanelet2 OSM in the dialect of Autoware, with its ``map_projector_info.yaml``.
 
-Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation; a
-stop line is a line string as well, with the regulatory element that Autoware's map validator asks for. Lane
-lines are line strings; where two of them bound a lane there is a lanelet, and another where a lane goes on,
-splits or merges along a line that bounds both: its other bound is ``virtual`` where no paint shows it.
-
-Lanelet2 has no word for paint without a sign: a stop line's element is a ``traffic_sign``, whose sign is a
-line beside the paint, tagged ``virtual``. The id of a marking or lane line is that of the map; the other ids
-follow from it, so that they stay when the map is written again.
+Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation;
+lane lines are line strings, with a lanelet where two of them bound a lane, and another where a lane goes on,
+splits or merges along a line that bounds both: its other bound is ``virtual`` where no paint shows it. A stop
+line is a line string as well, with the regulatory element that Autoware's map validator asks for: a
+``traffic_sign``, as Lanelet2 has no word for paint alone, whose sign is a line beside the paint, tagged
+``virtual``. Other ids follow from the map's, so that they stay when it is written again.
 """
 
 from __future__ import annotations
@@ -22,13 +20,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import closed_lanes, connections
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
-from v2hdm.store.files import dump_yaml, replace_text
+from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
@@ -44,14 +41,12 @@ _MOST_VERTICES = _PARTS // 2
 _NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
 
 
-def write_lanelet2(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, projector: str | None = None
-) -> None:
+def write_lanelet2(hd_map: HdMap, path: Path, projector: str | None = None) -> None:
     """Write ``hd_map`` to ``path`` and ``map_projector_info.yaml`` beside it, each atomically.
 
-    Autoware looks for ``lanelet2_map.osm``, which has no place for the ``verdict``. Without a ``projector``
-    of :data:`PROJECTORS` it is ``LocalCartesian`` for a map with an origin, else ``Local``. Raises
-    ConfigError when the projector does not suit the map, MapFileError when a line has too many vertices.
+    Without a ``projector`` of :data:`PROJECTORS` it is ``LocalCartesian`` for a map with an origin, else
+    ``Local``. Raises ConfigError when the projector does not suit the map, MapFileError when a line has too
+    many vertices.
     """
     projector = projector or (LOCAL if hd_map.origin is None else LOCAL_CARTESIAN)
     if projector not in PROJECTORS:
@@ -109,8 +104,7 @@ def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None
 def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """The edge of a stop line's ``corners`` (4, 3) to stop at, and the other one, each (2, 3).
 
-    Vehicles stop at the edge that they meet first (Autoware's requirement vm-02-01), at the middle of the
-    paint where the ``direction`` (2,) of travel is not known.
+    Vehicles stop at the edge that they meet first (Autoware's vm-02-01), else at the middle of the paint.
     """
     length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     start = int(length[1] + length[3] > length[0] + length[2])
@@ -199,10 +193,9 @@ class _Lanes:
 
 
 def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> tuple[str, FloatArray]:
-    """Points (N,) in the Military Grid Reference System: UTM within one square of 100 km, as ``54SUE``.
+    """The MGRS square of points (N,), as ``54SUE``, and m (N, 2) east and north of its south-west corner.
 
-    Returns the square, and the points (N, 2), m east and north of its south-west corner. Raises ConfigError
-    when they lie in several squares or beyond the grid, or ``mgrs`` or ``pyproj`` is missing.
+    Raises ConfigError when they lie in several squares or beyond the grid, or a package is missing.
     """
     pyproj, mgrs = (need(one, "gis", "lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs"))
     if np.min(latitude_deg) < -80 or np.max(latitude_deg) >= 84:
@@ -272,8 +265,7 @@ class _Document:
 
     def text(self) -> str:
         self._root.extend(sorted(self._elements, key=lambda one: one.tag != "way"))
-        ET.indent(self._root, " ")
-        return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(self._root, encoding="unicode")}\n'
+        return xml_text(self._root)
 
 
 def _part(owner: Feature, number: int) -> int:

@@ -1,21 +1,19 @@
 """Writing an HD map as OpenDRIVE 1.7, for simulators.
 
-Every lane between two lane lines is a road of its own: its reference line is the left line, straight from
-vertex to vertex, its only lane ``-1`` is as wide as the right line is away, and both lines are road marks.
-Roads have no links and no junctions, for a map of paint does not say how lanes connect. Every marking and
-symbol is an object ``roadMark`` of the nearest road, its outline exact in the object's own axes. Where no two
-lines bound a lane, one road without width runs along the longest line or through the markings and carries
-them.
+Every lane between two lane lines is a road of its own, without links, for a map of paint does not say how
+lanes connect: its reference line is the left line, straight from vertex to vertex, its only lane ``-1`` is as
+wide as the right line is away. Every marking and symbol is an object ``roadMark`` of the nearest road, its
+outline exact in the object's own axes. Where no two lines bound a lane, one road without width runs along the
+longest line or through the markings and carries them.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +22,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
 from v2hdm.records import LANE_DASH, FloatArray, HdMap
-from v2hdm.store.files import replace_text
+from v2hdm.store.files import replace_text, xml_text
 
 _LEAST_STEP_M = 1e-3  # between vertices of a reference line: shorter geometries are refused by readers
 
@@ -56,11 +54,8 @@ class _Road:
         return float(away[segment]), segment, float(along[segment])
 
 
-def write_opendrive(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
-    """Write ``hd_map`` as OpenDRIVE, atomically, in metres of the map frame, whose projection it states.
-
-    An OpenDRIVE file has no place for the ``verdict``.
-    """
+def write_opendrive(hd_map: HdMap, path: Path) -> None:
+    """Write ``hd_map`` as OpenDRIVE, atomically, in metres of the map frame, whose projection it states."""
     features = features_of(hd_map)
     roads = _roads(features)
     root = ET.Element("OpenDRIVE")
@@ -81,8 +76,7 @@ def write_opendrive(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None
             found = [road.nearest(centre) for road in roads]
             k = min(range(len(roads)), key=lambda number: found[number][0])
             _write_object(objects[k], one, roads[k], *found[k][1:])
-    ET.indent(root, " ")
-    replace_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n')
+    replace_text(path, xml_text(root))
 
 
 def _roads(features: Sequence[Feature]) -> list[_Road]:

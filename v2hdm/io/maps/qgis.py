@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+from v2hdm.errors import ConfigError, need
 from v2hdm.geometry.geodetic import Grid, crs_of
 from v2hdm.io.maps.features import POINTS, features_of
 from v2hdm.io.maps.geopackage import LOCAL_CRS, layer_style
@@ -22,14 +21,11 @@ MOSAIC = "mosaic.tif"  # beside the project, where the run has made one
 _AROUND_M = 5.0
 
 
-def write_qgis(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
-) -> None:
+def write_qgis(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
     """Write the project ``path`` of the GeoPackage beside it that has its name, atomically.
 
     The canvas is in metres: of the ``grid``, else of the map frame, about whose origin it is projected. All
-    files are named relative to the project, so that the folder may be moved. The ``verdict`` is in the
-    GeoPackage.
+    files are named relative to the project, so that the folder may be moved.
     """
     pyproj = need("pyproj", "map", "the format qgis", ConfigError)
     features, where = features_of(hd_map), grid or Grid("local", hd_map.origin)

@@ -68,10 +68,7 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
 
 
 def read_geojson(path: Path) -> HdMap:
-    """Read our own GeoJSON, which others may have edited; markings and lanes keep their order.
-
-    Ids that are missing or there twice are given anew. The log says what was edited.
-    """
+    """Read our own GeoJSON, perhaps edited, in its order; missing or repeated ids are given anew."""
     content = load_json(path, MapFileError)
     about, features = content.get("v2hdm"), content.get("features")
     if not isinstance(about, dict) or not isinstance(features, list):
@@ -133,10 +130,7 @@ class Geometry:
 
 
 class _Reader:
-    """Reads the features of one file: reports those whose geometry was edited, and gives ids.
-
-    ``rounding`` (3,) is how far positions may be off for having been rounded, in the file's own units.
-    """
+    """Reads the features of a file with positions off by ``rounding`` (3,), reports edits, gives ids."""
 
     def __init__(
         self, path: Path, origin: GeodeticOrigin | None, rounding: FloatArray, crs: object = None
@@ -292,7 +286,7 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
 def _of_wkb(blob: object, where: str) -> Geometry | None:
     """A polygon of one ring, a line, or a Multi... of one, from GeoPackage's binary (OGC 12-128r19, 2.1.3).
 
-    It is taken apart here: GEOS dies of a geometry that holds another, which holds another, and so on.
+    By hand: GEOS dies of a geometry that holds another, which holds another, and so on.
     """
     if blob is None:
         return None

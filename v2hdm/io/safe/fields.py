@@ -71,8 +71,7 @@ def take_covariance(content: object, size: int, where: str, error: type[V2hdmErr
 def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     """Refuse an impossible camera matrix and a lens that cannot be undone within the image.
 
-    A lens that folds over itself in the image's corners only, where its target never was, is a warning. The
-    number of coefficients must be the model's.
+    A lens that folds over itself in the image's corners only, where its target never was, is a warning.
     """
     (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
     if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:

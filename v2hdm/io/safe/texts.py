@@ -33,10 +33,7 @@ _OPENING, _CLOSING = [ord("["), ord("{")], [ord("]"), ord("}")]
 
 
 def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> bytes:
-    """The bytes of the plain file at ``path``, with a warning where it is ours and was changed.
-
-    Raises ``error`` when it is missing, no plain file (a pipe would block), unreadable or too large.
-    """
+    """The bytes of a plain file, with a warning if it is ours and was changed; raises ``error`` if none."""
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):

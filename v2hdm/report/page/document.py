@@ -23,10 +23,7 @@ from v2hdm.store.files import replace_text
 
 
 def document(facts: Facts) -> SimpleNamespace:
-    """The content of the page by the names of its templates; parts that a run lacks are None or empty.
-
-    Raises DriveError where an image of the drive cannot be read.
-    """
+    """The content of the page by the names of its templates; parts that a run lacks are None or empty."""
     metrics, verdict = facts.metrics, facts.metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
     findings = {which: tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")}
@@ -103,11 +100,9 @@ _ASSETS = {
 def write_page(folder: Path, drive: Drive | None, background: Path | None = None) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
-    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand: the
-    pictures are then those of the report that is there. ``background`` is a GeoTIFF or a folder of XYZ tiles
-    under the map; None keeps that of the report that is there.
-
-    Raises MapFileError where the folder is no result, or a file in it or the background is damaged,
+    ``drive`` is the one that was mapped, for pictures, recorded route and truth; ``background`` a GeoTIFF or
+    a folder of XYZ tiles under the map. Where either is None, what the report that is there shows of it is
+    kept. Raises MapFileError where the folder is no result, or a file in it or the background is damaged,
     DriveError where an image or the truth of the drive is damaged.
     """
     replace_text(folder / FILE, page_text(folder, drive, background=background))

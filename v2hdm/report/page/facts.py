@@ -21,11 +21,11 @@ from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
-from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
+from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
+from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HdMap, IntArray, Truth
 from v2hdm.store.files import load_json, load_yaml, read_text, take_number
 
 BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
@@ -65,25 +65,20 @@ class CameraFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """A result folder, read; what is not in it is None or empty.
-
-    ``excluded`` are the candidates that the map of all cameras left out, ``check_points`` the rows of
-    ``check_points.csv`` by its columns; ``truth`` is there if the drive was rendered. ``surface`` is the
-    ground under the poses of ``route``, None where it is a plane.
-    """
+    """A result folder, read; what is not in it is None or empty."""
 
     folder: Path
     metrics: Mapping[str, Any]
     config: str
     hd_map: HdMap | None
-    excluded: tuple[ExcludedMarking, ...]
+    excluded: tuple[Exclusion, ...]  # that the map of all cameras left out
     cameras: Mapping[str, CameraFacts]
     route: Route | None
-    surface: Surface | None
+    surface: Surface | None  # under the poses of ``route``, None for a plane
     residuals: Residuals | None
-    check_points: tuple[Mapping[str, str], ...]
+    check_points: tuple[Mapping[str, str], ...]  # rows of ``check_points.csv`` by its columns
     drive: Drive | None
-    truth: Truth | None
+    truth: Truth | None  # of a rendered drive
 
     @property
     def results(self) -> Mapping[str, Any]:
@@ -98,11 +93,7 @@ class Facts:
 
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
-    """Read the result folder of a run; ``drive`` is the one that it mapped, if it is at hand.
-
-    Raises MapFileError where the folder is no result, or a file in it is damaged, DriveError where the
-    drive's truth is damaged.
-    """
+    """Read the result folder of a run, and what is known by its ``drive``; MapFileError where damaged."""
     if not (folder / "metrics.json").is_file():
         raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
     metrics = load_json(folder / "metrics.json", MapFileError)
@@ -130,10 +121,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
-    """The calibrations of a result folder by camera.
-
-    Raises MapFileError where a file is damaged.
-    """
+    """The calibrations of a result folder by camera; raises MapFileError where a file is damaged."""
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
         content, calibration = load_yaml(path, MapFileError), read_calibration(path)
@@ -168,10 +156,7 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
 
 
 def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
-    """The ground of a result folder under vehicles at poses (F, 4, 4), None where it is a plane.
-
-    Raises MapFileError where its file is damaged.
-    """
+    """The ground of a result under vehicles at poses (F, 4, 4), None where plane; MapFileError if damaged."""
     path = folder / GROUND
     if not path.is_file():
         return None
@@ -192,14 +177,10 @@ def _table(path: Path) -> tuple[tuple[str, ...], ...]:
 
 @dataclass(frozen=True)
 class GroundResiduals:
-    """K corner observations, as in :class:`Residuals`; ``camera`` (K,) indexes ``cameras``.
-
-    ``range_m`` (K,) is from the camera's foot to the corner, as observed, ``ground_m`` (K, 2) projected minus
-    observed on the ground, in the map; both are nan above the horizon.
-    """
+    """K corner observations, as in :class:`Residuals`; nan above the horizon."""
 
     cameras: tuple[str, ...]
-    camera: IntArray
+    camera: IntArray  # (K,) into ``cameras``
     marking: IntArray
     corner: IntArray
     is_point: BoolArray
@@ -207,8 +188,8 @@ class GroundResiduals:
     observed_px: FloatArray
     residual_px: FloatArray
     distance_sigma: FloatArray
-    range_m: FloatArray
-    ground_m: FloatArray
+    range_m: FloatArray  # (K,) from the camera's foot to the corner, as observed
+    ground_m: FloatArray  # (K, 2) projected minus observed, in the map
 
     @property
     def size_px(self) -> FloatArray:

@@ -10,8 +10,7 @@ from xml.sax.saxutils import escape
 import cv2
 import numpy as np
 
-from v2hdm.errors import MapFileError
-from v2hdm.extras import need
+from v2hdm.errors import MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
@@ -32,6 +31,12 @@ def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
+def jpeg_of(path: Path, widest_px: int, quality: int) -> str | None:
+    """A picture's file as JPEG in base64, at most so wide; None where there is none."""
+    pixels = cv2.imread(str(path)) if path.is_file() else None
+    return None if pixels is None else jpeg(shrunk(pixels, min(1.0, widest_px / pixels.shape[1])), quality)
+
+
 def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
     return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
@@ -40,14 +45,10 @@ EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 
 LARGEST_BYTES = 3_500_000  # budget of the mosaic, as text in the page
 _QUALITY = 72
-_COMPARISON_WIDTH_PX = 1400
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
-    """The mosaic for the map: WebP in base64 and its bounds (west, south, east, north), m; None without one.
-
-    Raises MapFileError where ``mosaic.json`` is damaged, or the picture that it names is missing.
-    """
+    """The mosaic, if any: WebP in base64, bounds (west, south, east, north), m; MapFileError if damaged."""
     if not (folder / EXTENT).is_file():
         return None
     content, where = load_json(folder / EXTENT, MapFileError), f"{folder / EXTENT}"
@@ -93,10 +94,7 @@ def _source(path: Path) -> dict[str, Any]:
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
-    """A GeoTIFF or XYZ tiles of the user's own in the map's frame, as :func:`mosaic_layer` gives one.
-
-    Raises MapFileError where they cannot be read or laid under the map, DriveError where a tile is damaged.
-    """
+    """A GeoTIFF or XYZ tiles of the user's own, as :func:`mosaic_layer`; MapFileError if they do not fit."""
     rasterio, warped = (
         need(name, "gis", "a background", MapFileError) for name in ("rasterio", "rasterio.vrt")
     )
@@ -142,11 +140,7 @@ def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
 
 def comparison(folder: Path) -> str | None:
     """The same ground before and after the optimisation, JPEG in base64; None where the folder has none."""
-    path = folder / COMPARISON
-    pixels = cv2.imread(str(path)) if path.is_file() else None
-    return (
-        None if pixels is None else jpeg(shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1])), 84)
-    )
+    return jpeg_of(folder / COMPARISON, 1400, 84)
 
 
 SIGMAS_95 = 2.4477
@@ -224,10 +218,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
 
 
 def _systems(facts: Facts) -> list[dict[str, Any]]:
-    """Coordinates beside local metres: by system cubics in x and y, m, which meet it to a millimetre.
-
-    Within 10 km the earth's curvature leaves no more; without an origin there are none.
-    """
+    """Coordinates beside local metres, to a millimetre: by system cubics in x and y; none without origin."""
     hd_map = facts.hd_map
     if hd_map is None or hd_map.origin is None:
         return []
@@ -298,7 +289,7 @@ def _number(text: str | None) -> float | None:
 
 
 def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
-    """By marking an arrow a camera: number of the camera, mean of projected minus observed on the ground, m.
+    """By marking an arrow a camera: its number, mean of projected minus observed on the ground, m, count.
 
     A pixel covers ground that grows with the squared range, so observations count by its inverse, squared.
     """

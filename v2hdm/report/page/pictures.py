@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from v2hdm.detection.batch import read_image
@@ -14,7 +13,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
-from v2hdm.report.page.layers import jpeg, shrunk
+from v2hdm.report.page.layers import jpeg, jpeg_of, shrunk
 
 BUDGET_BYTES = 8_000_000  # budget of all pictures together, as text in the page: a report stays below 15 MB
 PER_CAMERA = 2  # pictures of a marking: the nearest one, and one from the middle of its sightings
@@ -42,11 +41,9 @@ class _Cut:
 def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     """Pictures by feature, the best first: ``m`` or ``s`` and the id, ``x`` and a number for one left out.
 
-    Empty without the drive.
-
     Each has ``src`` (JPEG as base64), ``size``, ``camera``, ``image``, ``t`` (s), the shape as the map puts
-    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture. Raises
-    DriveError where an image of the drive cannot be read.
+    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture. Empty
+    without the drive; raises DriveError where an image of it cannot be read.
     """
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
@@ -176,10 +173,5 @@ def _rounded(points: FloatArray) -> list[list[float]]:
 
 def overlays(facts: Facts) -> Mapping[str, str]:
     """By camera the folder's ``overlay_<camera>.png`` as JPEG in base64, where there is one."""
-    found = {}
-    for name in facts.cameras:
-        path = facts.folder / f"overlay_{name}.png"
-        pixels = cv2.imread(str(path)) if path.is_file() else None
-        if pixels is not None:
-            found[name] = jpeg(shrunk(pixels, min(1.0, 1200 / pixels.shape[1])), 82)
-    return found
+    found = {name: jpeg_of(facts.folder / f"overlay_{name}.png", 1200, 82) for name in facts.cameras}
+    return {name: picture for name, picture in found.items() if picture is not None}

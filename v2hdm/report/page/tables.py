@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from v2hdm.geometry.mounting import angle_sigmas, centre_sigmas, mounting_angles
+from v2hdm.geometry.ipm import angle_sigmas, centre_sigmas, mounting_angles
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
@@ -73,7 +73,6 @@ def _plain(value: object) -> str:
 
 
 _LEAST_FOR_SHARE = 20  # corners from which a share of them is stated
-
 
 _Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
 

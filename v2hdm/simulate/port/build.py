@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.ipm import cam_from_mounting, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.mounting import cam_from_mounting
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap

@@ -94,11 +94,7 @@ def check_drive(
 
 
 def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None) -> list[Finding]:
-    """The findings of :func:`check_drive`; causes without their consequences.
-
-    Cameras that ``ground``, the estimates by camera, leaves out are checked without. Raises DriveError where
-    a sampled image cannot be decoded.
-    """
+    """The findings of :func:`check_drive`, causes without their consequences; raises DriveError as that."""
     ground = ground or {}
     motion = Motion.of(drive)
     findings = [
@@ -140,11 +136,7 @@ def check_road(drive: Drive) -> Iterator[Finding]:
 
 
 def causes(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings without those that another one explains (:data:`HIDES`).
-
-    A cause hides its consequences about the same camera, one in the poses those about every camera. It is as
-    bad as the worst of them.
-    """
+    """The findings without those that another one explains (:data:`HIDES`), as bad as the worst of them."""
     findings = list(findings)
     raised = [finding for finding in findings if finding.status is not Status.PASS]
     explained: set[int] = set()

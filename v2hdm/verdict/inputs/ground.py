@@ -11,14 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.ground import (
-    GroundEstimate,
-    GroundOptions,
-    GroundStatus,
-    Parameter,
-    Reading,
-    estimate_ground,
-)
+from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading, estimate_ground
 from v2hdm.ground.estimate import STEEP_RAD
 from v2hdm.records import Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path
@@ -76,10 +69,7 @@ _UNTOLD = {
 
 @dataclass(frozen=True)
 class _Check:
-    """The check of one parameter: its limit in the parameter's own unit, ``scale`` to ``unit``.
-
-    ``wrong`` is filled with the ``{size}`` and with one of the ``ways`` for a positive and a negative value.
-    """
+    """The check of a parameter: its limit, ``scale`` to ``unit``, and what is wrong, by its sign."""
 
     name: str
     limit: float
@@ -131,11 +121,7 @@ _CHECKS: Mapping[str, _Check] = {
 
 
 def rival_of(ground: Mapping[str, GroundEstimate]) -> Reading | None:
-    """Another reading of the poses that fits every camera better, where the one as given needs excuses.
-
-    On a route of few turns most of the ground matches as given even if the path is mirrored; clock, focal
-    length or heading then have to bend for the rest.
-    """
+    """Another reading of the poses that fits every camera better, where the one as given needs excuses."""
     asked = [estimate for estimate in ground.values() if estimate.status is GroundStatus.FOUND]
     if len(asked) < len(ground) or not any(_is_bent(estimate) for estimate in asked):
         return None
@@ -302,10 +288,7 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
 
 
 def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None:
-    """The usual mistake after whose undoing the ground of a camera that never matched does.
-
-    None where a camera matches, or no mistake explains it. Raises DriveError where an image cannot be read.
-    """
+    """The usual mistake without which the ground of a camera that never matched does; else None."""
     lost = [
         name
         for name, estimate in ground.items()

@@ -105,10 +105,7 @@ class Path(Enum):
 
 
 def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
-    """Whether the recorded poses drive where they point, z up.
-
-    ``path`` is the verdict of the images' ground; None where it was not asked or has none.
-    """
+    """Whether the recorded poses drive where they point, z up; ``path`` is the verdict of the ground."""
     if not len(motion.chords):
         return []  # the check of the path's length says so
     _, either = _agreement(motion)

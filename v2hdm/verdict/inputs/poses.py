@@ -26,8 +26,7 @@ _FASTEST_MPS = 40.0  # no vehicle maps markings faster (144 km/h): its images wo
 _HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
 # A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance.
 _EXTREME = 12.0
-# Stamps that scatter less are as good as a drive needs them.
-_LEAST_JITTER_MS = 5.0
+_LEAST_JITTER_MS = 5.0  # stamps that scatter less are as good as a drive needs them
 # Four standard errors of the logarithm of a ratio of two robust sigmas of one offset: half the offsets count,
 # as neighbours share poses, and a median absolute deviation is worth .37 of a standard deviation.
 _SURE_JITTER = 4 / (0.5 * 0.37) ** 0.5
@@ -211,10 +210,7 @@ def _off_neighbours(motion: Motion, values: FloatArray) -> FloatArray:
 
 
 def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
-    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, none stands out.
-
-    A lost fix moves a few records, and any way; a late stamp moves each, and only along the way.
-    """
+    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, all of them."""
     ahead = motion.rotation[1:-1, :2, 0]
     driven = motion.moving[:-2] & motion.moving[1:-1] & motion.moving[2:]
     if not driven.any():
@@ -337,10 +333,7 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
 
 
 def _white_noise(motion: Motion) -> tuple[float, float] | tuple[None, None]:
-    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose.
-
-    None where the poses are too rare or uneven, so that driving would hide the noise.
-    """
+    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose, if known."""
     if len(motion.stamp_s) < 50:
         return None, None
     interval_s = float(np.median(motion.interval_s))

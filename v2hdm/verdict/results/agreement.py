@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from v2hdm.geometry.mounting import centre_sigmas
+from v2hdm.geometry.ipm import centre_sigmas
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
@@ -39,10 +39,7 @@ _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
 
 
 def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:
-    """Distance of two mountings: root of the mean squared deviation of their six parameters, in sigmas.
-
-    The sigmas are those of ``one``, which is known less; where the two are independent, ``of_both``.
-    """
+    """Distance of two mountings, root mean square of six parameters in sigmas of ``one``, or of both."""
     assert one.covariance is not None
     covariance = one.covariance + np.diag(_LEAST_VARIANCE)
     if of_both and other.covariance is not None:
@@ -57,10 +54,7 @@ def _difference(one: Calibration, other: Calibration) -> FloatArray:
 
 
 def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
-    """Single cameras against one another and against all of them.
-
-    ``results`` are the optimised ones by camera set, that of all cameras last.
-    """
+    """Single cameras, by their optimised results, against one another and, last, against all of them."""
     together = list(results.values())[-1]
     alone = {name: one for name, one in results.items() if len(one.cameras) == 1}
     for (first, a), (second, b) in combinations(alone.items(), 2):
@@ -106,10 +100,7 @@ def _offset(
 
 
 def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray:
-    """Offsets (N, 2), forward and left, of the markings of ``b`` from the same ones of ``a``.
-
-    A marking is that of the other map that is nearest to it, of its class, both ways.
-    """
+    """Offsets (N, 2), forward and left, of the markings of ``b`` from the nearest same ones of ``a``."""
     if not a.hd_map.markings or not b.hd_map.markings:
         return np.empty((0, 2))
     places = [np.array([one.corners_map.mean(axis=0) for one in r.hd_map.markings]) for r in (a, b)]

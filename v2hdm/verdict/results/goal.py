@@ -25,10 +25,7 @@ _CIRCLE_95 = 2.4477  # radius, in sigmas of a coordinate, where both have the sa
 
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
-    """The map against the largest 95 % radius ``goal_m``, then each mounting.
-
-    ``frame`` is what the map's frame rests on, ``poses`` or ``survey``.
-    """
+    """The map, in the frame of ``poses`` or ``survey``, against the 95 % radius ``goal_m``; each mounting."""
     markings, goal = best.hd_map.markings, f"; goal {100 * goal_m:g} cm"
     if markings:
         radius_m = np.array([_corner_radii_m(one) for one in markings])
@@ -96,10 +93,7 @@ def _corner_radii_m(marking: Marking) -> FloatArray:
 
 
 def _radius_of_all_m(radius_m: FloatArray) -> float:
-    """The radius within which 95 % of all corners lie, of which each does within its own (N,) at 95 %.
-
-    Each error is taken for one of a circular normal distribution: a share of 1 - .05^((r / own)^2) within r.
-    """
+    """The radius that holds 95 % of all corners, each within its own (N,) at 95 % of a circular normal."""
     if np.mean(np.isfinite(radius_m)) < _SHARE:
         return float("inf")
 
@@ -119,10 +113,7 @@ def _own_m(marking: Marking) -> float:
 
 
 def ground_ahead(calibration: Calibration) -> tuple[float, str]:
-    """The 95 % radius, m, within which a mounting leaves the ground ahead, and what would make it smaller.
-
-    It is of the point that the camera looks at, of one 10 m ahead where that is farther; infinite if unknown.
-    """
+    """The 95 % radius, m, to which a mounting knows the ground at least 10 m ahead, inf; what would help."""
     moves, covariance = _ground_jacobian(calibration.cam_from_vehicle), calibration.covariance
     if covariance is None:
         return float("inf"), "it saw no marking of the map"
@@ -147,11 +138,7 @@ def _ground_jacobian(cam_from_vehicle: FloatArray) -> FloatArray:
 
 
 def _radius_m(covariance_m2: FloatArray) -> float:
-    """The largest radius, m, within which errors of covariances (..., 2, 2) stay at 95 %.
-
-    It is 1.96 sigmas of a line and 2.45 of a circle, and between them to .3 % the polynomial of Leenhouts
-    (On the computation of bi-normal radial error, Navigation, 1985).
-    """
+    """The largest radius, m, that holds 95 % of errors of covariances (..., 2, 2), by Leenhouts (1985)."""
     minor, major = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2), 1e-18)).T
     return float(np.max(major * np.polyval((0.371625, 0.114276, 0.004071, 1.960790), minor / major)))
 

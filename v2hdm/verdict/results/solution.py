@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.adjust import Fault
-from v2hdm.adjust.bench import STRETCHES
+from v2hdm.adjust.sensitivity import STRETCHES
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.recovery import (
     CLEAR_SIGMAS,
@@ -54,8 +54,7 @@ _REJECTED_LIMIT = 0.06
 _VARIANCE_LIMIT = 3.0
 # Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
 _POSE_NOISE_LIMIT = 3.0
-# Log odds from which a cause is named that no score test looks for.
-_ODDS_LIMIT = CLEAR_SIGMAS**2 / 2
+_ODDS_LIMIT = CLEAR_SIGMAS**2 / 2  # log odds from which a cause is named that no score test looks for
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
 _LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
@@ -106,8 +105,7 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
 # How an input was corrected, where it was not just left out.
 _CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no known size was used"}
 
-# Faults that a constant clock offset may stand for.
-_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)
+_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
 
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
@@ -121,10 +119,9 @@ def check_result(
     methods: Mapping[str, Mapping[str, MethodResult]],
     ground: Sequence[Mapping[str, GroundEstimate]] = (),
 ) -> list[Finding]:
-    """The checks after the solve, and the mapper's mountings against those of bare ground.
+    """The checks after the solve, and the mapper's mountings against those of bare ground, by session.
 
-    ``methods`` are results by camera set, that of all cameras last, then by method, ``ground`` the estimates
-    of each session, by camera; empty where it was not asked.
+    ``methods`` are results by camera set, that of all cameras last, then by method.
     """
     best = list(methods.values())[-1][BEST]
     findings = check_solution(drive, methods)
@@ -170,10 +167,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
 
 
 def _explained(finding: Finding, named: Finding | None) -> Finding:
-    """A symptom that points to the cause which the tests of the inputs have named, if they have.
-
-    The colon of its sentence divides the symptom from the causes that are likely otherwise.
-    """
+    """A symptom that points to the cause which the tests of the inputs have named, if they have."""
     if named is None or finding.status is Status.PASS:
         return finding
     return replace(finding, says=f"{finding.says.split(': ')[0]}: see {named.check}")
@@ -232,8 +226,7 @@ def _corrected(one: Contradiction) -> Finding:
 def _is_left(one: Contradiction, corrected: Sequence[Contradiction]) -> bool:
     """Whether the correction of a clock leaves a drift, or a heading, that is likelier than none.
 
-    A clock that is off drifts as often as not, and may be what a wrong heading looks like: once it is known
-    to be off, the odds are even that one of these is the cause, where they are a thousandth otherwise.
+    Once a clock is known to be off, the odds are even that one of these is the cause.
     """
     off = {camera for each in corrected if each.fault is Fault.CLOCK for camera in each.cameras}
     return one.fault in _LIKE_CLOCK and off >= set(one.cameras) and matters(one) and log_odds(one) > 0
@@ -393,10 +386,7 @@ def _jitter_odds(evidence: SolveEvidence) -> float:
 
 
 def _stamps(evidence: SolveEvidence) -> Finding:
-    """Stamps that scatter: the poses err more than stated, from image to image, and only along the way.
-
-    Up to the noise of poses that map and tests allow for, it makes a map coarser but not wrong.
-    """
+    """Stamps that scatter: the poses err more than stated, from image to image, and only along the way."""
     ratio, by_ms = evidence.along_over_across, 1e3 * evidence.jitter_s
     allowed = max(evidence.pose_noise.values(), default=0.0) <= _POSE_NOISE_LIMIT
     return judge(

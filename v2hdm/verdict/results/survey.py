@@ -23,11 +23,9 @@ SIGNIFICANCE = 1e-3  # share of maps as good as they state that are contradicted
 
 
 def check_points(table: CheckTable) -> Finding:
-    """Whether the check points contradict the sigmas that map and survey state.
+    """Whether the check points contradict the sigmas that map and survey state, by their chi-square.
 
-    All differences together are tested by their chi-square (:mod:`v2hdm.report.check_points`). Where that is
-    too large, two simpler faults are tried in the same way: one point that is off, and all that are off
-    alike. The fault that leaves the rest as good as stated is named.
+    Where they do, the simpler fault that leaves the rest as stated is named: one point off, or all off alike.
     """
     total = len(table.compared) + len(table.unmatched)
     if not table.compared:
@@ -48,10 +46,7 @@ def check_points(table: CheckTable) -> Finding:
 
 
 def check_frame(found: Mapping[str, int]) -> list[Finding]:
-    """A survey that fits the map not at all, or better when it is read in another way than stated.
-
-    ``found`` counts corners that have a point within reach, as stated ("") and by other readings of the file.
-    """
+    """A survey that fits not at all, or better by another reading, by the counts of corners in reach."""
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
     stated, most = found.get("", 0), others.get(likeliest, 0)

@@ -15,11 +15,11 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
 from v2hdm.adjust.engine import Engine, Evaluated, Linearised
-from v2hdm.adjust.engines.numba import evaluate, frames, linearise, motion, observe
+from v2hdm.adjust.engines.numba import evaluate, frames, linearise, observe
 from v2hdm.adjust.engines.numba.evaluate import Evaluation
 from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
 from v2hdm.adjust.engines.numba.pool import share
-from v2hdm.adjust.engines.numba.tables import cam_from_map, prior_blocks_of, spread_of, with_priors
+from v2hdm.adjust.engines.numba.tables import cam_from_map, move, prior_blocks_of, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
 from v2hdm.adjust.tiles import find_pattern
@@ -27,8 +27,7 @@ from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-# Ranges of columns that threads take in turn.
-_COLUMN_RANGES = 8
+_COLUMN_RANGES = 8  # ranges of columns that threads take in turn
 # Multiplications of a factorisation above which other orders of elimination are tried, and the share of
 # them from which another order pays.
 _WORTH_ANOTHER_ORDER = 1e9
@@ -161,11 +160,7 @@ class NumbaEngine(Engine):
         return prior_blocks_of(self.arrays, estimate)
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
-        """Linearise, and subtract the eliminated corners from the reduced system.
-
-        Raises:
-            AdjustError: corners that lengths join cannot be solved for together.
-        """
+        """Linearise and eliminate the corners; raises AdjustError where joined ones cannot be solved for."""
         arrays, layout, spread = self.arrays, self.layout, system.spread
         clock, width, pairs = _by_pair(spread.clock), system.tip, arrays.pair_count
         touched, chunks = len(layout.touched), len(layout.chunk) - 1
@@ -309,7 +304,7 @@ class NumbaLinearised(Linearised):
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""
         engine, base, before, arrays = self.engine, self.base, self.estimate, self.engine.arrays
-        cameras, chart = motion.move(_rows(step.extrinsic), _rows(before.cam_from_vehicle))
+        cameras, chart = move(_rows(step.extrinsic), _rows(before.cam_from_vehicle))
         state, clock = before.frame_state + step.frame_state, before.clock_s + step.clock_s
         at = Estimate(torch.from_numpy(cameras), state, before.corners_map, clock)
         table, whitened = _table(engine.poses(at)), _rows(own.reshape(-1))

@@ -90,13 +90,7 @@ def _carry(
 
 @kernel
 def carry(
-    begin: int,
-    end: int,
-    layout: Layout,
-    base: Base,
-    by_corner: FloatArray,
-    scratch: Scratch,
-    out: Evaluation,
+    begin: int, end: int, layout: Layout, base: Base, by_corner: FloatArray, scratch: Scratch, out: Evaluation
 ) -> None:
     """Whiten a gradient (N, 2) by the corners of chunks ``begin`` to ``end``; see :func:`evaluate`."""
     for q in range(begin, end):
@@ -127,17 +121,9 @@ def evaluate(
 ) -> None:
     """Evaluate chunks ``begin`` to ``end`` at a step from where the whitening was made.
 
-    Args:
-        begin: the first chunk.
-        end: the chunk after the last.
-        layout: the problem.
-        base: the whitening.
-        table: of the pairs (P, 16) after the step.
-        motion: the step as left tangents (P, 6) of the pairs, where frames have states.
-        cameras: that of the cameras' unknowns (D,).
-        own: the whitened variables (2 N,) of the corners.
-        scratch: room to work in.
-        out: where the results go.
+    ``table`` (P, 16) is of the pairs after the step, ``motion`` (P, 6) the step as their left tangents, where
+    frames have states, ``cameras`` (D,) that of the cameras' unknowns, ``own`` (2 N,) the corners' whitened
+    variables.
     """
     slot, _, _, known, _, step, gradient, _ = scratch
     states = len(base.rows) == 0

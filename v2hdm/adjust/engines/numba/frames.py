@@ -12,30 +12,20 @@ from v2hdm.records import FloatArray, IntArray
 
 
 class TileMap(NamedTuple):
-    """Where the tiles of a :class:`~v2hdm.adjust.tiles.TiledMatrix` lie among its ``values``.
+    """Where the tiles of a :class:`~v2hdm.adjust.tiles.TiledMatrix` lie among its ``values``."""
 
-    Attributes:
-        per_tile: frames of a tile.
-        size: rows of a tile.
-        position: (G,) of each tile along the route in the order of elimination.
-        begin: (G,) the first tile of each column, that on the diagonal.
-        row, at: the row of each tile, G for the tip's, and where it lies.
-    """
-
-    per_tile: int
-    size: int
-    position: IntArray
-    begin: IntArray
+    per_tile: int  # frames of a tile
+    size: int  # rows of a tile
+    position: IntArray  # (G,) of each tile along the route in the order of elimination
+    begin: IntArray  # (G,) the first tile of each column, that on the diagonal
+    # the row of each tile, G for the tip's, and where it lies
     row: IntArray
     at: IntArray
 
 
 @inlined
 def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
-    """List the tiles that unit u touches in the order of elimination; returns their number.
-
-    ``marks`` are by tile the last unit that touched it and its place in the list, and the list.
-    """
+    """List the tiles that unit u touches in order of elimination, with ``marks`` by tile; their number."""
     mark, place, touched = marks[0], marks[1], marks[2]
     count = 0
     for k in range(layout.begin[layout.unit[u]], layout.begin[layout.unit[u + 1]]):
@@ -68,23 +58,12 @@ def subtract_frames(
     scratch: Scratch,
     values: FloatArray,
 ) -> None:
-    """Take B'B of all corners off the columns ``begin`` to ``end`` of the reduced system.
+    """Take B'B of all corners off the columns ``begin`` to ``end`` of the reduced system's ``values``.
 
-    Whoever takes off other columns, each tile's parts come in the same order.
-
-    Args:
-        begin: the first column in the order of elimination.
-        end: the one after the last.
-        layout: the problem.
-        base: where, and the factors of V.
-        tiles: of the system.
-        by_state: (P, 6 S) the pairs' left tangents by the states of their frame.
-        clock: (P, 6 Q) those by the clock offset of their camera.
-        each: unknowns of a camera.
-        marks: (5, G + 1) room to work in, -1 at first. The last two are the columns of each touched tile,
-            and of the tip behind them, that are not zero.
-        scratch: more of it; its rows are of all touched tiles and of the tip.
-        values: the tiles' numbers.
+    Whoever takes off other columns, each tile's parts come in the same order. ``by_state`` (P, 6 S) and
+    ``clock`` (P, 6 Q) are the pairs' left tangents by the states of their frame and the clock offset of their
+    camera, of which ``each`` is the number of unknowns. ``marks`` (5, G + 1), -1 at first, is room to work
+    in; its last two rows are the columns of each touched tile, and of the tip behind them, that are not zero.
     """
     states, size, tip_row = by_state.shape[1] // 6, tiles.size, len(tiles.begin)
     width = len(base.table) // layout.moments * each

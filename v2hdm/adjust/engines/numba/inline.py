@@ -17,8 +17,7 @@ from v2hdm.records import FloatArray, IntArray
 
 _Seen = tuple[float, float, float, float, float, float, float]
 
-# A product of the Cauchy loss's terms is taken the logarithm of before it can overflow.
-_LARGE = 1e150
+_LARGE = 1e150  # a product of the Cauchy loss's terms is taken the logarithm of before it can overflow
 
 
 @inlined

@@ -20,44 +20,34 @@ LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 
 
 class Layout(NamedTuple):
-    """K observations of N corners in M units and Q chunks.
+    """K observations of N corners in M units and Q chunks."""
 
-    Attributes:
-        pair, measured, root: as in :class:`~v2hdm.adjust.arrays.Arrays`.
-        moments: M.
-        frame: (M,) of each moment.
-        begin: (N + 1,) where each corner's observations begin.
-        unit: (M + 1,) where each unit's corners begin.
-        joint_at: (M,) where the factor of a unit of several corners begins among those of all.
-        chunk: (Q + 1,) where each chunk's units begin.
-        touched, touched_at: the pairs that chunks touch, ascending in each, and (Q + 1,) where they begin.
-        control, control_root: as in Arrays.
-        length_at: (M + 1,) where each unit's known lengths begin.
-        length_first, length_second, length_m, length_root: the lengths, sorted by unit.
-        most_seen, most_joined: observations and corners of a unit, at most.
-        kept: (M,) units that are not eliminated: their factor is the identity, and nothing couples to them.
-    """
-
+    # as in :class:`~v2hdm.adjust.arrays.Arrays`
     pair: IntArray
     measured: FloatArray
     root: FloatArray
-    moments: int
-    frame: IntArray
-    begin: IntArray
-    unit: IntArray
-    joint_at: IntArray
-    chunk: IntArray
+    moments: int  # M
+    frame: IntArray  # (M,) of each moment
+    begin: IntArray  # (N + 1,) where each corner's observations begin
+    unit: IntArray  # (M + 1,) where each unit's corners begin
+    joint_at: IntArray  # (M,) where the factor of a unit of several corners begins among those of all
+    chunk: IntArray  # (Q + 1,) where each chunk's units begin
+    # the pairs that chunks touch, ascending in each, and (Q + 1,) where they begin
     touched: IntArray
     touched_at: IntArray
+    # as in Arrays
     control: FloatArray
     control_root: FloatArray
-    length_at: IntArray
+    length_at: IntArray  # (M + 1,) where each unit's known lengths begin
+    # the lengths, sorted by unit
     length_first: IntArray
     length_second: IntArray
     length_m: FloatArray
     length_root: FloatArray
+    # observations and corners of a unit, at most
     most_seen: int
     most_joined: int
+    # (M,) units that are not eliminated: their factor is the identity, and nothing couples to them
     kept: BoolArray
 
 
@@ -115,22 +105,17 @@ def joint_offsets(joined: IntArray) -> IntArray:
 
 
 class Base(NamedTuple):
-    """Where a problem is linearised, and the factors of V there.
+    """Where a problem is linearised, and the factors of V there."""
 
-    Attributes:
-        table: of the pairs (P, 16).
-        corners: (N, 2).
-        code, scale: of the loss.
-        lower, joint: L of corners that stand alone (3, N), and of units of several, one after the other.
-        rows: L^-1 W' (2 N, D) where frames have no states; else (0, D): it is computed anew, by observation.
-    """
-
-    table: FloatArray
-    corners: FloatArray
+    table: FloatArray  # of the pairs (P, 16)
+    corners: FloatArray  # (N, 2)
+    # of the loss
     code: int
     scale: float
+    # L of corners that stand alone (3, N), and of units of several, one after the other
     lower: FloatArray
     joint: FloatArray
+    # L^-1 W' (2 N, D) where frames have no states; else (0, D): it is computed anew, by observation
     rows: FloatArray
 
 

@@ -27,27 +27,16 @@ from v2hdm.records import FloatArray
 
 
 class Linearisation(NamedTuple):
-    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks.
+    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks."""
 
-    Attributes:
-        costs: (Q, 3) of observations, survey and known lengths.
-        wrench: (R, 6) the gradient by the pairs.
-        coupled: (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states.
-        carried: (Q, D) the same by the cameras' unknowns, where they have none.
-        whitened: (2 N,) the gradient by the corners, L^-1 g.
-        own: J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21).
-        tip: (Q, D, D) B'B of the cameras' unknowns, its lower triangle.
-        failed: (Q,) units whose block has no factor.
-    """
-
-    costs: FloatArray
-    wrench: FloatArray
-    coupled: FloatArray
-    carried: FloatArray
-    whitened: FloatArray
-    own: FloatArray
-    tip: FloatArray
-    failed: FloatArray
+    costs: FloatArray  # (Q, 3) of observations, survey and known lengths
+    wrench: FloatArray  # (R, 6) the gradient by the pairs
+    coupled: FloatArray  # (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states
+    carried: FloatArray  # (Q, D) the same by the cameras' unknowns, where they have none
+    whitened: FloatArray  # (2 N,) the gradient by the corners, L^-1 g
+    own: FloatArray  # J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21)
+    tip: FloatArray  # (Q, D, D) B'B of the cameras' unknowns, its lower triangle
+    failed: FloatArray  # (Q,) units whose block has no factor
 
 
 @inlined
@@ -95,17 +84,10 @@ def linearise(
     scratch: Scratch,
     out: Linearisation,
 ) -> None:
-    """Linearise chunks ``begin`` to ``end``.
+    """Linearise chunks ``begin`` to ``end``; factors and rows of ``base`` are written.
 
-    Args:
-        begin: the first chunk.
-        end: the chunk after the last.
-        layout: the problem.
-        base: where; its factors and rows are written.
-        clock: (P, 6 Q) the pairs' left tangents by the clock offset of their camera.
-        by_pair: whether J'J is asked for by pair.
-        scratch: room to work in.
-        out: where the results go.
+    ``clock`` (P, 6 Q) are the pairs' left tangents by the clock offset of their camera; ``by_pair`` asks for
+    J'J by pair.
     """
     table, corners, states = base.table, base.corners, len(base.rows) == 0
     cameras, width = len(table) // layout.moments, out.tip.shape[1]

@@ -16,12 +16,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 @kernel
 def back_project(
-    begin: int,
-    end: int,
-    layout: Layout,
-    table: FloatArray,
-    corners: FloatArray,
-    fixed: BoolArray,
+    begin: int, end: int, layout: Layout, table: FloatArray, corners: FloatArray, fixed: BoolArray
 ) -> None:
     """Start the corners (N, 2) of chunks ``begin`` to ``end``, and say which (N,) a ray fixes."""
     for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):

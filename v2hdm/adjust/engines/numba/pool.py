@@ -10,8 +10,7 @@ from functools import lru_cache
 
 import torch
 
-# Below this many observations starting threads costs more than they save.
-_WORTH_THREADS = 50_000
+_WORTH_THREADS = 50_000  # below this many observations starting threads costs more than they save
 
 _granted: int | None = None
 
@@ -20,12 +19,8 @@ _granted: int | None = None
 def one_thread_in_torch(observations: int, alone: bool) -> Iterator[None]:
     """Within, torch computes on one thread, and kernels on as many as torch had.
 
-    Its products are small here, and threads that wait for each other after each of them cost more than they
-    save: on a machine that is busy otherwise, many times the whole solve.
-
-    Args:
-        observations: of the problem.
-        alone: whether torch has nothing large to do, whatever the number of observations.
+    Its products are small here, and threads that wait for each other cost more than they save. ``alone`` says
+    that torch has nothing large to do, whatever the number of ``observations``.
     """
     global _granted
     before, granted = torch.get_num_threads(), _granted

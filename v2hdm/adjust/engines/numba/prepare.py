@@ -67,10 +67,7 @@ def lay_out(
     measured: FloatArray,
     root: FloatArray,
 ) -> int:
-    """Write these of :class:`~v2hdm.adjust.arrays.Arrays` for observations in an order (K,).
-
-    Returns a place in that order, of an observation that is the same as the one before it, or -1.
-    """
+    """Write observations in an order (K,); returns a place there that repeats the one before, or -1."""
     again = -1
     for i in range(len(order)):
         k = order[i]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.mounting import mounting_angles
+from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
@@ -40,10 +40,7 @@ IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
 
 
 def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
-    """The content of a ``drive.yaml`` for the bag at ``path``, which names the bag relative to its folder.
-
-    Raises DriveError where the bag does not suffice.
-    """
+    """The content of a ``drive.yaml`` for the bag at ``path``; DriveError where it does not suffice."""
     folder = entry_folder(cache, bag_files(path), "drive", ["bare"])
     if not is_whole(folder):
         description = BagDescription(path, cache)
@@ -71,10 +68,7 @@ def list_topics(path: Path, cache: Path) -> str:
 
 
 class BagDescription:
-    """The ``content`` of a ``drive.yaml`` as far as a bag tells it.
-
-    ``missing`` has the keys that stay "?", dotted, each with what it is asked for.
-    """
+    """The ``content`` of a ``drive.yaml`` as far as a bag tells it, and the ``missing`` keys, dotted."""
 
     def __init__(self, path: Path, cache: Path) -> None:
         self.missing: dict[str, str] = {}

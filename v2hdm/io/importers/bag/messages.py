@@ -9,8 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError
-from v2hdm.extras import need
+from v2hdm.errors import DriveError, need
 from v2hdm.io.importers.tables import Attitudes, Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import checked_rotations, in_order
@@ -22,7 +21,6 @@ RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGE_KINDS = (RAW, COMPRESSED)
 
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-
 
 # Channels, and OpenCV's conversion to BGR.
 _ENCODINGS: Mapping[str, tuple[int, int | None]] = {
@@ -97,9 +95,9 @@ class VideoDecoder:
         self._complained = False
 
     def frames(self, data: bytes | None, number: int) -> Iterator[tuple[int, np.ndarray]]:
-        """The frames that the packet ``number`` completes, with their packets' numbers; None ends the video.
+        """The frames (H, W, 3) BGR that packet ``number`` completes, with their numbers; None ends the video.
 
-        Pixels are (H, W, 3) BGR. Frames before the first key frame never come. Raises DriveError on damage.
+        Frames before the first key frame never come. Raises DriveError on damage.
         """
         packet = None
         if data is not None:

@@ -15,8 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from v2hdm.errors import DriveError
-from v2hdm.extras import need
+from v2hdm.errors import DriveError, need
 from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -73,10 +72,7 @@ def _parts(path: Path) -> list[Path]:
 
 
 class Bag:
-    """An open bag: a reader for each of its files, in the order of time.
-
-    Types are taken from the bag when needed: unknown definitions, such as services', matter to no other.
-    """
+    """An open bag: a reader for each of its files, in the order of time; types are taken when needed."""
 
     def __init__(self, path: Path, readers: Sequence[Any]) -> None:
         self.path = path
@@ -94,10 +90,7 @@ class Bag:
         }
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """The messages of some topics, those of each in the order in which they were received.
-
-        Raises DriveError when the bag is damaged, holds fewer messages than it says, or lacks their types.
-        """
+        """The messages of some topics in the order received; DriveError where damaged, or some lack."""
         missing = sum(self.topics[name].messages for name in topics if name in self.topics)
         streams = (
             reader.messages(connections=wanted)

@@ -43,10 +43,7 @@ Writer = Generator[None, Message | None, None]  # is sent its messages, then Non
 
 
 class Stream(ABC):
-    """One stream, which ``label`` and ``settings`` distinguish from others of the bag.
-
-    ``needs`` are its topics, each with the types that it may be of and the place that names it.
-    """
+    """One stream of a bag, which ``label`` and ``settings`` tell from others; ``needs`` are its topics."""
 
     def __init__(
         self, label: str, settings: Any, where: str, *needs: tuple[str, Collection[str], str]
@@ -207,10 +204,7 @@ class TfStream(Stream):
 
 
 def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[Path]:
-    """The folders of ``streams`` of the bag at ``path``, imported now unless they were before.
-
-    Raises DriveError when the bag is damaged, lacks a topic, or the cache cannot be written.
-    """
+    """The folders of ``streams``, imported now unless before; raises DriveError where that fails."""
     files = bag_files(path)
     folders = [entry_folder(cache, files, stream.label, stream.settings) for stream in streams]
     missing = {folder: one for folder, one in zip(folders, streams, strict=True) if not is_whole(folder)}

@@ -55,10 +55,7 @@ class Frames:
         return out
 
     def moving(self, dst: str, src: str, max_gap_s: float, where: str) -> Trajectory:
-        """``dst_from_src`` at the times of the busiest edge between them, within all of them.
-
-        Raises DriveError when they are not connected, do not move, or never at one time.
-        """
+        """``dst_from_src`` at the times of the busiest edge between them; DriveError where there are none."""
         path = self._path(dst, src)
         if path is None:
             names = ", ".join(self.names)

@@ -1,4 +1,4 @@
-"""A solution made ready for score tests: residuals, and their derivatives less all that is estimated."""
+"""How the residuals of a solution answer to what it has not estimated, all that it has moving along."""
 
 from __future__ import annotations
 
@@ -12,27 +12,17 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.model import (
-    Estimate,
-    Gradient,
-    points_in_camera,
-    prior_residuals,
-    rigid,
-    robustified,
-)
+from v2hdm.adjust.model import Estimate, Gradient, points_in_camera, prior_residuals, rigid, robustified
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
-_STEP = 1e-3
-"""Step of the priors' central differences, in the unit of the fault (s or rad): millimetres of motion."""
+_STEP = 1e-3  # step of the priors' central differences, in the fault's unit (s or rad): millimetres of motion
 
-STRETCHES = 24
-"""Stretches that the route is divided into: several metres each, longer than most errors go together."""
+STRETCHES = 24  # stretches that the route is divided into: metres each, longer than most errors go together
 
-_DRAWS = 16
-"""Draws of the model's own noise: what the stretches would disagree by is known to a tenth."""
+_DRAWS = 16  # draws of the model's own noise: what the stretches would disagree by is known to a tenth
 
 _AT_ONCE = 64  # columns whose gradients are in memory together
 
@@ -42,26 +32,18 @@ of :func:`v2hdm.adjust.model.prior_residuals`; kinds that a fault does not touch
 
 
 @dataclass(frozen=True)
-class Bench:
-    """A solution made ready for tests: with the roots of weights, least squares remain.
+class Sensitivity:
+    """A solution as weighted least squares, whose residuals can be derived by further parameters."""
 
-    Attributes:
-        whitening: the solution's Hessian.
-        root: (K,) of the weights.
-        residuals: of everything.
-        whitened_px: (2, K) residuals of the observations without weights.
-        stretch: (J,) of the route that each frame is in, from 0.
-    """
-
-    whitening: Whitening
-    root: Tensor
-    residuals: Rows
-    whitened_px: Tensor
-    stretch: Tensor
+    whitening: Whitening  # the solution's Hessian
+    root: Tensor  # (K,) of the weights
+    residuals: Rows  # of everything
+    whitened_px: Tensor  # (2, K) residuals of the observations without weights
+    stretch: Tensor  # (J,) of the route that each frame is in, from 0
 
     @classmethod
-    def at(cls, whitening: Whitening) -> Bench:
-        """The bench of a solution's Hessian."""
+    def at(cls, whitening: Whitening) -> Sensitivity:
+        """That of a solution, by its Hessian."""
         engine, estimate = whitening.engine, whitening.estimate
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
@@ -226,34 +208,30 @@ def stretches(arrays: Arrays) -> Tensor:
     return stretch
 
 
-def raised(bench: Bench, height: Tensor) -> Rows:
+def raised(solved: Sensitivity, height: Tensor) -> Rows:
     """Corners that each observation (K,) sees so much higher, m, a unit of the value."""
-    return {"observations": bench.seen(height[:, None] * bench.poses[:, :3, 2])}
+    return {"observations": solved.seen(height[:, None] * solved.poses[:, :3, 2])}
 
 
 def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
-    """The information of a drive on parameters that raise the ground, all else being estimated with them.
+    """The information (B, B) on parameters that raise the ground, and the gradient (B,) of the cost by them.
 
-    Args:
-        solution: at the parameters' present values.
-        heights: (K, B) sparse, m by which a unit of each raises what each observation of the problem shows.
-
-    Returns:
-        The information (B, B) on them, and the gradient (B,) of the cost.
+    ``heights`` (K, B), sparse, are m by which a unit of each raises what each observation of the problem
+    shows.
     """
-    bench = Bench.at(solution.covariance.whitening)
-    unit = raised(bench, torch.ones_like(bench.root))["observations"]
-    columns = heights[bench.arrays.order.cpu().numpy()]
+    solved = Sensitivity.at(solution.covariance.whitening)
+    unit = raised(solved, torch.ones_like(solved.root))["observations"]
+    columns = heights[solved.arrays.order.cpu().numpy()]
     squared = unit.square().sum(0).cpu().numpy()
     information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
     seen = np.flatnonzero(information.diagonal() > 0)
     by_column = columns[:, seen].tocsc()
-    coupled, weighted = bench.root.new_zeros(len(seen), bench.whitening.size), unit * bench.root
+    coupled, weighted = solved.root.new_zeros(len(seen), solved.whitening.size), unit * solved.root
     for begin in range(0, len(seen), _AT_ONCE):
         lifted = torch.as_tensor(by_column[:, begin : begin + _AT_ONCE].toarray().T).to(unit)
-        pulled = [bench.whitening.pull(weighted * one) for one in lifted]
-        coupled[begin : begin + _AT_ONCE] = bench.whitening.whiten(pulled)
+        pulled = [solved.whitening.pull(weighted * one) for one in lifted]
+        coupled[begin : begin + _AT_ONCE] = solved.whitening.whiten(pulled)
     information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
-    gradient = columns.T @ (unit * bench.residuals["observations"]).sum(0).cpu().numpy()
-    gradient[seen] -= (coupled @ bench.whitening.gradient).cpu().numpy()
+    gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()
+    gradient[seen] -= (coupled @ solved.whitening.gradient).cpu().numpy()
     return information, gradient
