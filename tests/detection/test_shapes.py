@@ -4,16 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.detection.pictures import (
-    LENSES,
-    bar,
-    diamond,
-    make_camera,
-    output_of,
-    picture,
-    to_image,
-    view_of,
-)
+from tests.detection.pictures import LENSES, bar, diamond, make_camera, output_of, picture, to_image, view_of
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import CHANNELS, SIZE

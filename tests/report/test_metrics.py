@@ -16,13 +16,7 @@ from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
 from v2hdm.report import figures, style
 from v2hdm.report.check_points import COLUMNS, write_check_points
 from v2hdm.report.figures import save_birdseye
-from v2hdm.report.metrics import (
-    corner_errors,
-    driven_past,
-    extrinsic_metrics,
-    lane_metrics,
-    marking_metrics,
-)
+from v2hdm.report.metrics import corner_errors, driven_past, extrinsic_metrics, lane_metrics, marking_metrics
 from v2hdm.report.photos import save_overlay
 from v2hdm.report.terminal import METHODS, results_table
 
