@@ -345,7 +345,7 @@ def images() -> Iterator[Case]:
         yield checked(f"image in a drive: {name}", says, write("front/images/000001.jpg", data))
     yield detects("image: damaged inside", "a.jpg", write("a.jpg", damaged_inside()), "damaged")
     deep = picture(".png", depth=np.uint16)
-    yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits")
+    yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits a channel; convert it to 8 bits")
     yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
     yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
     for orientation in range(2, 9):
@@ -434,7 +434,14 @@ def outputs() -> Iterator[Case]:
         ),
         ("output is a file of the user's", "imgs --output precious.txt", imgs, "holds no det"),
         ("output is a folder", "imgs --output imgs", imgs, "give another --output"),
-        ("output in a file", "imgs --output precious.txt/x", imgs, "cannot write"),
+        ("output in a file", "imgs --output precious.txt/x", imgs, "give another --output"),
+        ("drawings in a file", "imgs --draw precious.txt/x", imgs, "give another --draw"),
+        (
+            "a drawing is a folder",
+            "imgs --draw d",
+            both(imgs, _folder_with("d/a.jpg", "x")),
+            "give another --draw",
+        ),
     ):
         yield detects(name, line, prepare, says)
     yield detects("output on a full disk", "imgs --output x.jsonl", imgs, "cannot write", disk_bytes=1)
@@ -494,16 +501,18 @@ def arguments() -> Iterator[Case]:
     }.items():
         yield Case(f"check {line}", CHECK, line.split(), drive(), says)
     for line, says in {
-        "nowhere.jpg": "no such image",
+        "nowhere.jpg": "nowhere.jpg: no such image, video or folder",
         "precious.txt": "neither an image nor a video",
         "imgs --limit 0": "--limit 0",
         "imgs --threads 0": "threads is 0",
-        "imgs --threads 99999": "threads is 99999",
-        "imgs --model nowhere.onnx": "nowhere.onnx",
-        "imgs --model precious.txt": "precious.txt",
+        "imgs --threads 99999": "threads is 99999: set 1 to 256",
+        "imgs --model nowhere.onnx": "nowhere.onnx: no such detector model",
+        "imgs --model precious.txt": "precious.txt: not a usable ONNX model",
         "imgs --camera nowhere.yaml": "nowhere.yaml: no such file",
         "imgs --camera precious.txt": "precious.txt",
-        "imgs --mounting 0 5 60": "--mounting 0",
+        "imgs --mounting 0 5 60": "give a height above 0 m",
+        "imgs --mounting -1 5 60": "give a height above 0 m",
+        "imgs --mounting inf 5 60": "give a height above 0 m",
         "imgs --mounting nan 5 60": "--mounting nan",
         "imgs --mounting 1.6 5 600": "--mounting",
     }.items():
@@ -650,7 +659,7 @@ def _run_file(data: bytes) -> Prepare:
 def all_cases() -> list[Case]:
     """The table."""
     parts = (
-        texts, points, names, images, damages, fields, outputs, owners, geopackages, small, arguments, settings,
-        numbers,
+        texts, points, names, images, damages, fields, outputs, owners, geopackages, small,
+        arguments, settings, numbers,
     )  # fmt: skip
     return [case for part in parts for case in part()]
