@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -16,7 +17,6 @@ from tests.drive.example import looking_forward
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
 from v2hdm.io.drive import read_drive
 from v2hdm.records import Drive, FloatArray
-import yaml
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)

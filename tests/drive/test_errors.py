@@ -1,4 +1,4 @@
-"""Drives that cannot be read as wished, damaged truth, and regions beside the image; tests/faults has the rest."""
+"""Drives that cannot be read as wished, damaged truth, and regions beside the image; more in tests/faults."""
 
 import numpy as np
 import pytest
