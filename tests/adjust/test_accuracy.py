@@ -55,11 +55,8 @@ def state_covariance(scene):
 
 def dense_bound_m2(scene):
     """Mean trace of the corners' blocks of the whole inverse information."""
-    cameras, frames, truth = (
-        len(scene.problem.intrinsic),
-        len(scene.problem.map_from_vehicle),
-        truth_of(scene),
-    )
+    cameras, frames = len(scene.problem.intrinsic), len(scene.problem.map_from_vehicle)
+    truth = truth_of(scene)
 
     def residuals(x):
         parts = reference_residuals(scene.problem, x)

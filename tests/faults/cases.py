@@ -543,7 +543,7 @@ SETTINGS = _plainly(
     "workers=-1 device=tpu mode=x mapping.max_range_m=nan mapping.max_range_m=inf mapping.max_range_m=0 "
     "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_length_m=-1 detector.threads=0 "
     "detector.blur_px=99 detector.max_range_m=-1 detector.min_score=nan detector.border_px=-3 "
-    "drive.max_gap_s=-1 drive.max_gap_s=nan"
+    "detector.lane_step_m=-1 drive.max_gap_s=-1 drive.max_gap_s=nan"
 ) | {
     "workers=99999999999999999999": "workers is",
     "workers=many": "workers=many",

@@ -59,15 +59,9 @@ def owners() -> Iterator[Case]:
         yield Case(f"map over its base {base}", "v2hdm map", words, _site(_own_base), "one of the inputs")
     for file, prepare, words in _exports():
         for name, harm in HARMS.items():
-            says = "move it, or give another --output"
-            case = f"export onto {name}: {words}"
-            yield Case(
-                case,
-                "v2hdm export",
-                words.split(),
-                both(prepare, lambda root, file=file, harm=harm: harm(root / file)),
-                says,
-            )
+            harmed = both(prepare, lambda root, file=file, harm=harm: harm(root / file))
+            says, case = "move it, or give another --output", f"export onto {name}: {words}"
+            yield Case(case, "v2hdm export", words.split(), harmed, says)
 
 
 def _site(more: Callable[[Path], None]) -> Prepare:

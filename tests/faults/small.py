@@ -36,14 +36,8 @@ def entries(**content: object) -> Change:
     return described(lambda given: given.update(content))
 
 
-ROUTE = {
-    "stamp_s": "100",
-    "x_m": "0",
-    "y_m": "0",
-    "yaw_deg": "0",
-    "sigma_m": ".02",
-    "heading_sigma_deg": ".1",
-}
+ROUTE = {"stamp_s": "100", "x_m": "0", "y_m": "0", "yaw_deg": "0", "sigma_m": ".02"}
+ROUTE |= {"heading_sigma_deg": ".1"}
 ROUTES = [
     *(("sigma_m", cell, "sigma_m|cells under|no table") for cell in NO_NUMBERS),
     *(("heading_sigma_deg", cell, "heading_sigma_deg|cells under|no table") for cell in NO_NUMBERS),
