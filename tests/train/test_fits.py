@@ -108,9 +108,9 @@ def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
 
 def test_readings_that_were_gathered_in_parts_are_those_gathered_at_once(tmp_path):
     cv2.setNumThreads(1)
-    ranges = range(0, 2), range(2, 3), range(0, 3)
+    ranges = range(0, 1), range(1, 2), range(0, 2)
     parts = [
-        fit_judge.Part(numbers, 3, weights.NETWORK_FILE, tmp_path / f"{k}.npz")
+        fit_judge.Part(numbers, 2, weights.NETWORK_FILE, tmp_path / f"{k}.npz")
         for k, numbers in enumerate(ranges)
     ]
     first, second, whole = (Gathered.load([fit_judge.gather(part).path]) for part in parts)
