@@ -1,5 +1,6 @@
 """What a user knows beforehand, surveyed corners and sizes; and inputs that the drive contradicts."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -278,13 +279,14 @@ def test_known_sizes_that_the_paint_does_not_have_are_dropped_and_told(scene):
     assert np.median(np.linalg.norm(longest, axis=1)) > 1.15
 
 
-def test_a_surveyed_point_that_lies_elsewhere_is_dropped_and_the_others_stay(scene):
+def test_a_surveyed_point_that_lies_elsewhere_is_dropped_and_one_far_from_the_map_warned_of(scene, caplog):
     known = mapped(scene, scene.drive).hd_map.markings
     points = [m.corners_map[0] for m in known[2:14:3]]
     points[1] = points[1] + (0.15, 0.0)
-    survey = survey_of(*points, sigma_m=0.005)
+    survey = survey_of(*points, (500.0, 3.0), sigma_m=0.005)
     result = mapped(scene, scene.drive, replace(OPTIONS, survey=survey))
     assert [one.about for one in result.evidence.corrected] == [f"({points[1][0]:.2f}, {points[1][1]:.2f})"]
+    assert re.search(r"1 of [45] surveyed points are of no use.*\(500\.00, 3\.00\)", caplog.text)
 
 
 def test_a_clock_60_ms_late_is_put_right(scene):
