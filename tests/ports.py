@@ -1,12 +1,14 @@
 """The rendered ports that tests share: each is rendered once a run, whichever process asks for it first."""
 
 import fcntl
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.drive.example import description
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
@@ -44,6 +46,14 @@ def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
     drive_config = DriveConfig(path=str(drive))
     given = {"name": "short", "drive": drive_config, "output": str(output), "workers": 1}
     return RunConfig(**{**given, "cache": f"{output}.cache", **changes})
+
+
+def blind_copy(drive: Path, target: Path) -> Path:
+    """The drive, whose truth nobody knows."""
+    shutil.copytree(drive, target, ignore=shutil.ignore_patterns("truth"))
+    with description(target) as content:
+        content.pop("truth")
+    return target
 
 
 @pytest.fixture(scope="session")

@@ -157,6 +157,7 @@ def test_the_catalogue_of_the_documentation_is_read():
         ("pad: {family: stripe, length_m: 1.2, width_m: [1, 2]}", "length_m of 'pad'"),
         (f"pad: {{family: stripe, {SIZES}, softness: soft}}", "softness of 'pad'"),
         (f"pad: {{family: stripe, {SIZES}, softness: .inf}}", "softness of 'pad'"),
+        (f"pad: {{family: stripe, {SIZES}, softness: 0}}", "softness of 'pad'"),
         ("pad: stripe", "'pad' may have"),
     ],
 )

@@ -69,16 +69,8 @@ def test_what_is_saved_is_what_the_command_writes(names, tmp_path):
     from v2hdm.cli.main import run
 
     saved = names["result"].save(tmp_path / "saved")
-    drive = f"drive.path={names['port'].root}"
-    given = [
-        drive,
-        "name=run",
-        f"output={tmp_path}",
-        f"cache={tmp_path / 'cache'}",
-        "workers=1",
-        "accuracy_goal_cm=10",
-    ]
-    assert run(["map", *given]) == 0
+    given = f"name=run output={tmp_path} cache={tmp_path / 'cache'} workers=1 accuracy_goal_cm=10"
+    assert run(["map", f"drive.path={names['port'].root}", *given.split()]) == 0
     written = {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*") if path.is_file()}
     of_runs = {Path("config.yaml"), Path("run.log")}
     assert {path.relative_to(saved) for path in saved.rglob("*") if path.is_file()} == written - of_runs

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.cameras import mounted
 from v2hdm.adjust import Observations, PoseSigma, Problem
 from v2hdm.geometry.rigid import exp
 
@@ -29,18 +30,6 @@ class Scene:
         return np.rad2deg(
             np.linalg.norm(Rotation.from_matrix(off.reshape(-1, 3, 3)).as_rotvec(), axis=1)
         ).reshape(off.shape[:-2])
-
-
-def mounted(x: float, height: float, pitch_deg: float, *, rear: bool = False, y: float = 0.0) -> np.ndarray:
-    """``cam_from_vehicle`` of a camera looking forward (or back) and down by ``pitch_deg``."""
-    forward = np.array([-1.0 if rear else 1.0, 0, 0])
-    pitch = np.deg2rad(pitch_deg)
-    ahead = np.cos(pitch) * forward - np.sin(pitch) * np.array([0, 0, 1])
-    right = np.cross(forward, [0, 0, 1.0])
-    rotation = np.stack([right, np.cross(ahead, right), ahead])
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, -rotation @ [x, y, height]
-    return out
 
 
 def route(frames: int, step_m: float, turn_deg_per_m: float, straight_m: float) -> np.ndarray:
@@ -126,7 +115,9 @@ def make_scene(
     """
     rng = np.random.default_rng(seed)
     if mounts is None:
-        mounts = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
+        mounts = np.stack([mounted((1.5, 0.0, 2.4), 18), mounted((-1.0, 0.2, 2.6), 22, yaw_deg=180)])[
+            :cameras
+        ]
     cameras = len(mounts)
     truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ mounts
     recorded = route(frames, step_m, turn_deg_per_m, straight_m) if driven is None else driven
@@ -197,9 +188,9 @@ def with_late_clocks(scene: Scene, offset_s: np.ndarray) -> Scene:
     return replace(scene, problem=problem, map_from_vehicle=poses)
 
 
-def project(cam_from_map: np.ndarray, points_map: np.ndarray) -> np.ndarray:
-    """Pixels (K, 2) of ground points (K, 2), each by a transform of its own."""
-    ground = np.column_stack([points_map, np.zeros(len(points_map)), np.ones(len(points_map))])
+def project(cam_from_map: np.ndarray, points_map: np.ndarray, z_m: np.ndarray | float = 0.0) -> np.ndarray:
+    """Pixels (K, 2) of points (K, 2) at heights, each by a transform of its own."""
+    ground = np.column_stack([points_map, np.broadcast_to(z_m, len(points_map)), np.ones(len(points_map))])
     points = (cam_from_map @ ground[..., None])[:, :3, 0]
     return FOCAL * points[:, :2] / points[:, 2:] + np.array([WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
 

@@ -24,10 +24,8 @@ def site(drives: int, frames: int, overlap: int, *, every_m: float = 2.0, seed: 
     sigmas = [(DRIFTING, SCATTERING)[number % 2] for number in range(drives)]
     parts = []
     for number, sigma in enumerate(sigmas):
-        rng, own = (
-            np.random.default_rng(seed + 100 * number),
-            slice(number * stride, number * stride + frames),
-        )
+        rng = np.random.default_rng(seed + 100 * number)
+        own = slice(number * stride, number * stride + frames)
         true = poses[own] @ exp(pose_errors(poses[own], sigma, 0.5, rng))
         mine = np.flatnonzero((seen.frame >= own.start) & (seen.frame < own.stop))
         frame = seen.frame[mine] - own.start

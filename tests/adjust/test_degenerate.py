@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.adjust.scene import make_scene, mounted, rows_of
+from tests.adjust.scene import make_scene, rows_of
+from tests.cameras import mounted
 from v2hdm.adjust import (
     ControlPoints,
     Drift,
@@ -144,7 +145,7 @@ def test_an_unknown_option_is_refused_with_the_choices(change, message):
 def test_an_extrinsic_that_looks_at_the_sky_is_refused_with_advice():
     problem = street(cameras=1)
     with pytest.raises(AdjustError, match="no ray of corner 0 meets the ground"):
-        solve(replace(problem, cam_from_vehicle=mounted(1.5, 2.4, -80)[None]))
+        solve(replace(problem, cam_from_vehicle=mounted((1.5, 0.0, 2.4), -80)[None]))
 
 
 def finite(solution):

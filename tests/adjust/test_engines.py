@@ -1,6 +1,5 @@
 """Engines agree: compiled kernels, in closed form, with the model's page, differentiated by autograd."""
 
-import inspect
 from collections import Counter
 from dataclasses import is_dataclass, replace
 
@@ -10,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.adjust.scene import make_scene, with_late_clocks
+from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.engines import make_engine
@@ -26,7 +25,7 @@ POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003
 MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)]
 
 
-def example(*, lengths=True, frames=40, seed=3):
+def example(*, lengths=True, rolling=False, frames=40, seed=3):
     """A drive with all that a model can know: clocks, drifts, a survey, lengths, covariances of any shape."""
     scene = with_late_clocks(make_scene(seed, frames=frames, outliers=0.05), np.array([0.02, -0.01]))
     problem, rng = scene.problem, np.random.default_rng(0)
@@ -42,18 +41,17 @@ def example(*, lengths=True, frames=40, seed=3):
         np.array([[0.02, 0.03], [0.05, 0.01], [0.01, np.inf]]),
         np.array([[1.0, 0.0], [0.6, 0.8], [-0.8, 0.6]]),
     )
-    return replace(
-        problem,
-        observations=replace(problem.observations, covariance_px=root @ root.transpose(0, 2, 1)),
-        pose_sigma=POSES,
-        control=control,
-        lengths=known if lengths else None,
-    )
+    seen = replace(problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
+    if rolling:
+        seen = replace(seen, row_share=seen.pinhole_px[:, 1] / (HEIGHT - 1) - 0.5)
+        problem = replace(problem, read_out_s=np.array([0.03, 0.02]))
+    known = known if lengths else None
+    return replace(problem, observations=seen, pose_sigma=POSES, control=control, lengths=known)
 
 
-def engines(problem, pose_states, clock=False):
+def engines(problem, pose_states, clock=False, read_out=False):
     """Kernels and autograd over a problem."""
-    arrays = make_arrays(problem, pose_states, "cpu", clock)
+    arrays = make_arrays(problem, pose_states, "cpu", clock, read_out)
     return make_engine("numba", arrays), make_engine("torch", arrays)
 
 
@@ -95,12 +93,13 @@ def assert_same(one, other, share=1e-12):
     size=st.sampled_from([0.0, 1e-9, 0.01]),
     lengths=st.booleans(),
     behind=st.booleans(),
+    rolling=st.booleans(),
 )
-def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, lengths, behind):
+def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, lengths, behind, rolling):
     """Cost, gradient and all blocks, of drives with everything that a model can know, to 1e-12."""
     (pose_states, clock), rng = model, np.random.default_rng(seed)
-    problem = example(lengths=lengths, frames=14, seed=seed % 7)
-    numba, by_torch = engines(problem, pose_states, clock)
+    problem = example(lengths=lengths, rolling=rolling, frames=14, seed=seed % 7)
+    numba, by_torch = engines(problem, pose_states, clock, rolling and clock)
     robust = Loss(loss, float(rng.uniform(1, 4)))
     estimate = estimate_of(numba, problem, torch.Generator().manual_seed(seed), size, behind)
     assert_same(numba.poses(estimate), by_torch.poses(estimate))
@@ -261,10 +260,3 @@ def test_residuals_and_gradients_of_a_solve_by_torch_are_those_of_kornia(monkeyp
     for one in evaluated:
         assert min(one[name] for name in ("transform_points", "project_points", "exp")) > 0
     assert calls["project_points"] > len(evaluated)
-
-
-def test_a_model_s_page_writes_no_derivative_and_no_loop():
-    """Of what engines share, the model alone says what a residual is."""
-    source = inspect.getsource(model)
-    assert "jacobian" not in source
-    assert "for run in" not in source

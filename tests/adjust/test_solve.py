@@ -1,13 +1,12 @@
 """Recovery of known streets, and the optimum against an independent solver."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
+from tests.adjust.reference import reference_residuals, truth_of
 from tests.adjust.scene import make_scene, rows_of, with_late_clocks
 from v2hdm.adjust import (
     ControlPoints,
@@ -25,46 +24,14 @@ POSES = PoseSigma()
 REAL = PoseSigma(position_m=0.02, heading_rad=0.0017, roll_pitch_rad=0.005, height_m=0.01)
 
 
-def reference_residuals(problem, x):
-    """The model of the problem's docstring, written anew in plain numpy: all residuals, flat."""
-    cameras, frames, count = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
-    extrinsic, state, corners = np.split(x, [6 * cameras, len(x) - 2 * count])
-    extrinsic, state, corners = extrinsic.reshape(-1, 6), state.reshape(frames, 6), corners.reshape(-1, 2)
-    seen = problem.observations
-    rotation = Rotation.from_rotvec(extrinsic[:, 3:]).as_matrix() @ problem.cam_from_vehicle[:, :3, :3]
-    centre = extrinsic[:, :3]
-    # exp(s) of a pose: a rotation, and the translation V s_t with V by the textbook's closed form.
-    angle = np.linalg.norm(state[:, 3:], axis=1)[:, None, None]
-    skew = np.cross(np.eye(3)[None], state[:, None, 3:])
-    half = np.sinc(angle / (2 * np.pi)) ** 2 / 2
-    sixth = (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-30) ** 2
-    v = np.eye(3) + half * skew + sixth * skew @ skew
-    turned = problem.map_from_vehicle[:, :3, :3] @ Rotation.from_rotvec(state[:, 3:]).as_matrix()
-    shift = np.einsum("jab,jbc,jc->ja", problem.map_from_vehicle[:, :3, :3], v, state[:, :3])
-    position = problem.map_from_vehicle[:, :3, 3] + shift
-    point_map = np.column_stack([corners, np.zeros(count)])[seen.corner] - position[seen.frame]
-    point_vehicle = np.einsum("kba,kb->ka", turned[seen.frame], point_map)
-    point = np.einsum("kab,kb->ka", rotation[seen.camera], point_vehicle - centre[seen.camera])
-    focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
-    off = focal * point[:, :2] / point[:, 2:] + principal - seen.pinhole_px
-    whitened = np.einsum("kab,kb->ka", np.linalg.inv(np.linalg.cholesky(seen.covariance_px)), off)
-    prior = (centre - problem.centre_vehicle) / problem.centre_sigma_m
-    parts = [whitened.ravel(), prior.ravel(), (state / problem.pose_sigma.by_state()).ravel()]
-    if problem.lengths is not None:
-        apart = np.linalg.norm(corners[problem.lengths.first] - corners[problem.lengths.second], axis=1)
-        parts.append((apart - problem.lengths.length_m) / problem.lengths.sigma_m)
-    return np.concatenate(parts)
-
-
 def reference_optimum(scene):
     """The least cost that scipy finds from the truth."""
-    problem = scene.problem
-    turn = scene.cam_from_vehicle[:, :3, :3] @ problem.cam_from_vehicle[:, :3, :3].transpose(0, 2, 1)
-    extrinsic = np.column_stack([problem.centre_vehicle, Rotation.from_matrix(turn).as_rotvec()])
-    states = np.zeros(6 * len(problem.map_from_vehicle))
-    start = np.concatenate([extrinsic.ravel(), states, scene.corners_map.ravel()])
+
+    def residuals(x):
+        return np.concatenate([one.ravel() for one in reference_residuals(scene.problem, x).values()])
+
     exact = {"jac": "3-point", "x_scale": "jac", "ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
-    return float(least_squares(partial(reference_residuals, problem), start, **exact).cost)
+    return float(least_squares(residuals, truth_of(scene), **exact).cost)
 
 
 def sides(scene, sigma_m, error_m=0.0):

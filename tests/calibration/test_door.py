@@ -106,24 +106,11 @@ def test_a_drive_takes_the_entry_and_the_detector_the_calibration(tmp_path, intr
     np.testing.assert_allclose(detector.ipm["calibrated"], camera.ipm["calibrated"], atol=1e-12)
 
 
-def test_two_calibrations_of_one_camera_say_that_it_has_not_moved(tmp_path, intrinsics, capsys):
-    tilted = mounting((0.3, 17.0, 0.6))
-    for name, seed, truth in (("monday", 1, None), ("friday", 2, None), ("knocked", 3, tilted)):
-        table = clicked(seed, cam_from_vehicle=truth)
-        assert run(tmp_path, table, "--intrinsics", intrinsics, "--output", tmp_path / name) == 0
-    assert run_command(["calibrate", "compare", str(tmp_path / "monday"), str(tmp_path / "friday")]) == 0
-    assert run_command(["calibrate", "compare", str(tmp_path / "monday"), str(tmp_path / "knocked")]) == 3
-    assert re.search(r"front: MOVED .* pitch \+(0\.9|1\.0)", capsys.readouterr().out)
-
-
 def test_intrinsics_of_a_chain_need_the_camera_s_name(tmp_path, capsys):
     entry = {
-        "camera_model": "pinhole",
-        "distortion_coeffs": list(INFO.distortion[:4]),
-        "distortion_model": "radtan",
-        "intrinsics": [900.0, 900.0, 645.5, 355.5],
-        "resolution": [1280, 720],
-    }
+        "camera_model": "pinhole", "resolution": [1280, 720], "intrinsics": [900.0, 900.0, 645.5, 355.5],
+        "distortion_model": "radtan", "distortion_coeffs": list(INFO.distortion[:4]),
+    }  # fmt: skip
     chain = tmp_path / "chain.yaml"
     chain.write_text(
         yaml.safe_dump({"cam0": entry | {"intrinsics": [500.0, 500.0, 640.0, 360.0]}, "cam1": entry})
@@ -216,7 +203,6 @@ def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--pixel-sigma", "-1"], "--pixel-sigma -1: give a standard deviation"),
         (["--pixel-sigma", "0", "--survey-sigma", "0"], "are both 0"),
         (["--name", "a/b"], "no file name; give another --name"),
         (["--image", "half.png"], "the image is 640 x 360, but the intrinsics of 'front' are for 1280 x 720"),
@@ -253,10 +239,8 @@ def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, ca
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " "])
 def test_columns_come_in_any_order_and_with_any_separator(tmp_path, separator):
-    rows = [
-        ("x_m", "U", "name", "y_m", "v"),
-        *((x, u, f"P{n}", y, v) for n, (u, v, x, y) in enumerate(TABLE)),
-    ]
+    rows = [(x, u, f"P{n}", y, v) for n, (u, v, x, y) in enumerate(TABLE)]
+    rows = [("x_m", "U", "name", "y_m", "v"), *rows]
     path = tmp_path / "points.csv"
     path.write_text("\ufeff" + "\n".join(separator.join(map(str, row)) for row in rows) + "\n\n# the end\n")
     points = read_points(path)
@@ -270,14 +254,10 @@ TEXT = "u,v,x,y\n" + "".join(",".join(map(str, row)) + "\n" for row in TABLE)
 
 WRONG_TABLES = {
     "empty": ("", "holds no point; expected a line of column names"),
-    "three": ("\n".join(TEXT.splitlines()[:4]), "3 points; 4 barely fix a camera"),
     "no header": (TEXT.split("\n", 1)[1], "no column 'u'; the first line must name u, v, x, y"),
     "millimetres by name": (TEXT.replace("x,y", "x_mm,y_mm"), "no column 'x'; .* it says: u, v, x_mm, y_mm"),
     "twice": (TEXT.replace("u,v", "u,u"), "more than one column 'u'"),
-    "height": (
-        TEXT.replace("x,y", "x,y,z").replace("0\n", "0,0\n").replace("5\n", "5,0\n"),
-        "column 'z' is not",
-    ),
+    "height": (re.sub(r"([05])\n", r"\1,0\n", TEXT.replace("x,y", "x,y,z")), "column 'z' is not"),
     "nan": (TEXT.replace("30.0", "nan"), "line 3: u: 'nan' is not a finite number; drop or mend"),
     "words": (TEXT.replace("30.0", "left"), "line 3: u: 'left' is not a number; mend that line"),
     "decimal comma": (
@@ -314,11 +294,6 @@ def test_points_outside_the_image_and_repeated_ones_are_named(tmp_path, change, 
     with pytest.raises(DriveError, match=expected) as caught:
         check_points(points, INFO)
     assert "\n" not in str(caught.value)
-
-
-def test_good_points_pass(tmp_path):
-    check_points(read_points(write_table(tmp_path, *clicked(seed=3))), INFO)
-    assert len(PLACES) == 10
 
 
 def test_a_calibration_from_points_is_data_and_writes_nothing(tmp_path):
@@ -408,7 +383,10 @@ def test_the_door_tells_which_camera_has_moved(tmp_path, capsys):
         write_calibration(looking_ahead(), tmp_path / folder / "calibration_front.yaml")
         moved = turned(looking_ahead(rear), pitch_deg, 0)
         write_calibration(moved, tmp_path / folder / "calibration_rear.yaml")
-    assert run_command(["calibrate", "compare", str(tmp_path / "before"), str(tmp_path / "after")]) == 3
+    before, after = (str(tmp_path / name) for name in ("before", "after"))
+    assert run_command(["calibrate", "compare", before, before]) == 0
+    assert "MOVED" not in capsys.readouterr().out
+    assert run_command(["calibrate", "compare", before, after]) == 3
     front, rear_line = capsys.readouterr().out.splitlines()
     assert front.startswith("front: not moved")
     assert rear_line.startswith("rear: MOVED")

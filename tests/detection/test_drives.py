@@ -17,10 +17,9 @@ from tests.detection.pictures import (
     to_image,
 )
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.batch import detect_all, read_image, with_own_vehicle
+from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import DriveError
 from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import Drive, Image
 
@@ -55,25 +54,6 @@ def test_the_result_does_not_depend_on_the_number_of_workers(drive, model):
         assert len(a.markings) == len(b.markings) == 2
         for one, other in zip(a.markings, b.markings, strict=True):
             np.testing.assert_array_equal(one.corners_px, other.corners_px)
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_truncated_image_is_refused_by_name(drive, tmp_path, suffix):
-    path = tmp_path / f"cut{suffix}"
-    noisy = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
-    data = cv2.imencode(suffix, noisy)[1].tobytes()
-    path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(DriveError, match=f"cut{suffix}: image is truncated"):
-        read_image(Image("front", 0.0, path, np.eye(4)), drive.cameras["front"])
-
-
-def test_a_missing_image_and_one_of_another_size_are_refused_by_name(drive, tmp_path):
-    camera = drive.cameras["front"]
-    with pytest.raises(DriveError, match=r"gone\.png: image listed but missing"):
-        read_image(Image("front", 0.0, tmp_path / "gone.png", np.eye(4)), camera)
-    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((20, 40, 3), dtype=np.uint8))
-    with pytest.raises(DriveError, match="40x20 but the camera_info"):
-        read_image(Image("front", 0.0, tmp_path / "small.png", np.eye(4)), camera)
 
 
 BONNET = (slice(330, 350), slice(250, 400))

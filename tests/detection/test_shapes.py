@@ -4,23 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.detection.pictures import (
-    LENSES,
-    bar,
-    diamond,
-    make_camera,
-    output_of,
-    picture,
-    to_image,
-    view_of,
-)
+from tests.detection.pictures import LENSES, bar, diamond, make_camera, output_of, picture, to_image, view_of
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import CHANNELS, SIZE
-from v2hdm.detection.lattice import blurred_coverage, normal_pdf, normal_share
+from v2hdm.detection.lattice import blurred_coverage
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.patch import ImageQuads, LensFrames
-from v2hdm.detection.propose import Blob, _outlines, find_blobs, on_edges, outline_polygon
+from v2hdm.detection.propose import Blob, find_blobs, on_edges, outline_polygon
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import Quad, order_corners, side_frames
 from v2hdm.records import DIAMOND, LANE_DASH
@@ -34,13 +25,6 @@ def output_of_labels(labels, top=0):
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
     coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))
     return NetworkOutput(paint, coarse.astype(np.float32), [], tuple(PAINT_CLASSES), 2, top)
-
-
-def test_the_normal_distribution_is_right_to_three_digits():
-    x = np.array([[-40.0, -2.0, -1.0, 0.0, 1.0, 1.959964]], dtype=np.float32)
-    share = [[-0.5, -0.4772499, -0.3413447, 0.0, 0.3413447, 0.475]]
-    np.testing.assert_allclose(normal_share(x), share, atol=1.5e-4)
-    np.testing.assert_allclose(normal_pdf(x)[0, 3:5], [0.3989423, 0.2419707], atol=1e-6)
 
 
 def lattice(columns, rows):
@@ -74,13 +58,6 @@ def test_the_derivative_of_coverage_is_its_slope():
         before = (corner - 1) % 4
         slope = normal[corner, axis] * by_side[:, corner] + normal[before, axis] * by_side[:, 4 + before]
         np.testing.assert_allclose(slope, difference, atol=2e-3)
-
-
-def test_outlines_are_interpolated_between_neighbours():
-    level = np.full((3, 3), -1.0)
-    level[1, 1] = 3.0
-    (points,) = _outlines(level, (level > 0).astype(np.int16), 1)
-    np.testing.assert_allclose(sorted(points.tolist()), [[0.25, 1.0], [1.0, 0.25], [1.0, 1.75], [1.75, 1.0]])
 
 
 def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
@@ -150,12 +127,6 @@ def test_worn_holes_do_not_add_to_the_outline():
     blobs, _ = find_blobs(output_of_labels(labels, 100))
     inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
     assert inner.min() > 15
-
-
-def test_an_empty_picture_has_no_blobs():
-    blobs, owner = find_blobs(output_of_labels(np.zeros((8, 8), dtype=int)))
-    assert blobs == []
-    assert not owner.any()
 
 
 def test_a_piece_of_two_classes_comes_whole_and_in_its_parts():
@@ -258,23 +229,11 @@ def corners_of(shape):
     return order_corners(to_image(CAMERA, shape))
 
 
-def inside(kind):
-    """Elements (20, 20) well within the marking, as the module's margins put it."""
-    step = (np.arange(SIZE) + 0.5) / SIZE
-    along, across = (
-        np.abs((1 + 2 * margin) * (step - 0.5)) < 0.4
-        for margin in ((0.6, 0.6) if kind == DIAMOND else (0.3, 1.0))
-    )
-    return across[:, None] & along
-
-
-def outside(kind):
-    step = (np.arange(SIZE) + 0.5) / SIZE
-    along, across = (
-        np.abs((1 + 2 * margin) * (step - 0.5)) > 0.65
-        for margin in ((0.6, 0.6) if kind == DIAMOND else (0.3, 1.0))
-    )
-    return across[:, None] | along
+def elements(kind):
+    """Elements (20, 20) well within the marking and those well outside, as the module's margins put it."""
+    step = np.abs((np.arange(SIZE) + 0.5) / SIZE - 0.5)
+    along, across = ((1 + 2 * margin) * step for margin in ((0.6, 0.6) if kind == DIAMOND else (0.3, 1.0)))
+    return (across < 0.4)[:, None] & (along < 0.4), (across > 0.65)[:, None] | (along > 0.65)
 
 
 @pytest.mark.parametrize(
@@ -288,13 +247,10 @@ def outside(kind):
 )
 def test_paint_fills_the_middle_wherever_a_marking_lies(shape, kind):
     corners = corners_of(shape)
+    image, (inside, outside) = picture(CAMERA, [shape], ground=0.1, paint=0.5), elements(kind)
     for first in range(4):
-        view = seen_in_frame(
-            picture(CAMERA, [shape], ground=0.1, paint=0.5), np.roll(corners, first, axis=0), kind
-        )
-        grey = view[GREY]
-        bright, dark = grey[inside(kind)], grey[outside(kind)]
-        assert bright.min() > dark.max() + np.log(2)
+        view = seen_in_frame(image, np.roll(corners, first, axis=0), kind)
+        assert view[GREY][inside].min() > view[GREY][outside].max() + np.log(2)
         assert not view[OUTSIDE].any()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -243,3 +244,16 @@ def assert_mounted(got: Drive) -> None:
         ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
         product = got.cameras[name].ipm["estimated"] @ ground
         np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)
+
+
+def topics_for(folder: Path, bag: Path, **changes: Any) -> dict[str, Any]:
+    """The folder's ``drive.yaml`` with the topics of ``bag`` in the place of files."""
+    content: dict[str, Any] = yaml.safe_load((folder / "drive.yaml").read_text())
+    content.pop("truth")
+    content |= {"bag": str(bag), "poses": {"topic": "/odom"}}
+    for name, suffix in (("front", ""), ("rear", "/compressed")):
+        content["cameras"][name] |= {
+            "camera_info": {"topic": f"/sensing/{name}/camera_info"},
+            "images": {"topic": f"/sensing/{name}/image_raw{suffix}"},
+        }
+    return content | changes

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import yaml
 
-from tests.cameras import mounted
+from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.drive import Trajectory
@@ -98,8 +98,7 @@ def make_map() -> HdMap:
 
 
 def make_truth(drive: Drive) -> Truth:
-    poses = np.tile(np.eye(4), (len(drive.images), 1, 1))
-    poses[:, 0, 3] = [5.0 * (image.stamp_s - 100.0) for image in drive.images]
+    poses = level([5.0 * (image.stamp_s - 100.0) for image in drive.images])
     visibility = np.zeros((len(drive.images), 2))
     visibility[1:4, 0] = [0.25, 1.0, 0.5]
     return Truth(

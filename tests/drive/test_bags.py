@@ -9,7 +9,6 @@ import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from tests.drive.bags import (
     assert_same_poses,
     messages_of,
     mountings,
+    topics_for,
     write_ros1,
     write_ros2,
 )
@@ -45,7 +45,6 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
 from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag import reading
-from v2hdm.io.importers.bag.describe import list_topics
 from v2hdm.io.importers.bag.messages import file_of
 from v2hdm.io.importers.bag.streams import ImageStream, TfStream, import_streams
 
@@ -84,19 +83,6 @@ def bags(tmp_path_factory, folder):
     return {kind: write(target / kind.replace(" ", "_"), folder) for kind, write in CONTAINERS.items()}
 
 
-def described(folder, bag, **changes):
-    """The folder's ``drive.yaml`` with the topics of ``bag`` in the place of files."""
-    content = yaml.safe_load((folder / "drive.yaml").read_text())
-    content.pop("truth")
-    content |= {"bag": str(bag), "poses": {"topic": "/odom"}}
-    for name, suffix in (("front", ""), ("rear", "/compressed")):
-        content["cameras"][name] |= {
-            "camera_info": {"topic": f"/sensing/{name}/camera_info"},
-            "images": {"topic": f"/sensing/{name}/image_raw{suffix}"},
-        }
-    return content | changes
-
-
 def read(root, content):
     root.mkdir(exist_ok=True)
     (root / "drive.yaml").write_text(yaml.safe_dump(content))
@@ -105,7 +91,7 @@ def read(root, content):
 
 @pytest.mark.parametrize("kind", CONTAINERS)
 def test_a_bag_is_the_same_drive_as_its_folder(kind, folder, bags, tmp_path):
-    got = read(tmp_path / "drive", described(folder, bags[kind]))
+    got = read(tmp_path / "drive", topics_for(folder, bags[kind]))
     assert_same_drive(got, read_drive(folder))
     # The rear camera's JPEG files are those that were recorded, byte by byte.
     rear = [image.path for image in got.images if image.camera == "rear"]
@@ -185,15 +171,8 @@ def test_a_drive_that_cannot_be_read_leaves_no_description(folder, tmp_path, mon
     assert not Path("mysite/drive.yaml").exists()
 
 
-def test_topics_are_listed_with_the_description(bags, tmp_path):
-    text = list_topics(bags["mcap"], tmp_path)
-    assert "/sensing/rear/image_raw/compressed         3  sensor_msgs/msg/CompressedImage" in text
-    content = yaml.safe_load(text.split("# drive.yaml\n")[1])
-    assert set(content["cameras"]) == {"front", "rear"}
-
-
 def test_a_second_reading_decodes_nothing_and_mends_what_was_damaged(folder, bags, tmp_path, caplog):
-    content = described(folder, bags["mcap"])
+    content = topics_for(folder, bags["mcap"])
     with caplog.at_level(logging.INFO, "v2hdm"):
         first = read(tmp_path / "drive", content)
         assert caplog.text.count(", once") == 1
@@ -218,13 +197,13 @@ def test_a_second_reading_decodes_nothing_and_mends_what_was_damaged(folder, bag
 
 def test_another_recording_under_the_same_name_is_imported_anew(folder, tmp_path):
     bag = write_ros1(tmp_path / "site", messages_of(folder, ros1=True))
-    count = len(read(tmp_path / "drive", described(folder, bag)).images)
+    count = len(read(tmp_path / "drive", topics_for(folder, bag)).images)
     bag.unlink()
     made = messages_of(folder, ros1=True)
     last_s = max(row[0] for row in made.rows if "image" in row[1])
     made.rows = [row for row in made.rows if row[0] < last_s or "image" not in row[1]]
     write_ros1(tmp_path / "site", made)
-    assert len(read(tmp_path / "drive", described(folder, bag)).images) == count - 2
+    assert len(read(tmp_path / "drive", topics_for(folder, bag)).images) == count - 2
 
 
 def test_a_bag_in_parts_is_read_through(folder, tmp_path):
@@ -235,7 +214,7 @@ def test_a_bag_in_parts_is_read_through(folder, tmp_path):
         half = Messages(rows=[row for row in made.rows if (row[0] > 101.0) == bool(number)])
         (file,) = write_ros2(tmp_path / f"part_{number}", half).glob("*.mcap")
         file.rename(parts / f"wbag_{number}.mcap")
-    assert_same_drive(read(tmp_path / "drive", described(folder, parts)), read_drive(folder))
+    assert_same_drive(read(tmp_path / "drive", topics_for(folder, parts)), read_drive(folder))
 
 
 def cut(path, share):
@@ -244,12 +223,12 @@ def cut(path, share):
     return path
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.4, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.999])
 @pytest.mark.parametrize("kind", CONTAINERS)
 def test_a_bag_that_is_cut_off_is_one_line(kind, share, folder, tmp_path):
     bag = cut(CONTAINERS[kind](tmp_path / "site", folder), share)
     with pytest.raises(DriveError, match=r"copy it again") as caught:
-        read(tmp_path / "drive", described(folder, bag))
+        read(tmp_path / "drive", topics_for(folder, bag))
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "drive").glob("cache/*"))
 
@@ -260,8 +239,8 @@ def test_a_topic_that_is_not_there_or_of_another_type_is_named(folder, bags, tmp
         ("/sensing/front/camera_info", r"is of type sensor_msgs/msg/CameraInfo, wanted is .*Odometry"),
     ):
         with pytest.raises(DriveError, match=message):
-            read(tmp_path / "drive", described(folder, bags["mcap"], poses={"topic": name}))
-    content = described(folder, bags["mcap"])
+            read(tmp_path / "drive", topics_for(folder, bags["mcap"], poses={"topic": name}))
+    content = topics_for(folder, bags["mcap"])
     content["cameras"]["front"]["images"] = {"topic": "/odom"}
     with pytest.raises(DriveError, match=r"camera 'front', images: topic /odom .*it has: /sensing/front"):
         read(tmp_path / "drive", content)
@@ -277,10 +256,10 @@ def test_a_type_that_the_bag_does_not_define_is_named_only_if_it_is_wanted(folde
         database.execute("UPDATE topics SET type = 'own_msgs/msg/Odd' WHERE name = '/tf_static'")
         database.execute("DELETE FROM message_definitions")
     database.close()
-    assert_same_drive(read(tmp_path / "drive", described(folder, bag)), read_drive(folder))
+    assert_same_drive(read(tmp_path / "drive", topics_for(folder, bag)), read_drive(folder))
     poses = {"topic": "/tf", "frame": "map", "vehicle": "base_link"}
     with pytest.raises(DriveError, match=r"topic /tf_static .*own_msgs/msg/Odd, wanted is TFMessage"):
-        read(tmp_path / "drive", described(folder, bag, poses=poses))
+        read(tmp_path / "drive", topics_for(folder, bag, poses=poses))
 
 
 def test_images_on_two_clocks_and_without_a_time_are_named(folder, tmp_path):
@@ -290,17 +269,7 @@ def test_images_on_two_clocks_and_without_a_time_are_named(folder, tmp_path):
         stamp.sec, stamp.nanosec = second, stamp.nanosec if second else 0
         bag = write_ros2(tmp_path / f"clocks_{second}", made)
         with pytest.raises(DriveError, match=message):
-            read(tmp_path / "drive", described(folder, bag))
-
-
-def test_poses_on_another_clock_than_images_are_named(folder, tmp_path):
-    made = messages_of(folder)
-    for _, name, message in made.rows:
-        if name == "/odom":
-            message.header.stamp.sec += 18 + 315964800
-    bag = write_ros2(tmp_path / "site", made)
-    with pytest.raises(DriveError, match=r"the poses begin 315964818 s later than the images.*one clock"):
-        read(tmp_path / "drive", described(folder, bag))
+            read(tmp_path / "drive", topics_for(folder, bag))
 
 
 @pytest.mark.parametrize(
@@ -334,7 +303,7 @@ def test_images_of_an_unknown_encoding_are_named(folder, tmp_path):
         if name == "/sensing/front/image_raw":
             message.encoding = "16UC1"
     with pytest.raises(DriveError, match="image 1: encoding '16UC1' is not known; record one of mono8"):
-        read(tmp_path / "drive", described(folder, write_ros2(tmp_path / "site", made)))
+        read(tmp_path / "drive", topics_for(folder, write_ros2(tmp_path / "site", made)))
 
 
 H265 = "lossless=1:bframes=0:keyint=2:min-keyint=2:repeat-headers=1:log-level=0"
@@ -373,7 +342,7 @@ def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(codec, folder, tm
     made.rows.sort(key=lambda row: row[0])
     bag = write_ros2(tmp_path / "site", made)
     with caplog.at_level(logging.WARNING):
-        assert_same_drive(read(tmp_path / "drive", described(folder, bag)), expected)
+        assert_same_drive(read(tmp_path / "drive", topics_for(folder, bag)), expected)
     assert "left out 1 of 4 packets of video: no key frame before them" in caplog.text
 
 
@@ -396,7 +365,7 @@ def test_memory_does_not_grow_with_the_bag(kind, folder, tmp_path):
 
 
 def test_notes_beside_an_import_stay_when_it_is_made_anew(folder, bags, tmp_path):
-    content = described(folder, bags["mcap"])
+    content = topics_for(folder, bags["mcap"])
     image = read(tmp_path / "drive", content).images[0].path
     notes = [image.parent / "notes.md", image.parent / "photos" / "a.txt"]
     for path in notes:
@@ -412,7 +381,7 @@ def test_an_image_of_a_bag_has_one_name_from_wherever_the_cache_is_named(folder,
     """Or else the pictures of a report that is made again are those of no image."""
     root = tmp_path / "drive"
     root.mkdir()
-    (root / "drive.yaml").write_text(yaml.safe_dump(described(folder, bags["mcap"])))
+    (root / "drive.yaml").write_text(yaml.safe_dump(topics_for(folder, bags["mcap"])))
     names = []
     for here, path, cache in ((tmp_path, "drive", "cache"), (root, str(root), str(tmp_path / "cache"))):
         monkeypatch.chdir(here)
@@ -443,7 +412,7 @@ def test_a_definition_that_would_be_parsed_for_ever_is_refused(name, folder, tmp
         )
     database.close()
     with pytest.raises(DriveError, match="its definition is none of a recording's"):
-        read(tmp_path / "drive", described(folder, bag))
+        read(tmp_path / "drive", topics_for(folder, bag))
 
 
 @pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
@@ -459,7 +428,7 @@ def test_zeros_that_would_unpack_to_all_of_the_memory_are_refused(mode, folder, 
             database.execute("UPDATE messages SET data = ?", (bomb,))
         database.close()
     with pytest.raises(DriveError, match="unpacks to more than a recording would"):
-        read(tmp_path / "drive", described(folder, bag))
+        read(tmp_path / "drive", topics_for(folder, bag))
 
 
 PACKED: dict[str, Callable[[Path, Messages], Path]] = {
@@ -499,32 +468,12 @@ def test_no_decompressor_of_a_bag_is_without_a_limit(monkeypatch):
         reader2.zstd.decompress(packed)
 
 
-def test_a_lens_that_changes_within_a_recording_is_refused(folder, tmp_path):
-    made = messages_of(folder)
-    infos = [n for n, (_, topic, _) in enumerate(made.rows) if topic == "/sensing/front/camera_info"]
-    stamp_s, topic, last = made.rows[infos[-1]]
-    zoomed = replace(last, k=last.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1])
-    made.rows[infos[-1]] = stamp_s, topic, zoomed
-    with pytest.raises(DriveError, match=rf"message {len(infos)} states another lens than the first"):
-        read(tmp_path / "drive", described(folder, write_ros2(tmp_path / "bag", made)))
-
-
 def test_a_frame_whose_name_has_a_tab_is_refused(folder, tmp_path):
     made = messages_of(folder, mounted={**mountings(), "a\tb": mountings()["front"]})
     bag = write_ros2(tmp_path / "bag", made)
     with pytest.raises(DriveError, match="a frame is named") as refused:
         import_streams(bag, [TfStream(False, "here")], tmp_path / "cache")
     assert "\t" not in str(refused.value)
-
-
-def test_stamps_of_messages_that_are_texts_end_in_one_line(folder, tmp_path):
-    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
-    (file,) = bag.glob("*.db3")
-    with sqlite3.connect(file) as database:
-        database.execute("UPDATE messages SET timestamp = 'noon'")
-    database.close()
-    with pytest.raises(DriveError, match="not readable as a bag"):
-        read(tmp_path / "drive", described(folder, bag))
 
 
 def _video(path, frames=20, codec="mpeg4", **options):

@@ -367,16 +367,9 @@ def drive_with(folder, described):
 def test_a_drive_takes_intrinsics_of_any_format_by_file_and_camera(tmp_path):
     own = camera_info("front")
     (fx, _, cx), (_, fy, cy), _ = own.intrinsic.tolist()
-    chain = {
-        name: {
-            "camera_model": "pinhole",
-            "intrinsics": [fx + number, fy, cx, cy],
-            "distortion_model": "radtan",
-            "distortion_coeffs": list(own.distortion[:4]),
-            "resolution": [own.width, own.height],
-        }
-        for number, name in enumerate(("cam0", "cam1"))
-    }
+    lens = {"distortion_model": "radtan", "distortion_coeffs": list(own.distortion[:4])}
+    size = {"camera_model": "pinhole", "resolution": [own.width, own.height]}
+    chain = {f"cam{n}": {**size, **lens, "intrinsics": [fx + n, fy, cx, cy]} for n in range(2)}
     drive_with(tmp_path, {"file": "chain.yaml", "camera": "cam1"})
     (tmp_path / "chain.yaml").write_text(yaml.safe_dump(chain))
     info = read_drive(tmp_path).cameras["front"].info

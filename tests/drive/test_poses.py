@@ -15,7 +15,6 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.poses import read_poses
 from v2hdm.io.importers.tables import read_table
 from v2hdm.records import GeodeticOrigin
-from v2hdm.verdict import input_findings
 
 START_S = 1715934630.0
 """2024-05-17 08:30:30 UTC."""
@@ -349,28 +348,3 @@ def test_poses_of_transforms_over_a_moving_and_a_fixed_edge(tmp_path):
     drive = with_topic(tmp_path, made, {"topic": "/tf", "frame": "map", "vehicle": "base_link"})
     expected = 2 * points - antenna(points, yaw)
     np.testing.assert_allclose(drive.recorded.map_from_vehicle[:, :3, 3], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize(("stated_m", "status"), [((1.2, 0.0, 1.8), "PASS"), ((0.0, 0.0, 0.0), "WARN")])
-def test_a_lever_arm_of_zero_that_should_not_be_is_named_by_the_check(stated_m, status, tmp_path):
-    """A straight of 40 m, a bend of 15 m radius and a straight, driven with the axle on the line."""
-    station_m = np.arange(0.0, 110.0, 0.25)
-    yaw = np.clip((station_m - 40.0) / 15.0, 0.0, 3.5)
-    halfway = np.clip((station_m - 0.125 - 40.0) / 15.0, 0.0, 3.5)
-    points = 0.25 * np.cumsum([[np.cos(angle), np.sin(angle), 0.0] for angle in halfway], axis=0)
-    moved = points + np.column_stack([1.2 * np.cos(yaw), 1.2 * np.sin(yaw), np.full(len(yaw), 1.8)])
-    stamp_s = START_S + station_m / 5.0
-    rows = np.column_stack([stamp_s, place(moved), true_azimuth_deg(points, yaw), np.full(len(yaw), 4)])
-    root = tmp_path / "drive"
-    root.mkdir()
-    make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))
-    names = "stamp_s,latitude_deg,longitude_deg,altitude_m,heading_deg,quality"
-    lines = [",".join(map(repr, row)) for row in rows.tolist()]
-    (root / "route.csv").write_text("\n".join([names, *lines]))
-    with description(root) as content:
-        content["poses"] = {"csv": "route.csv", "lever_arm_m": list(stated_m)}
-    (finding,) = [one for one in input_findings(read_drive(root), {}) if one.check == "origin"]
-    assert finding.status.name == status
-    if status == "WARN":
-        assert finding.value == pytest.approx(1.2, abs=0.03)
-        assert "m ahead of the rear axle" in finding.line

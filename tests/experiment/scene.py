@@ -25,21 +25,16 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
     """CNI is 2 cm off and has four of five markings, ENI 50 cm, ONI 2 cm, Opt ``opt_m``."""
     naive = {"CNI": shifted(0.02, 4), "ENI": shifted(0.5, 3), "ONI": shifted(0.02, 4)}
     maps = {
-        "front": {**naive, "Opt": shifted(opt_m, 4), "Opt, paper": shifted(0.03, 4)},
-        "rear": {**naive, "Opt": shifted(opt_m, 4), "Opt, paper": shifted(0.03, 4)},
-        "both": {**naive, "Opt": shifted(opt_m), "Opt, paper": shifted(0.03)},
+        name: {**naive, "Opt": shifted(opt_m, count), "Opt, paper": shifted(0.03, count)}
+        for name, count in (("front", 4), ("rear", 4), ("both", 5))
     }
+    route = np.column_stack([np.linspace(0, 25, 26), np.zeros(26)]).tolist()
     return {
-        "port": port,
-        "seed": seed,
-        "started_from": started_from,
-        "truth": plain_map(TRUE),
-        "true_lanes": [[[0.0, 1.0], [20.0, 1.0]]],
-        "route": np.column_stack([np.linspace(0, 25, 26), np.zeros(26)]).tolist(),
-        "expected": {name: [True] * 5 for name in maps},
+        "port": port, "seed": seed, "started_from": started_from, "route": route, "failures": [],
+        "truth": plain_map(TRUE), "true_lanes": [[[0.0, 1.0], [20.0, 1.0]]],
         "maps": maps,
-        "failures": [],
-    }
+        "expected": {name: [True] * 5 for name in maps},
+    }  # fmt: skip
 
 
 def experiment(output: str, **changes: Any) -> ExperimentConfig:

@@ -328,11 +328,6 @@ def test_nothing_slow_is_left_nor_anything_unused(thought_out):
     assert {tensor.name for tensor in graph.initializer} <= read
 
 
-def test_it_is_arranged_once(thought_out):
-    once = after(thought_out)
-    assert after(once).SerializeToString() == once.SerializeToString()
-
-
 def test_weights_keep_their_names_and_values(thought_out):
     kept = {t.name: numpy_helper.to_array(t) for t in after(thought_out).graph.initializer}
     for tensor in thought_out.graph.initializer:

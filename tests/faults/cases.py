@@ -3,49 +3,40 @@
 import io
 import json
 import os
-import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields as fields_of
 from dataclasses import is_dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
-import yaml
 from PIL import Image
 
 from tests.calibration.site import INFO
-from tests.drive.example import camera_info, looking_forward, make_drive, make_map
+from tests.drive.example import camera_info, looking_forward, make_map
+from tests.faults.damages import damages
 from tests.faults.judge import Case, Prepare
+from tests.faults.making import (
+    CHECK,
+    CHECKED,
+    Change,
+    both,
+    checked,
+    described,
+    drive,
+    edit,
+    write,
+    write_example,
+)
 from tests.faults.owners import geopackages, owners
 from tests.faults.small import small
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.pipeline.config import PortConfig, RunConfig
 from v2hdm.records import Calibration
-
-CHECK = "v2hdm check"
-CHECKED = ("drive", "--no-ground", "--workers", "1", "--output", "out")
-
-
-def drive(*changes: Callable[[Path], object]) -> Prepare:
-    """The example drive in the folder ``drive``, changed."""
-
-    def prepare(root: Path) -> None:
-        _write_files(root / "drive", _example())
-        for change in changes:
-            change(root / "drive")
-
-    return prepare
-
-
-def checked(name: str, says: str, *changes: Callable[[Path], object], **more: object) -> Case:
-    """The check of the example drive, changed."""
-    return Case(name, CHECK, CHECKED, drive(*changes), says, **more)
 
 
 def detects(name: str, line: str, prepare: Prepare, says: str, **more: object) -> Case:
@@ -57,54 +48,7 @@ def exported(name: str, prepare: Prepare, says: str) -> Case:
     return Case(name, "v2hdm export", tuple(line.split()), prepare, says)
 
 
-@lru_cache
-def _example() -> tuple[tuple[str, bytes], ...]:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        make_drive(Path(folder) / "drive")
-        return _read_files(Path(folder) / "drive")
-
-
-def _read_files(folder: Path) -> tuple[tuple[str, bytes], ...]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return tuple((path.relative_to(folder).as_posix(), path.read_bytes()) for path in files)
-
-
-def _write_files(folder: Path, files: tuple[tuple[str, bytes], ...]) -> None:
-    for name, data in files:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-
-
-def write(name: str, data: str | bytes) -> Callable[[Path], object]:
-    """Put this into a file."""
-    return lambda root: (root / name).write_bytes(data.encode() if isinstance(data, str) else data)
-
-
-def edit(name: str, pattern: str, new: str) -> Callable[[Path], object]:
-    """Change the first match in a file."""
-
-    def change(root: Path) -> None:
-        text = (root / name).read_text()
-        assert re.search(pattern, text, re.MULTILINE), (name, pattern)
-        (root / name).write_text(re.sub(pattern, lambda _: new, text, count=1, flags=re.MULTILINE))
-
-    return change
-
-
-def described(change: Callable[[dict], object]) -> Callable[[Path], object]:
-    """Change the content of ``drive.yaml``."""
-
-    def apply(root: Path) -> None:
-        content = yaml.safe_load((root / "drive.yaml").read_text())
-        change(content)
-        (root / "drive.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
-
-    return apply
-
-
-def renamed(name: object) -> Callable[[Path], object]:
+def renamed(name: object) -> Change:
     """Give the front camera another name."""
 
     def change(content: dict) -> None:
@@ -113,7 +57,7 @@ def renamed(name: object) -> Callable[[Path], object]:
     return described(change)
 
 
-def pipe(name: str) -> Callable[[Path], object]:
+def pipe(name: str) -> Change:
     """A pipe that nobody writes to in the place of a file."""
 
     def change(root: Path) -> None:
@@ -123,7 +67,7 @@ def pipe(name: str) -> Callable[[Path], object]:
     return change
 
 
-def folder_instead(name: str) -> Callable[[Path], object]:
+def folder_instead(name: str) -> Change:
     """A folder in the place of a file."""
 
     def change(root: Path) -> None:
@@ -331,12 +275,8 @@ def texts() -> Iterator[Case]:
     poses = "front/images.txt", "poses.tum"
     lines = {
         "words": "one two\n",
-        "a letter for a number": "100.0 x 0 0 0 0 0 1\n",
-        "one column": "100.0\n",
         "infinite": "100.0 inf 0 0 0 0 0 1\n",
         "not a number": "nan 0 0 0 0 0 0 1\n",
-        "falling": "100.0 0 0 0 0 0 0 1\n99.0 0 0 0 0 0 0 1\n",
-        "twice": "100.0 0 0 0 0 0 0 1\n100.0 0 0 0 0 0 0 1\n",
     }
     for name, text in lines.items():
         yield checked(f"poses: {name}", "poses.tum: line", write(poses[1], text))
@@ -362,15 +302,11 @@ POINTS = {
 }
 
 
-def _info(root: Path) -> None:
-    write_camera_info(INFO, root / "camera_info.yaml")
-
-
 def points() -> Iterator[Case]:
     """Tables of surveyed points."""
     line = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
     for name, (text, says) in POINTS.items():
-        prepare = _both(
+        prepare = both(
             lambda root: write_camera_info(INFO, root / "camera_info.yaml"), write("points.csv", text)
         )
         yield Case(f"points: {name}", "v2hdm calibrate points", line, prepare, says)
@@ -388,14 +324,8 @@ def names() -> Iterator[Case]:
     for word in ("both", "all", "Both"):
         yield checked(f"camera called {word}", "results of all", renamed(word))
     for number in (7, 1.5):
-        yield checked(
-            f"camera called {number}",
-            "verdict",
-            renamed(number),
-            code=0,
-            leaves="^work/here/out(/|$)",
-            tells=True,
-        )
+        more = {"code": 0, "leaves": "^work/here/out(/|$)", "tells": True}
+        yield checked(f"camera called {number}", "verdict", renamed(number), **more)
 
 
 def _map_of_class(kind: str) -> Prepare:
@@ -415,7 +345,7 @@ def images() -> Iterator[Case]:
         yield checked(f"image in a drive: {name}", says, write("front/images/000001.jpg", data))
     yield detects("image: damaged inside", "a.jpg", write("a.jpg", damaged_inside()), "damaged")
     deep = picture(".png", depth=np.uint16)
-    yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits")
+    yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits a channel; convert it to 8 bits")
     yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
     yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
     for orientation in range(2, 9):
@@ -425,11 +355,11 @@ def images() -> Iterator[Case]:
             yield checked(name, f"EXIF orientation {orientation}", write("front/images/000001.jpg", data))
     for name, text in PLAYLISTS.items():
         for ending in (".mp4", ".avi", ".mkv"):
-            files = _both(write("a.mp4", SHORT_VIDEO), write(f"v{ending}", text))
+            files = both(write("a.mp4", SHORT_VIDEO), write(f"v{ending}", text))
             yield detects(f"video: {name}, {ending}", f"v{ending}", files, "nor a video|holds no")
 
 
-def _imgs(change: Callable[[Path], object]) -> Prepare:
+def _imgs(change: Change) -> Prepare:
     def prepare(root: Path) -> None:
         (root / "imgs").mkdir()
         change(root)
@@ -488,49 +418,48 @@ def _names(key: str, value: object) -> str:
 def outputs() -> Iterator[Case]:
     """Outputs that are inputs, the user's, somebody else's or nowhere."""
     imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
-    yield detects("draw into the source", "imgs --draw imgs", imgs, "no results of ours")
-    yield detects("output is the source", "imgs/a.jpg --output imgs/a.jpg", imgs, "inputs")
-    yield detects(
-        "output is a link to the source",
-        "imgs/a.jpg --output link",
-        _both(imgs, lambda root: (root / "link").symlink_to("imgs/a.jpg")),
-        "inputs",
-    )
-    yield detects(
-        "output is the source by another name",
-        "imgs/a.jpg --output twin",
-        _both(imgs, lambda root: os.link(root / "imgs/a.jpg", root / "twin")),
-        "inputs",
-    )
-    yield detects("output is an image of the source", "imgs --output imgs/a.jpg", imgs, "inputs")
-    yield detects(
-        "output is the calibration",
-        "imgs/a.jpg --camera c.yaml --output c.yaml",
-        _both(imgs, _calibration),
-        "inputs",
-    )
-    yield detects("output is a file of the user's", "imgs --output precious.txt", imgs, "holds no det")
-    yield detects("output is a folder", "imgs --output imgs", imgs, "give another --output")
-    yield detects("output in a file", "imgs --output precious.txt/x", imgs, "cannot write")
+    linked = both(imgs, lambda root: (root / "link").symlink_to("imgs/a.jpg"))
+    twin = both(imgs, lambda root: os.link(root / "imgs/a.jpg", root / "twin"))
+    for name, line, prepare, says in (
+        ("draw into the source", "imgs --draw imgs", imgs, "no results of ours"),
+        ("output is the source", "imgs/a.jpg --output imgs/a.jpg", imgs, "inputs"),
+        ("output is a link to the source", "imgs/a.jpg --output link", linked, "inputs"),
+        ("output is the source by another name", "imgs/a.jpg --output twin", twin, "inputs"),
+        ("output is an image of the source", "imgs --output imgs/a.jpg", imgs, "inputs"),
+        (
+            "output is the calibration",
+            "imgs/a.jpg --camera c.yaml --output c.yaml",
+            both(imgs, _calibration),
+            "inputs",
+        ),
+        ("output is a file of the user's", "imgs --output precious.txt", imgs, "holds no det"),
+        ("output is a folder", "imgs --output imgs", imgs, "give another --output"),
+        ("output in a file", "imgs --output precious.txt/x", imgs, "give another --output"),
+        ("drawings in a file", "imgs --draw precious.txt/x", imgs, "give another --draw"),
+        (
+            "a drawing is a folder",
+            "imgs --draw d",
+            both(imgs, _folder_with("d/a.jpg", "x")),
+            "give another --draw",
+        ),
+    ):
+        yield detects(name, line, prepare, says)
     yield detects("output on a full disk", "imgs --output x.jsonl", imgs, "cannot write", disk_bytes=1)
     yield detects("drawing on a full disk", "imgs --draw d", imgs, "cannot be written", disk_bytes=200)
     for name, make in {
         "somebody's folder": _folder_with("out", "thesis.tex"),
-        "a drive": lambda root: _write_files(root / "out", _example()),
+        "a drive": lambda root: write_example(root / "out"),
         "a folder with a config.yaml": _folder_with("out", "config.yaml"),
         "a folder with a metrics.json": _folder_with("out", "metrics.json"),
         "a folder with a folder": _folder_with("out/deep", "x"),
     }.items():
-        yield Case(f"result into {name}", CHECK, CHECKED, _both(drive(), make), "no results of ours")
-    yield Case("result onto a file", CHECK, CHECKED, _both(drive(), write("out", "x")), "is a file")
-    yield Case(
-        "result within a file", CHECK, (*CHECKED[:-1], "precious.txt/x"), drive(), "cannot be written|is a "
-        "file"
-    )  # fmt: skip
+        yield Case(f"result into {name}", CHECK, CHECKED, both(drive(), make), "no results of ours")
+    yield Case("result onto a file", CHECK, CHECKED, both(drive(), write("out", "x")), "is a file")
+    within = (*CHECKED[:-1], "precious.txt/x")
+    yield Case("result within a file", CHECK, within, drive(), "cannot be written|is a file")
     yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "no results of ours")
-    yield Case(
-        "result onto a link in a circle", CHECK, CHECKED, _both(drive(), _circle), "leads nowhere|cannot"
-    )
+    circle = both(drive(), lambda root: (root / "out").symlink_to("out"))
+    yield Case("result onto a link in a circle", CHECK, CHECKED, circle, "leads nowhere|cannot")
     for most in (0, 10, 1000, 5000):
         name = f"result on a disk with room for {most} bytes"
         yield checked(name, "cannot be written", disk_bytes=most)
@@ -541,24 +470,12 @@ def outputs() -> Iterator[Case]:
     yield exported("export onto a link to the map", _linked_map, "written over")
 
 
-def _both(*steps: Callable[[Path], object]) -> Prepare:
-    def prepare(root: Path) -> None:
-        for step in steps:
-            step(root)
-
-    return prepare
-
-
 def _folder_with(folder: str, name: str) -> Prepare:
     def prepare(root: Path) -> None:
         (root / folder).mkdir(parents=True)
         (root / folder / name).write_text("mine")
 
     return prepare
-
-
-def _circle(root: Path) -> None:
-    (root / "out").symlink_to("out")
 
 
 def _calibration(root: Path) -> None:
@@ -578,22 +495,24 @@ def arguments() -> Iterator[Case]:
         "nowhere --no-ground": "nowhere: no such drive",
         "drive --workers -1": "--workers -1",
         "drive --workers 99999999": "--workers 99999999",
-        "drive --camera left": "no camera 'left'",
+        "drive --camera left": "no camera 'left'; choose from: front, rear",
         "precious.txt": "not a drive",
         ". --no-ground": "not a drive",
     }.items():
         yield Case(f"check {line}", CHECK, line.split(), drive(), says)
     for line, says in {
-        "nowhere.jpg": "no such image",
+        "nowhere.jpg": "nowhere.jpg: no such image, video or folder",
         "precious.txt": "neither an image nor a video",
         "imgs --limit 0": "--limit 0",
         "imgs --threads 0": "threads is 0",
-        "imgs --threads 99999": "threads is 99999",
-        "imgs --model nowhere.onnx": "nowhere.onnx",
-        "imgs --model precious.txt": "precious.txt",
+        "imgs --threads 99999": "threads is 99999: set 1 to 256",
+        "imgs --model nowhere.onnx": "nowhere.onnx: no such detector model",
+        "imgs --model precious.txt": "precious.txt: not a usable ONNX model",
         "imgs --camera nowhere.yaml": "nowhere.yaml: no such file",
         "imgs --camera precious.txt": "precious.txt",
-        "imgs --mounting 0 5 60": "--mounting 0",
+        "imgs --mounting 0 5 60": "give a height above 0 m",
+        "imgs --mounting -1 5 60": "give a height above 0 m",
+        "imgs --mounting inf 5 60": "give a height above 0 m",
         "imgs --mounting nan 5 60": "--mounting nan",
         "imgs --mounting 1.6 5 600": "--mounting",
     }.items():
@@ -604,14 +523,14 @@ def arguments() -> Iterator[Case]:
         "precious.txt precious.txt": "precious.txt",
         ". .": "no calibration_",
     }.items():
-        yield Case(f"calibration {line}", "v2hdm calibrate compare", line.split(), _both(), says)
+        yield Case(f"calibration {line}", "v2hdm calibrate compare", line.split(), both(), says)
     for line, says in {
         "nowhere.geojson --format csv": "nowhere.geojson",
         "precious.txt --format csv": "precious",
         "map.geojson --format pdf": "pdf",
         ". --format csv": "",
     }.items():
-        yield Case(f"export {line}", "v2hdm export", line.split(), _both(), says)
+        yield Case(f"export {line}", "v2hdm export", line.split(), both(), says)
 
 
 def _plainly(lines: str) -> dict[str, str]:
@@ -624,7 +543,7 @@ SETTINGS = _plainly(
     "workers=-1 device=tpu mode=x mapping.max_range_m=nan mapping.max_range_m=inf mapping.max_range_m=0 "
     "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_images=-1 detector.threads=0 "
     "detector.blur_px=99 detector.max_range_m=-1 detector.min_score=nan detector.border_px=-3 "
-    "drive.max_gap_s=-1 drive.max_gap_s=nan"
+    "detector.lane_step_m=-1 drive.max_gap_s=-1 drive.max_gap_s=nan"
 ) | {
     "workers=99999999999999999999": "workers is",
     "workers=many": "workers=many",
@@ -705,11 +624,11 @@ def settings() -> Iterator[Case]:
         words = (line.strip("'"), "workers=1") if "workers" not in line else (line,)
         yield Case(f"map {line}", "v2hdm map", ("drive.path=drive", *words), drive(), says)
     for line, says in SIMULATED.items():
-        yield Case(f"map {line}", "v2hdm map", ("+run=port2", "workers=1", line), _both(), says)
+        yield Case(f"map {line}", "v2hdm map", ("+run=port2", "workers=1", line), both(), says)
     for line, says in TRAINING.items():
         end = () if line.startswith(("minutes", "steps")) else ("steps=1",)
         words = (line, *end) if line.startswith("validation") else (line, *end, "validation.images=0")
-        yield Case(f"train {line}", "train.__main__", words, _both(), says)
+        yield Case(f"train {line}", "train.__main__", words, both(), says)
     for line, says in EXPORTS.items():
         words = [
             one for one in ("checkpoint=a.pt", "output=b.onnx") if one.split("=")[0] != line.split("=")[0]
@@ -740,7 +659,7 @@ def _run_file(data: bytes) -> Prepare:
 def all_cases() -> list[Case]:
     """The table."""
     parts = (
-        texts, points, names, images, fields, outputs, owners, geopackages, small, arguments, settings,
-        numbers,
+        texts, points, names, images, damages, fields, outputs, owners, geopackages, small,
+        arguments, settings, numbers,
     )  # fmt: skip
     return [case for part in parts for case in part()]

@@ -8,8 +8,9 @@ from contextlib import closing
 from pathlib import Path
 
 from tests.calibration.site import INFO, clicked, mounting, write_table
-from tests.drive.example import make_drive, make_map
+from tests.drive.example import make_map
 from tests.faults.judge import Case, Prepare
+from tests.faults.making import both, write, write_example
 from v2hdm.io.calibration.reading import read_provenance
 from v2hdm.io.calibration.writing import (
     CALIBRATION_FORMATS,
@@ -58,14 +59,14 @@ def owners() -> Iterator[Case]:
         yield Case(f"map over its base {base}", "v2hdm map", words, _site(_own_base), "one of the inputs")
     for file, prepare, words in _exports():
         for name, harm in HARMS.items():
-            says = "move it, or give another --output"
-            case = f"export onto {name}: {words}"
-            yield Case(case, "v2hdm export", words.split(), _both(prepare, _harmed(file, harm)), says)
+            harmed = both(prepare, lambda root, file=file, harm=harm: harm(root / file))
+            says, case = "move it, or give another --output", f"export onto {name}: {words}"
+            yield Case(case, "v2hdm export", words.split(), harmed, says)
 
 
 def _site(more: Callable[[Path], None]) -> Prepare:
     def prepare(root: Path) -> None:
-        make_drive(root / "drive")
+        write_example(root / "drive")
         write_geojson(make_map(), root / "map.geojson")
         write_camera_info(INFO, root / "camera_info.yaml")
         write_table(root, *clicked(seed=1))
@@ -90,26 +91,18 @@ def _own_base(root: Path) -> None:
     (root / "linked.geojson").symlink_to("out/map.geojson")
 
 
-def _both(first: Prepare, second: Prepare) -> Prepare:
-    def prepare(root: Path) -> None:
-        first(root)
-        second(root)
-
-    return prepare
-
-
 def _exports() -> Iterator[tuple[str, Prepare, str]]:
     """A file of each format, what writes it as the command does, and the command's line."""
     for name in FORMATS:
         source = "map.gpkg" if name == "geojson" else "map.geojson"
 
-        def write(root: Path, name: str = name, source: str = source) -> None:
+        def put_map(root: Path, name: str = name, source: str = source) -> None:
             write_map(make_map(), root, "map", [source.rpartition(".")[2]])
             with listed_files(root / "there", "--output", f"v2hdm export of ../{source}"):
                 write_map(make_map(), root / "there", "map", [name])
 
         line = f"{source} --format {name} --output there"
-        yield f"there/{FORMATS[name].file.format(name='map')}", write, line
+        yield f"there/{FORMATS[name].file.format(name='map')}", put_map, line
     for name, (ending, _) in CALIBRATION_FORMATS.items():
 
         def put(root: Path, name: str = name) -> None:
@@ -170,10 +163,6 @@ HARMS: dict[str, Callable[[Path], None]] = {
 }
 
 
-def _harmed(name: str, harm: Callable[[Path], None]) -> Prepare:
-    return lambda root: harm(root / name)
-
-
 _VRT = (
     '<OGRVRTDataSource><OGRVRTLayer name="v2hdm"><SrcDataSource>{}</SrcDataSource></OGRVRTLayer>'
     "</OGRVRTDataSource>"
@@ -231,18 +220,15 @@ def geopackages() -> Iterator[Case]:
     """Files that end in .gpkg, and are something else, or compute, or never end."""
     line = ("map.gpkg", "--format", "csv", "--output", "there")
     for name, data in OTHERS.items():
-        prepare = _wrote("map.gpkg", data)
-        yield Case(f"geopackage: {name}", "v2hdm export", line, prepare, "not a map written by v2hdm")
+        yield Case(
+            f"geopackage: {name}", "v2hdm export", line, write("map.gpkg", data), "not a map written by v2hdm"
+        )
     for name, (sql, says) in SQL.items():
         yield Case(f"geopackage: {name}", "v2hdm export", line, _executed(sql), says)
     for name, (wkb, says) in GEOMETRIES.items():
         blob = b"GP\0\1" + bytes(4) + wkb
         prepare = _executed(f"UPDATE markings SET geom = X'{blob.hex()}'")
         yield Case(f"geopackage: {name}", "v2hdm export", line, prepare, says)
-
-
-def _wrote(name: str, data: bytes) -> Prepare:
-    return lambda root: (root / name).write_bytes(data) and None
 
 
 def _executed(sql: str) -> Prepare:

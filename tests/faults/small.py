@@ -13,15 +13,14 @@ import numpy as np
 import yaml
 
 from tests.calibration.site import INFO, clicked, write_table
-from tests.drive.bags import Messages, StoragePlugin, messages_of, mountings, write_ros2
+from tests.drive.bags import Messages, StoragePlugin, messages_of, mountings, topics_for, write_ros2
 from tests.drive.example import make_drive, make_map
-from tests.drive.test_bags import described
 from tests.faults.judge import Case
+from tests.faults.making import CHECK, CHECKED, Change, checked, described, drive, write, write_example
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
 
 LONG = "9" * 200_000
-CHECKED = ("drive", "--no-ground", "--workers", "1", "--output", "out")
 NO_SIGMAS = ("-1", "-0.01", "-1e-9", "-inf")
 NO_NUMBERS = (*NO_SIGMAS, "x", "0x10", "1,5", "--1", "1e", LONG)
 
@@ -32,25 +31,13 @@ def small() -> Iterator[Case]:
         yield from part()
 
 
-def _checked(name: str, says: str, content: dict[str, object], files: dict[str, str]) -> Case:
-    def prepare(root: Path) -> None:
-        make_drive(root / "drive")
-        path = root / "drive" / "drive.yaml"
-        path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | content))
-        for file, text in files.items():
-            (root / "drive" / file).write_text(text)
-
-    return Case(name, "v2hdm check", CHECKED, prepare, says)
+def entries(**content: object) -> Change:
+    """Put entries into ``drive.yaml``."""
+    return described(lambda given: given.update(content))
 
 
-ROUTE = {
-    "stamp_s": "100",
-    "x_m": "0",
-    "y_m": "0",
-    "yaw_deg": "0",
-    "sigma_m": ".02",
-    "heading_sigma_deg": ".1",
-}
+ROUTE = {"stamp_s": "100", "x_m": "0", "y_m": "0", "yaw_deg": "0", "sigma_m": ".02"}
+ROUTE |= {"heading_sigma_deg": ".1"}
 ROUTES = [
     *(("sigma_m", cell, "sigma_m|cells under|no table") for cell in NO_NUMBERS),
     *(("heading_sigma_deg", cell, "heading_sigma_deg|cells under|no table") for cell in NO_NUMBERS),
@@ -67,8 +54,9 @@ def _routes() -> Iterator[Case]:
         wrong = range(20) if "sure" in says else [19]
         rows = [line | ({column: cell} if k in wrong else {}) for k, line in enumerate(lines)]
         text = "\n".join(",".join(row.values()) for row in (dict(zip(ROUTE, ROUTE, strict=True)), *rows))
-        content = {"poses": {"csv": "route.csv"}}
-        yield _checked(f"route: {column} {cell[:9]}", says, content, {"route.csv": text})
+        yield checked(
+            f"route: {column} {cell[:9]}", says, entries(poses={"csv": "route.csv"}), write("route.csv", text)
+        )
 
 
 GST = "GNGST,120000.00,1.0,,,,{},{},0.02"
@@ -88,7 +76,7 @@ def _logs() -> Iterator[Case]:
     for name, text in LOGS.items():
         poses = {"nmea": "log.nmea", "lever_arm_m": [0, 0, 0], "date": "2024-05-17"}
         says = "no GGA sentence|sentences are damaged"
-        yield _checked(f"NMEA log: {name}", says, {"poses": poses}, {"log.nmea": text})
+        yield checked(f"NMEA log: {name}", says, entries(poses=poses), write("log.nmea", text))
 
 
 URLS = ("s3://bucket/x", "memory://bucket/x", "http://127.0.0.1:9/x", "file:///etc/hosts")
@@ -104,10 +92,10 @@ def _urls() -> Iterator[Case]:
         own = {"images": "front/images.txt", "camera_info": "front/camera_info.yaml"}
         for key, value in {"images": url, "camera_info": url, "video": url}.items():
             named = {"images": {"video": value, "start_s": 0}} if key == "video" else {key: value}
-            content = {"cameras": {"front": front | own | named}}
-            yield _checked(f"{key} at {url}", "no such|not readable|cannot be read|missing", content, {})
+            changed = entries(cameras={"front": front | own | named})
+            yield checked(f"{key} at {url}", "no such|not readable|cannot be read|missing", changed)
         for key in ("poses", "truth"):
-            yield _checked(f"{key} at {url}", "no such|cannot be read|not a", {key: url}, {})
+            yield checked(f"{key} at {url}", "no such|cannot be read|not a", entries(**{key: url}))
 
 
 def _maps() -> Iterator[Case]:
@@ -177,7 +165,7 @@ OPTIONS = [
 def _options() -> Iterator[Case]:
     for line in OPTIONS:
         words, says = ("drive.path=drive", "workers=1", line), line.split("=")[0].rpartition(".")[2]
-        yield Case(f"map {line}", "v2hdm map", words, lambda root: make_drive(root / "drive") and None, says)
+        yield Case(f"map {line}", "v2hdm map", words, drive(), says)
 
 
 @lru_cache
@@ -196,13 +184,13 @@ def _bag(name: str, says: str, change: Callable[[object], object], topic: str) -
         made.rows[number] = (*made.rows[number][:2], change(made.rows[number][2]))
         _described(root, made)
 
-    return Case(f"bag: {name}", "v2hdm check", CHECKED, prepare, says, leaves="^work/here/cache(/|$)")
+    return Case(f"bag: {name}", CHECK, CHECKED, prepare, says, leaves="^work/here/cache(/|$)")
 
 
 def _described(root: Path, made: Messages) -> Path:
-    make_drive(root / "drive")
+    write_example(root / "drive")
     bag = write_ros2(root / "bag", made, StoragePlugin.SQLITE3)
-    (root / "drive" / "drive.yaml").write_text(yaml.safe_dump(described(root / "drive", bag)))
+    (root / "drive" / "drive.yaml").write_text(yaml.safe_dump(topics_for(root / "drive", bag)))
     return next(bag.glob("*.db3"))
 
 
@@ -210,7 +198,7 @@ STAMPS = ("'noon'", "X'ff'")
 
 
 def _bags() -> Iterator[Case]:
-    info, other = "/sensing/front/camera_info", "states another lens than the first"
+    info, other = "/sensing/front/camera_info", r"message \d+ states another lens than the first"
     for name, change in {
         "another focal length": lambda one: replace(one, k=one.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1]),
         "a focal length that is not finite": lambda one: replace(one, k=one.k * np.nan),
@@ -236,6 +224,4 @@ def _bags() -> Iterator[Case]:
                 data.commit()
 
         says = "not readable as a bag"
-        yield Case(
-            f"bag: stamps {value}", "v2hdm check", CHECKED, prepare, says, leaves="^work/here/cache(/|$)"
-        )
+        yield Case(f"bag: stamps {value}", CHECK, CHECKED, prepare, says, leaves="^work/here/cache(/|$)")

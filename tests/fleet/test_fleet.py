@@ -94,13 +94,9 @@ def test_a_fleet_outlives_its_processes_keeps_what_is_finished_and_goes_on_past_
 def test_a_fleet_that_is_ended_takes_its_processes_with_it(end, drive, tmp_path):
     file = written(tmp_path, "good", drive)
     arguments = [str(file), f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}", "--workers", "1"]
-    begun = subprocess.Popen(
-        [sys.executable, "-m", "v2hdm", "fleet", *arguments, "--table", str(tmp_path / "table")],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-m", "v2hdm", "fleet", *arguments, "--table", str(tmp_path / "table")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    begun = subprocess.Popen(command, cwd=ROOT, **pipes)
     assert begun.stdout.readline().startswith("good: check")  # a process is at work
     os.kill(begun.pid, end)
     _, errors = begun.communicate(timeout=60)  # returns when the last process has closed its end

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.adjust.scene import mounted
+from tests.cameras import mounted
 from v2hdm.geometry.ipm import (
     apply_homography,
     apply_in_front,
@@ -33,7 +33,7 @@ from v2hdm.geometry.rigid import camera_centre, exp, ground_in_vehicle
 from v2hdm.records import CameraInfo
 
 INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 639.5], [0, 880, 359.5], [0, 0, 1]]))
-MOUNTS = np.stack([mounted(1.5, 2.4, 18), mounted(-1, 2.6, 40, rear=True), mounted(2, 1.7, 1)])
+MOUNTS = np.stack([mounted((1.5, 0, 2.4), 18), mounted((-1, 0, 2.6), 40, 180), mounted((2, 0, 1.7), 1)])
 ROI = np.array([[4.0, -2], [4, 2], [12, 4], [12, -4], [8, 0]])
 
 

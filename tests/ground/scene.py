@@ -6,10 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.cameras import mounted
+from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray, Image, PoseNoise, Trajectory
 
@@ -42,11 +41,7 @@ def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:
     steps = np.diff(fine, prepend=0.0)
     x, y = np.cumsum(steps * np.cos(yaw)), np.cumsum(steps * np.sin(yaw))
     along = at * _SPEED_MPS
-    zero = np.zeros(len(at))
-    poses = np.tile(np.eye(4), (len(at), 1, 1))
-    poses[:, :3, :3] = rotation_from_euler(zero, zero, np.interp(along, fine, yaw))
-    poses[:, 0, 3], poses[:, 1, 3] = np.interp(along, fine, x), np.interp(along, fine, y)
-    return Trajectory(at, poses)
+    return Trajectory(at, level(*(np.interp(along, fine, one) for one in (x, y, yaw))))
 
 
 def make_drive(

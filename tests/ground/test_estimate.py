@@ -199,15 +199,3 @@ def test_the_command_writes_a_mounting_and_says_how_good_it_is(tmp_path, capsys)
     shown = capsys.readouterr().out
     assert shown.startswith("front: roll 0.")
     assert "verdict: " in shown
-
-
-def test_a_folder_with_other_files_is_refused_and_left_alone(tmp_path, capsys):
-    drive = make_drive(tmp_path / "drive", 0.0, extrinsic())
-    assert drive.trajectory is not None
-    write_drive(tmp_path / "drive", drive, drive.trajectory)
-    mine = tmp_path / "mine" / "calibration_front.yaml"
-    mine.parent.mkdir()
-    mine.write_text("mine")
-    assert run(["calibrate", "ground", str(tmp_path / "drive"), "--output", str(mine.parent)]) == 2
-    assert "no results of ours" in capsys.readouterr().err
-    assert mine.read_text() == "mine"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.cameras import mounted
+from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import exp
@@ -183,10 +183,7 @@ def _poses(
 
 def _twists(route: FloatArray) -> FloatArray:
     """Twists (J, 6) of the vehicle along a route of poses (J, 3) that are a frame apart."""
-    poses = np.tile(np.eye(4), (len(route), 1, 1))
-    poses[:, :2, 3] = route[:, :2]
-    poses[:, :3, :3] = Rotation.from_euler("Z", route[:, 2:]).as_matrix()
-    return vehicle_twists(poses, FRAME_S * np.arange(len(route)))
+    return vehicle_twists(level(*route.T), FRAME_S * np.arange(len(route)))
 
 
 def _project_rows(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.cameras import level
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.association.ground import Located, locate
 from v2hdm.association.groups import (
@@ -152,10 +153,7 @@ def test_a_steady_turn_has_one_twist_everywhere():
     """5 m/s on a circle of 10 m radius: half a radian a second to the left."""
     stamp_s = np.array([0.0, 0.2, 0.5, 0.6, 1.0])
     heading = 0.5 * stamp_s
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, 0, 0], poses[:, 0, 1] = np.cos(heading), -np.sin(heading)
-    poses[:, 1, 0], poses[:, 1, 1] = np.sin(heading), np.cos(heading)
-    poses[:, 0, 3], poses[:, 1, 3] = 10 * np.sin(heading), 10 * (1 - np.cos(heading))
+    poses = level(10 * np.sin(heading), 10 * (1 - np.cos(heading)), heading)
     expected = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.5], (5, 1))
     np.testing.assert_allclose(vehicle_twists(poses, stamp_s), expected, atol=1e-9)
 

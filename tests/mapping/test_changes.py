@@ -116,13 +116,6 @@ def test_observations_bear_the_ids_and_corners_of_the_updated_map(updated):
     assert np.percentile(off_px, 90) < 8.0
 
 
-def test_two_drives_together_are_better_than_either(before, base, updated):
-    now = updated[0]
-    alone = run_methods(now.drive, now.detections, ("front", "rear"))["Opt"].hd_map
-    errors = [match(one, now.markings, 0.3)[1] for one in (alone, updated[1].hd_map)]
-    assert errors[1] < errors[0]
-
-
 def test_an_id_that_is_gone_is_never_given_again(tmp_path, updated):
     hd_map = updated[1].hd_map
     last = max(one.id or 0 for one in hd_map.markings)

@@ -9,11 +9,10 @@ import pytest
 from tests.benchmarks.highway import LINES, few_dashes, mounting_of
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.adjust import ControlPoints
-from v2hdm.errors import ConfigError
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.mapping.lanes import _catmull_rom, draw_lanes, find_knots
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.recovery import Inputs
 from v2hdm.records import HdMap
 from v2hdm.site.options import JOINT, LaneOptions
@@ -135,11 +134,6 @@ def test_sigmas_survive_writing_and_reading_as_features(solved):
     again = map_of(features_of(HdMap((), lanes)), range(1, len(lanes) + 1), None)
     for one, other in zip(lanes, again.lanes, strict=True):
         np.testing.assert_array_equal(one.sigma_m, other.sigma_m)
-
-
-def test_an_unknown_model_of_lanes_is_refused_by_name():
-    with pytest.raises(ConfigError, match=r"mapping\.lanes\.model is 'spline'; choose after or joint"):
-        check_options(MappingOptions(lanes=LaneOptions(model="spline")))
 
 
 @pytest.mark.parametrize("along", [[1.0, 0.0], [0.0, 1.0], [-0.6, 0.8], [1e-9, 1.0]])

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cameras import mounted
+from tests.cameras import level, mounted
 from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
@@ -34,13 +34,8 @@ def cloud_of(lines, dash=False, images=12, sigma_m=0.03, seed=0):
             tangents.append(direction * rng.choice([-1.0, 1.0]))
             image.append(np.full(len(line), i))
     count = sum(len(p) for p in points)
-    return LaneCloud(
-        np.concatenate(points),
-        np.concatenate(tangents),
-        np.full(count, 1 / sigma_m**2),
-        np.concatenate(image),
-        np.full(count, dash),
-    )
+    weight, kind = np.full(count, 1 / sigma_m**2), np.full(count, dash)
+    return LaneCloud(np.concatenate(points), np.concatenate(tangents), weight, np.concatenate(image), kind)
 
 
 def guides_of(lines):
@@ -136,13 +131,8 @@ def test_a_closed_line_is_closed():
 
 
 def test_an_empty_cloud_has_no_lanes():
-    assert (
-        map_lanes(
-            LaneCloud(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)),
-            OPTIONS,
-        )
-        == ()
-    )
+    nothing = LaneCloud(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool))
+    assert map_lanes(nothing, OPTIONS) == ()
 
 
 def test_a_hundred_thousand_points_take_seconds():
@@ -199,17 +189,7 @@ def symbols_of(outlines, kinds):
 
 def scene(arrow_x_m):
     """Three frames, a metre apart, that all see an arrow ahead of the first one."""
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 0, 3] = [0.0, 1.0, 2.0]
-    rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], poses)
-    outlines = []
-    for pose in poses:
-        vehicle = np.column_stack(
-            [ARROW + np.array([arrow_x_m, 1.0]), np.zeros(len(ARROW)), np.ones(len(ARROW))]
-        )
-        cam = vehicle @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
-        outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
-    return symbols_of(outlines, ("arrow",) * 3), rig
+    return seen([ARROW + np.array([arrow_x_m, 1.0])] * 3, ("arrow",) * 3, [0.0, 1.0, 2.0])
 
 
 def rectangle(centre, length_m, width_m):
@@ -237,26 +217,24 @@ def test_far_arrows_say_nothing():
     assert images_with_symbol(symbols, rig, rectangle((40.0, 1.05), 0.5, 0.3)[None]).tolist() == [0]
 
 
-def test_without_symbols_there_is_nothing_to_count():
-    _, rig = scene(9.0)
-    assert images_with_symbol(NO_SYMBOLS, rig, np.zeros((4, 4, 2))).tolist() == [0, 0, 0, 0]
-
-
 JITTER_RAD = 0.002
 AT, OFF = np.array([9.0, 1.0]), np.array([0.1, 0.0])
 
 
 def seen(shapes, kinds, poses_x):
     """What a camera at so many places ahead says of shapes on the ground, one from each."""
-    poses = np.tile(np.eye(4), (len(poses_x), 1, 1))
-    poses[:, 0, 3] = poses_x
+    poses = level(poses_x)
     rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], poses)
-    outlines = []
-    for shape, pose in zip(shapes, poses, strict=True):
-        ground = np.column_stack([shape, np.zeros(len(shape)), np.ones(len(shape))])
-        cam = ground @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
-        outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
-    return symbols_of(outlines, kinds), rig
+    return symbols_of(
+        [outline_px(*one, rig.cam_from_vehicle[0]) for one in zip(shapes, poses, strict=True)], kinds
+    ), rig
+
+
+def outline_px(shape, pose, cam_from_vehicle):
+    """A shape (N, 2) on the ground as a camera at a pose shows it."""
+    ground = np.column_stack([shape, np.zeros(len(shape)), np.ones(len(shape))])
+    cam = ground @ (cam_from_vehicle @ np.linalg.inv(pose)).T
+    return (cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3]
 
 
 def mapped(symbols, rig, markings=()):
@@ -355,14 +333,12 @@ def test_neighbours_are_symbols_of_their_own():
     assert len(found) == 2
 
 
-@pytest.mark.parametrize("x", [40.0, 9.0])
-def test_what_is_far_or_seen_seldom_is_left_out(x):
-    symbols, rig = scene(x)
-    if x == 9.0:
-        seldom = replace(symbols, frame=np.array([0, 1, 1]))
-        assert mapped(seldom, rig) == ()
-    else:
-        assert mapped(symbols, rig) == ()
+def test_what_is_far_seen_seldom_or_never_is_left_out():
+    symbols, rig = scene(9.0)
+    assert mapped(replace(symbols, frame=np.array([0, 1, 1])), rig) == ()
+    assert mapped(*scene(40.0)) == ()
+    assert mapped(NO_SYMBOLS, rig) == ()
+    assert images_with_symbol(NO_SYMBOLS, rig, np.zeros((4, 4, 2))).tolist() == [0, 0, 0, 0]
 
 
 def test_paint_that_is_a_marking_is_no_symbol():
@@ -371,11 +347,6 @@ def test_paint_that_is_a_marking_is_no_symbol():
     on, beside = (Marking("pad", square + place, 9) for place in ([9.0, 1.0], [9.0, 3.0]))
     assert mapped(symbols, rig, (on,)) == ()
     assert len(mapped(symbols, rig, (beside,))) == 1
-
-
-def test_without_sightings_there_are_no_symbols():
-    _, rig = scene(9.0)
-    assert mapped(NO_SYMBOLS, rig) == ()
 
 
 @pytest.mark.parametrize(("step_m", "reason"), [(0.0, NOT_OBSERVED), (0.3, NOT_ON_GROUND)])
@@ -393,11 +364,7 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
     back = mounted([0.0, 0.0, 2.0], yaw_deg=180.0)
     both = replace(rig, cam_from_vehicle=np.stack([rig.cam_from_vehicle[0], back]))
     both = replace(both, intrinsic=np.stack([INTRINSIC, INTRINSIC]))
-    behind = []
-    for pose in rig.map_from_vehicle[3:]:
-        ground = np.column_stack([ARROW + AT, np.zeros(len(ARROW)), np.ones(len(ARROW))])
-        cam = ground @ (back @ np.linalg.inv(pose)).T
-        behind.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
+    behind = [outline_px(ARROW + AT, pose, back) for pose in rig.map_from_vehicle[3:]]
     outlines = (*symbols.outlines_pinhole_px[:3], *behind)
     symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]), outlines_pinhole_px=outlines)
     assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.cameras import level
 from tests.mapping.scene import MOUNTS
 from v2hdm.association.ground import Views
 from v2hdm.association.sightings import Rig, Sightings
@@ -104,9 +105,7 @@ GONE, HIDDEN = 4, 7
 
 
 def poses():
-    out = np.tile(np.eye(4), (20, 1, 1))
-    out[:, 0, 3] = 1.5 * np.arange(20)
-    return out
+    return level(1.5 * np.arange(20))
 
 
 def image(pose, rng):

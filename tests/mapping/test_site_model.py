@@ -10,15 +10,7 @@ from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, 
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
-from v2hdm.site.posterior import (
-    CLUTTER,
-    OF_CLASS,
-    OTHER_LENGTH,
-    PART_OF_SYMBOL,
-    PIECE,
-    WRONG_END,
-    posterior,
-)
+from v2hdm.site.posterior import CLUTTER, OF_CLASS, OTHER_LENGTH, PART_OF_SYMBOL, PIECE, WRONG_END, posterior
 from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])

@@ -11,14 +11,10 @@ from scipy.sparse import csr_array
 from tests.adjust.scene import make_scene
 from tests.benchmarks.made.draw import draw
 from tests.benchmarks.right_drives import Job, map_one
-from tests.cameras import apply
-from tests.mapping.scene import SceneOptions
-from tests.mapping.scene import make_scene as make_yard
+from tests.cameras import apply, level
 from v2hdm.adjust import SolveOptions, height_information, solve
-from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.surface import KNOTS_M, Paths, Recorded, Surface
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import HdMap, PoseNoise, Road
 from v2hdm.store.files import load_json, write_json
@@ -33,10 +29,7 @@ MOUNT = np.array([[0.0, -1, 0, 0], [-0.35, 0, -0.94, 1.6], [0.94, 0, -0.35, -0.9
 def arc(frames=60, radius_m=40.0, step_m=0.6):
     """Poses along a bend to the left, level."""
     yaw = np.arange(frames) * step_m / radius_m
-    poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, :3, :3] = rotation_from_euler(0 * yaw, 0 * yaw, yaw)
-    poses[:, :2, 3] = radius_m * np.column_stack([np.sin(yaw), 1 - np.cos(yaw)])
-    return poses
+    return level(radius_m * np.sin(yaw), radius_m * (1 - np.cos(yaw)), yaw)
 
 
 def ground_of_arc(points_map, radius_m=40.0):
@@ -70,8 +63,8 @@ def seen_from(poses, rng, count=400):
 def test_a_moved_pixel_is_the_plane_s_where_the_ground_s_point_is_projected():
     poses, rng = arc(), np.random.default_rng(1)
     cam_from_map, frame, points = seen_from(poses, rng)
-    level = Surface.level(way(poses))
-    section = replace(level, parameters=np.pad(FALLS, (0, len(level.parameters) - len(FALLS))))
+    flat = Surface.level(way(poses))
+    section = replace(flat, parameters=np.pad(FALLS, (0, len(flat.parameters) - len(FALLS))))
     height = ground_of_arc(points)
     assert np.abs(height).max() > 0.2
     # Between the places of the path a chord is up to 5 mm off the circle.
@@ -80,17 +73,6 @@ def test_a_moved_pixel_is_the_plane_s_where_the_ground_s_point_is_projected():
     for z, most_px in ((section.seen_height_m(points, frame), 1e-6), (height, 0.1)):
         moved = section.flattened_px(intrinsic, cam_from_map, frame, projected(cam_from_map, points, z))
         assert np.abs(moved - plane).max() < most_px
-
-
-def test_ground_without_slopes_changes_no_pixel():
-    scene = make_yard(SceneOptions(length_m=40.0))
-    seen = collect_sightings(scene.drive, scene.detections, ("front",))
-    extrinsic = scene.cam_from_vehicle["front"][None]
-    rig = Rig(scene.drive.cameras["front"].info.intrinsic[None], extrinsic, seen.map_from_vehicle)
-    flat = Surface.level(Paths.of(seen.map_from_vehicle, seen.visit)).flattened(seen, rig)
-    known = seen.informs
-    np.testing.assert_allclose(flat.corners_pinhole_px[known], seen.corners_pinhole_px[known], atol=1e-7)
-    np.testing.assert_allclose(flat.covariance_px[known], seen.covariance_px[known], rtol=1e-6, atol=1e-9)
 
 
 def test_a_vehicle_that_stands_backs_up_or_comes_again_keeps_its_left():
@@ -115,8 +97,8 @@ def way(poses):
 def test_a_pixel_of_any_surface_is_moved_to_where_the_plane_would_show_its_place():
     poses, rng = arc(), np.random.default_rng(5)
     cam_from_map, frame, points = seen_from(poses, rng)
-    level = Surface.level(way(poses))
-    surface = replace(level, parameters=rng.normal(0.0, 0.05, len(level.parameters)))
+    flat = Surface.level(way(poses))
+    surface = replace(flat, parameters=rng.normal(0.0, 0.05, len(flat.parameters)))
     height, intrinsic = surface.seen_height_m(points, frame), np.tile(INTRINSIC, (len(frame), 1, 1))
     assert np.std(height) > 0.1
     seen, plane = (projected(cam_from_map, points, z) for z in (height, 0 * height))
@@ -132,8 +114,8 @@ def test_a_surface_read_back_shows_from_any_pose_what_the_plane_would(tmp_path):
     # The way back on the same road: each place was passed in two directions.
     back = there[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
     paths = Paths.of(np.concatenate([there, back]), np.repeat([0, 1], len(there)))
-    level = Surface.level(paths)
-    surface = replace(level, parameters=rng.normal(0.0, 0.01, len(level.parameters)), datum_m=80.0)
+    flat = Surface.level(paths)
+    surface = replace(flat, parameters=rng.normal(0.0, 0.01, len(flat.parameters)), datum_m=80.0)
     write_json(tmp_path / "ground.json", surface.stored())
     between = there.copy()  # poses that the surface was not made at
     between[:, :2, 3] += 0.3 * there[:, :2, 0]
@@ -167,8 +149,7 @@ def test_a_damaged_ground_is_named(damage):
 
 
 def test_ground_that_is_a_plane_is_seen_as_one_however_it_leans():
-    poses = np.tile(np.eye(4), (60, 1, 1))
-    poses[:, 0, 3] = 0.6 * np.arange(60)
+    poses = level(0.6 * np.arange(60))
     surface = Surface.level(way(poses))
     along, across = np.meshgrid(np.arange(surface.knots[2]) - 1, np.arange(7) - 3, indexing="ij")
     spline = 0.05 * surface.knots[1] * along + 0.03 * 5.0 * across  # a cubic spline's own grade and bank
@@ -184,8 +165,7 @@ def test_ground_that_is_a_plane_is_seen_as_one_however_it_leans():
 
 @pytest.mark.parametrize("shape", ["plane", "crest", "bank"])
 def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_for_it(shape):
-    poses = np.tile(np.eye(4), (200, 1, 1))
-    poses[:, 0, 3] = 0.6 * np.arange(200)
+    poses = level(0.6 * np.arange(200))
 
     def ground(points):
         if shape == "crest":
@@ -206,13 +186,13 @@ def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_
     road = Road(line, height, slope + 0.004 * short @ rng.normal(size=(200, 2)))
     frame = rng.integers(0, 175, 3000)
     points = line[frame] + np.column_stack([rng.uniform(2, 15, 3000), rng.uniform(-8, 8, 3000)])
-    level = Surface.level(way(poses))
+    flat = Surface.level(way(poses))
     plane = ground(line)[frame] + np.einsum("ki,ki->k", slope[frame], points - line[frame])
     seen = ground(points) - plane + rng.normal(0.0, sigma_m, 3000)
-    columns = level.seen_columns(points, frame)
+    columns = flat.seen_columns(points, frame)
     noise = PoseNoise(position_m=0.01, position_drift_m=0.01, position_drift_over_m=30.0)
     information, score = (columns.T @ columns).toarray() / sigma_m**2, -columns.T @ seen / sigma_m**2
-    found, gain = level.estimated(information, score, Recorded.of(road, noise))
+    found, gain = flat.estimated(information, score, Recorded.of(road, noise))
     height, stated = found.height_m(points)
     off = height - ground(points)
     # No image shows the height, grade and bank of the whole, which err as the receiver does.
@@ -225,10 +205,10 @@ def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_
 
 
 def test_the_ground_of_a_map_is_the_same_in_files(tmp_path):
-    level = Surface.level(way(arc()))
-    along, across = np.meshgrid(np.arange(level.knots[2]), np.arange(7), indexing="ij")
+    flat = Surface.level(way(arc()))
+    along, across = np.meshgrid(np.arange(flat.knots[2]), np.arange(7), indexing="ij")
     smooth = np.concatenate([0 * FALLS, (0.3 * np.sin(along / 2) + 0.1 * np.cos(across / 2)).ravel()])
-    surface = replace(level, parameters=smooth, covariance=1e-4 * np.eye(len(smooth)), datum_m=80.0)
+    surface = replace(flat, parameters=smooth, covariance=1e-4 * np.eye(len(smooth)), datum_m=80.0)
     strips = surface.strips()
     paths = write_map(HdMap((), ground=strips), tmp_path, "map", ["geotiff", "opencrg"])
     spots = np.concatenate([strips[0].points(d)[5:-5:4] for d in (-6.1, 0.2, 5.3)])

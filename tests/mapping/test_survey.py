@@ -1,5 +1,6 @@
 """What a user knows beforehand, surveyed corners and sizes; and inputs that the drive contradicts."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,19 +15,13 @@ from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.trajectory import interpolate
-from v2hdm.mapping.bundle import (
-    control_points,
-    full_model,
-    known_lengths,
-    pose_sigma_of,
-    solve_bundle,
-    without_corner,
-)
+from v2hdm.mapping.bundle import control_points, known_lengths, without_corner
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SizeOptions, SurveyOptions, check_options
 from v2hdm.mapping.recovery import Inputs
 from v2hdm.records import DIAMOND, LANE_DASH, Trajectory
+from v2hdm.site.options import LaneOptions
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 INDEX = np.array([[7, 8, -1, 9]])
@@ -66,15 +61,6 @@ def test_surveyed_points_that_no_corner_is_nearest_to_are_told():
     assert without_corner(survey, control) == ["(0.10, 0.10)", "(5.00, 5.00)", "(1.00, 1.00)"]
     assert len(without_corner(survey, None)) == 4
     assert without_corner(SurveyOptions(), None) == []
-
-
-def test_a_surveyed_point_far_from_the_map_is_warned_of(caplog):
-    scene = make_scene(SceneOptions(seed=31, length_m=30.0, wild_rate=0.0, false_rate=0.0))
-    options = MappingOptions(pose_model="full", survey=survey_of([500.0, 3.0]))
-    run_methods(scene.drive, scene.detections, ("front",), options)
-    (warning,) = [r.getMessage() for r in caplog.records if "surveyed" in r.getMessage()]
-    assert "1 of 1" in warning
-    assert "(500.00, 3.00)" in warning
 
 
 def adjusted(scene, survey, one_by_one=False):
@@ -163,23 +149,38 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
 
 
 @pytest.mark.parametrize(
-    ("survey", "mode", "message"),
+    ("options", "message"),
     [
-        ({"points": [named("A", position_map=[1.0, float("nan")])]}, "batch", r"position_map\[1\]"),
-        ({"points": [named("A", sigma_m=[0.01, 0.0])]}, "batch", r"points\[0\]\.sigma_m is \[0\.01, 0\.0\]"),
-        ({"points": [named("A", position_map=[1.0])]}, "batch", r"points\[0\]\.position_map is \[1\.0\]"),
-        ({"points": [named("A"), named("A")]}, "batch", "names the point A twice"),
-        ({"file": "points.csv"}, "batch", r"survey\.file is 'points.csv': read it first"),
-        ({"sigma_m": 0.0}, "batch", r"survey\.sigma_m"),
-        ({"reach_m": -1.0}, "batch", r"survey\.reach_m"),
-        ({"reach_m": -1.0}, "incremental", r"survey\.reach_m"),
+        ({"survey": {"points": [named("A", position_map=[1.0, float("nan")])]}}, r"position_map\[1\]"),
+        (
+            {"survey": {"points": [named("A", sigma_m=[0.01, 0.0])]}},
+            r"points\[0\]\.sigma_m is \[0\.01, 0\.0\]",
+        ),
+        ({"survey": {"points": [named("A", position_map=[1.0])]}}, r"points\[0\]\.position_map is \[1\.0\]"),
+        ({"survey": {"points": [named("A"), named("A")]}}, "names the point A twice"),
+        ({"survey": {"sigma_m": 0.0}}, r"survey\.sigma_m"),
+        ({"survey": {"reach_m": -1.0}}, r"survey\.reach_m"),
+        ({"known_sizes": {"by_class_m": {"zebra": [1.0, 1.0]}}}, r"by_class_m\.zebra"),
+        ({"known_sizes": {"by_class_m": {DIAMOND: [1.0]}}}, r"by_class_m\.diamond"),
+        ({"known_sizes": {"by_class_m": {DIAMOND: [0.5, 1.0]}}}, "the longer one first"),
+        ({"known_sizes": {"by_class_m": {DIAMOND: [float("nan"), 1.0]}}}, r"by_class_m\.diamond"),
+        ({"known_sizes": {"by_class_m": {DIAMOND: [1.0, 0.0]}}}, r"by_class_m\.diamond"),
+        ({"known_sizes": {"sigma_m": 0.0}}, r"known_sizes\.sigma_m"),
+        ({"lanes": {"model": "spline"}}, r"mapping\.lanes\.model is 'spline'; choose after or joint"),
+        ({"mode": "online"}, r"mapping.mode is 'online'; choose batch or incremental"),
+        ({"max_range_m": 0.0}, r"mapping\.max_range_m"),
     ],
 )
-def test_a_survey_that_cannot_be_used_is_refused(survey, mode, message):
-    scene = make_scene(SceneOptions(length_m=20.0))
-    options = MappingOptions(mode=mode, survey=SurveyOptions(**survey))  # type: ignore[arg-type]
+def test_options_that_cannot_be_used_are_refused(options, message):
+    parts = {"survey": SurveyOptions, "known_sizes": SizeOptions, "lanes": LaneOptions}
+    given = {key: parts[key](**value) if key in parts else value for key, value in options.items()}
     with pytest.raises(ConfigError, match=message):
-        run_methods(scene.drive, scene.detections, ("front",), options)
+        check_options(MappingOptions(**given), CORNERED_CLASSES)
+
+
+def test_a_survey_that_is_still_a_file_is_refused(scene):
+    with pytest.raises(ConfigError, match=r"survey\.file is 'points.csv': read it first"):
+        mapped(scene, scene.drive, MappingOptions(survey=SurveyOptions(file="points.csv")))
 
 
 SIZES = SizeOptions(by_class_m={DIAMOND: [1.2, 0.6], LANE_DASH: [3.0, 0.15]})
@@ -213,31 +214,6 @@ def test_nothing_is_known_of_what_has_another_size_or_an_unknown_one():
     assert not lengths_of("stop_line", STRIP)
 
 
-def test_a_joint_solve_keeps_to_the_sizes():
-    scene = make_scene(SceneOptions(seed=31, length_m=60.0, pixel_sigma=0.6, hidden_corner_rate=0.0))
-    (true,) = {tuple(np.round(_diagonals(m.corners_map), 6)) for m in scene.markings if m.kind == DIAMOND}
-    sightings = collect_sightings(scene.drive, scene.detections, ("front", "rear"))
-    views = views_of(scene.drive, ("front", "rear"))
-    options = MappingOptions(pose_model="heave")
-    optimiser = Optimiser(sightings, views, scene.drive.cameras, scene.drive.noises, options)
-    bundle = optimiser.finish(optimiser.settle(optimiser.initial_tracks())).bundle
-    spread = []
-    for sizes in (SizeOptions(), SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)):
-        model = full_model(
-            [pose_sigma_of(scene.drive.pose_noise)], replace(options, known_sizes=sizes), "heave"
-        )
-        usable = sightings.valid & (bundle.association.group >= 0)[:, None]
-        solved = solve_bundle(
-            sightings, bundle.association, usable, bundle.rig, scene.drive.cameras, model
-        ).corners_map
-        long_m = np.array([_diagonals(c)[0] for c in solved if np.isfinite(c).all()])
-        near = long_m[np.abs(long_m - true[0]) < 0.15 * true[0]]
-        assert len(near) > 10
-        spread.append(np.std(near))
-    assert spread[1] < 0.004
-    assert spread[1] < 0.5 * spread[0]
-
-
 def test_a_map_that_grows_marking_by_marking_keeps_to_the_sizes():
     scene = make_scene(SceneOptions(seed=31, length_m=40.0, pixel_sigma=0.6, hidden_corner_rate=0.0))
     (true,) = {tuple(np.round(_diagonals(m.corners_map), 6)) for m in scene.markings if m.kind == DIAMOND}
@@ -255,23 +231,6 @@ def test_a_map_that_grows_marking_by_marking_keeps_to_the_sizes():
 
 def _diagonals(corners):
     return np.sort(np.linalg.norm(corners[2:] - corners[:2], axis=1))[::-1]
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"by_class_m": {"zebra": [1.0, 1.0]}}, r"by_class_m\.zebra"),
-        ({"by_class_m": {DIAMOND: [1.0]}}, r"by_class_m\.diamond"),
-        ({"by_class_m": {DIAMOND: [0.5, 1.0]}}, "the longer one first"),
-        ({"by_class_m": {DIAMOND: [float("nan"), 1.0]}}, r"by_class_m\.diamond"),
-        ({"by_class_m": {DIAMOND: [1.0, 0.0]}}, r"by_class_m\.diamond"),
-        ({"sigma_m": 0.0}, r"known_sizes\.sigma_m"),
-    ],
-)
-def test_sizes_that_no_marking_has_are_refused(change, key):
-    options = MappingOptions(known_sizes=SizeOptions(**change))  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=key):
-        check_options(options, CORNERED_CLASSES)
 
 
 OPTIONS = MappingOptions(pose_model="heave")
@@ -302,12 +261,6 @@ def surveyed(drive, off_m):
     return replace(drive, cameras={**drive.cameras, "front": replace(camera, centre_prior=prior)})
 
 
-def test_right_inputs_are_kept(scene):
-    result = mapped(scene, scene.drive)
-    assert faults(result) == []
-    assert max(one.sigmas for one in result.evidence.score_tests) < 5
-
-
 def test_a_survey_half_a_metre_too_high_is_dropped_and_told(scene):
     result = mapped(scene, surveyed(scene.drive, (0.0, 0.0, 0.5)))
     assert faults(result) == [Fault.SURVEY]
@@ -326,18 +279,14 @@ def test_known_sizes_that_the_paint_does_not_have_are_dropped_and_told(scene):
     assert np.median(np.linalg.norm(longest, axis=1)) > 1.15
 
 
-def test_known_sizes_that_the_paint_has_are_kept(scene):
-    sizes = SizeOptions(by_class_m={DIAMOND: [1.2, 0.6]}, sigma_m=0.005)
-    assert faults(mapped(scene, scene.drive, replace(OPTIONS, known_sizes=sizes))) == []
-
-
-def test_a_surveyed_point_that_lies_elsewhere_is_dropped_and_the_others_stay(scene):
+def test_a_surveyed_point_that_lies_elsewhere_is_dropped_and_one_far_from_the_map_warned_of(scene, caplog):
     known = mapped(scene, scene.drive).hd_map.markings
     points = [m.corners_map[0] for m in known[2:14:3]]
     points[1] = points[1] + (0.15, 0.0)
-    survey = survey_of(*points, sigma_m=0.005)
+    survey = survey_of(*points, (500.0, 3.0), sigma_m=0.005)
     result = mapped(scene, scene.drive, replace(OPTIONS, survey=survey))
     assert [one.about for one in result.evidence.corrected] == [f"({points[1][0]:.2f}, {points[1][1]:.2f})"]
+    assert re.search(r"1 of [45] surveyed points are of no use.*\(500\.00, 3\.00\)", caplog.text)
 
 
 def test_a_clock_60_ms_late_is_put_right(scene):
@@ -368,3 +317,12 @@ def test_inputs_are_tested_with_the_poses_estimated_even_where_the_first_groups_
     scene = make_scene(clear)
     inputs = Inputs(scene.drive, scene.detections, ("front",), OPTIONS)
     assert "roll" in inputs.optimiser.settle(inputs.tracks).model.solver.pose_states
+
+
+@pytest.mark.parametrize(
+    "sizes", [SizeOptions(), SizeOptions(by_class_m={DIAMOND: [1.2, 0.6]}, sigma_m=0.005)]
+)
+def test_right_inputs_are_kept(scene, sizes):
+    result = mapped(scene, scene.drive, replace(OPTIONS, known_sizes=sizes))
+    assert faults(result) == []
+    assert max(one.sigmas for one in result.evidence.score_tests) < 5

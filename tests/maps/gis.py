@@ -2,12 +2,13 @@
 
 import ctypes
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyogrio
 
-from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking
+from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking, Symbol
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0)
 
@@ -103,3 +104,15 @@ def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) ->
             )
         )
     return HdMap(tuple(markings), tuple(lanes), origin)
+
+
+def assert_same_map(got: HdMap, expected: HdMap) -> None:
+    """Every value to the last bit, but ids, which a file gives."""
+    assert got.origin == expected.origin
+    for one, other in zip(_features(got), _features(expected), strict=True):
+        for name, value in vars(replace(other, id=one.id)).items():
+            np.testing.assert_array_equal(getattr(one, name), value, err_msg=name)
+
+
+def _features(hd_map: HdMap) -> list[Marking | Lane | Symbol]:
+    return [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]

@@ -16,7 +16,7 @@ from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration.reading import Provenance, read_calibration, read_camera_info, read_provenance
+from v2hdm.io.calibration.reading import Provenance, read_calibration, read_provenance
 from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration, write_calibration_as
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
@@ -59,32 +59,19 @@ def test_an_edited_geopackage_becomes_the_geojson_again(folder):
 EXPORT = ("export", "map.geojson", "--format", "csv", "--format", "lanelet2")
 
 
-def _refused(folder, name, capsys, words=EXPORT):
+def _refused(folder, name, capsys, words):
     before = (folder / name).read_bytes()
     assert run(words) == 2
     assert "move it, or give another --output" in capsys.readouterr().err
     assert (folder / name).read_bytes() == before
 
 
-def test_an_export_replaces_what_it_has_written_itself_and_nothing_else(folder, capsys):
-    (folder / "map.csv").write_text("of the user's")
-    _refused(folder, "map.csv", capsys)
-    (folder / "map.csv").unlink()
+def test_an_export_replaces_what_it_has_written_of_the_same_map_and_nothing_else(folder, capsys):
+    """Of edited files, links and the user's own, tests/faults has a case for each format."""
     for _ in range(2):
         assert run(EXPORT) == 0
-    osm = folder / "map_lanelet2" / "lanelet2_map.osm"
-    osm.write_text(osm.read_text() + "<!-- edited -->")
-    _refused(folder, "map_lanelet2/lanelet2_map.osm", capsys)
-    osm.unlink()
     write_geojson(street(), folder / "other" / "map.geojson")  # of the same name, from elsewhere
     _refused(folder, "map.csv", capsys, ("export", "other/map.geojson", "--format", "csv", "--output", "."))
-    (folder / "map.csv").rename(folder / "elsewhere.csv")
-    (folder / "map.csv").symlink_to("elsewhere.csv")
-    _refused(folder, "map.csv", capsys)
-    (folder / "map.csv").unlink()
-    (folder / "map_lanelet2").rename(folder / "elsewhere")
-    (folder / "map_lanelet2").symlink_to("elsewhere")
-    _refused(folder, "elsewhere/map_projector_info.yaml", capsys)
 
 
 @pytest.mark.parametrize("source", ["map.geojson", "map.gpkg"])
@@ -111,16 +98,11 @@ def test_a_geopackage_of_an_earlier_export_is_made_anew_for_a_project(folder):
         (["map.geojson", "--format", "shp"], "--format: unknown format 'shp'; choose from: geojson, csv"),
         (["map.geojson", "--format", "opencrg"], "--format opencrg: a map's file does not hold the ground"),
         (["calibration_front.yaml", "--format", "gpkg"], "unknown format 'gpkg' of a calibration"),
-        (["map.geojson", "--format", "geojson"], "map.geojson would be written over"),
         (["map.csv", "--format", "gpkg"], "map.csv: no map that can be read"),
-        (["none.geojson", "--format", "csv"], "none.geojson: no such file"),
         (["none.gpkg", "--format", "csv"], "none.gpkg: no such file"),
         (["none.yaml", "--format", "urdf"], "none.yaml: no such file"),
         (["map.geojson", "--format", "lanelet2", "--projector", "UTM"], "unknown projector 'UTM'"),
-        (
-            ["map.geojson", "--format", "csv", "--output", "map.gpkg"],
-            "map.gpkg is a file; give another --output",
-        ),
+        (["map.geojson", "--format", "csv", "--output", "map.gpkg"], "map.gpkg is a file; give another"),
     ],
 )
 def test_what_a_user_must_mend_is_one_line(folder, arguments, message, capsys):
@@ -152,15 +134,11 @@ def test_every_form_tells_sigmas_drive_date_and_verdict(tmp_path, form):
     np.testing.assert_allclose(told["rotation_sigma_deg"], np.degrees(SIGMAS[3:]))
 
 
-def test_camera_info_is_read_as_ros_does_and_as_a_drive_s(tmp_path):
-    path = written(tmp_path, "camera_info")
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+def test_camera_info_has_the_matrices_of_ros(tmp_path):
+    content = yaml.safe_load(written(tmp_path, "camera_info").read_text(encoding="utf-8"))
     for name, columns in (("camera", 3), ("projection", 4), ("rectification", 3)):
         matrix = content[f"{name}_matrix"]
         assert (matrix["rows"], matrix["cols"], len(matrix["data"])) == (3, columns, 3 * columns)
-    info = read_camera_info(path)
-    np.testing.assert_array_equal(info.intrinsic, CALIBRATION.info.intrinsic)
-    assert (info.name, info.distortion) == ("front", CALIBRATION.info.distortion)
 
 
 def test_a_static_transform_is_where_the_camera_sits_on_the_vehicle(tmp_path):
@@ -198,20 +176,11 @@ def test_a_urdf_s_origin_is_where_the_camera_sits_on_the_vehicle(tmp_path, cam_f
     assert_inverse(Rotation.from_euler("xyz", rpy).as_matrix(), xyz, cam_from_vehicle)
 
 
-def test_kalibr_has_the_same_pixels(tmp_path):
+def test_kalibr_has_the_mounting_beside_the_lens(tmp_path):
+    """That its pixels are the same is told by reading them back, in tests/drive."""
     camera = yaml.safe_load(written(tmp_path, "kalibr").read_text())["cam0"]
     np.testing.assert_array_equal(camera["T_cam_vehicle"], CALIBRATION.cam_from_vehicle)
-    fx, fy, cx, cy = camera["intrinsics"]
     assert (camera["camera_model"], camera["distortion_model"]) == ("pinhole", "radtan")
-    assert camera["resolution"] == [64, 48]
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    points = np.array([[0.3, 0.2, 1.0], [-0.2, 0.1, 1.0]])
-    got, _ = cv2.projectPoints(
-        points, np.zeros(3), np.zeros(3), matrix, np.array(camera["distortion_coeffs"])
-    )
-    lens = np.array(CALIBRATION.info.distortion)
-    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CALIBRATION.info.intrinsic, lens)
-    np.testing.assert_allclose(got, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -163,13 +163,3 @@ def test_what_cannot_be_exported_is_refused_in_one_line(result, monkeypatch, cap
     shown = capsys.readouterr().err
     assert message in shown
     assert len(shown.strip().splitlines()) == 1
-
-
-def test_a_users_file_of_a_project_is_not_replaced(result, monkeypatch, capsys):
-    folder, _ = result
-    write_geojson(street(), folder / "map.geojson")
-    (folder / "map.qgs").write_text("of the user's")
-    monkeypatch.chdir(folder)
-    assert run(["export", "map.geojson", "--format", "qgis"]) == 2
-    assert "move it, or give another --output" in capsys.readouterr().err
-    assert (folder / "map.qgs").read_text() == "of the user's"

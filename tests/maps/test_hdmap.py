@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
+from tests.maps.gis import assert_same_map
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.io.calibration.reading import read_calibration
@@ -55,22 +56,6 @@ def test_enu_agrees_with_pyproj_and_returns(latitude, longitude, altitude):
     np.testing.assert_allclose(expected, points, atol=1e-6)
 
 
-def assert_same(got, expected):
-    assert got.origin == expected.origin
-    assert len(got.markings) == len(expected.markings)
-    for a, b in zip(got.markings, expected.markings, strict=True):
-        assert (a.kind, a.sightings) == (b.kind, b.sightings)
-        np.testing.assert_array_equal(a.corners_map, b.corners_map)
-        assert (a.covariance_m2 is None) == (b.covariance_m2 is None)
-        if a.covariance_m2 is not None:
-            np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)
-        np.testing.assert_array_equal(a.heights_m, b.heights_m)
-    for c, d in zip(got.lanes, expected.lanes, strict=True):
-        assert (c.kind, c.sightings) == (d.kind, d.sightings)
-        np.testing.assert_array_equal(c.points_map, d.points_map)
-        np.testing.assert_array_equal(c.heights_m, d.heights_m)
-
-
 @pytest.mark.parametrize("origin", [None, ORIGIN])
 def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
     outline = np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]])
@@ -109,18 +94,6 @@ def test_every_format_holds_a_symbol_of_three_corners(tmp_path, ending):
         assert "parking_t" in path.read_text()
 
 
-@pytest.mark.parametrize("origin", [None, ORIGIN])
-def test_a_map_survives_its_file_to_the_last_bit(tmp_path, origin):
-    hd_map = HdMap(make_map().markings, make_map().lanes, origin)
-    write_geojson(hd_map, tmp_path / "map.geojson")
-    assert_same(read_geojson(tmp_path / "map.geojson"), hd_map)
-
-
-def test_an_empty_map_is_a_map(tmp_path):
-    write_geojson(HdMap(()), tmp_path / "map.geojson")
-    assert_same(read_geojson(tmp_path / "map.geojson"), HdMap(()))
-
-
 @pytest.mark.parametrize("turn", [1, -1])
 def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path, turn):
     corners = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])[::turn]
@@ -132,15 +105,6 @@ def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path
     np.testing.assert_array_equal(ring[0], ring[-1])
     x, y, _ = (ring - ring[0]).T
     assert x[:-1] @ y[1:] - y[:-1] @ x[1:] > 0
-
-
-def test_coordinates_are_longitude_and_latitude_to_a_tenth_of_a_millimetre(tmp_path):
-    write_geojson(make_map(), tmp_path / "map.geojson")
-    feature = json.loads((tmp_path / "map.geojson").read_text())["features"][-1]
-    lon, lat, height_m = np.array(feature["geometry"]["coordinates"]).T
-    metres = enu_from_geodetic(ORIGIN, np.column_stack([lat, lon, height_m]))
-    np.testing.assert_allclose(metres[:, :2], make_map().lanes[0].points_map, atol=2e-4)
-    np.testing.assert_allclose(metres[:, 2], 0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize(("origin", "above_m"), [(None, 0.0), (ORIGIN, ORIGIN.altitude_m)])
@@ -160,7 +124,7 @@ def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(tmp_pat
     )
     np.testing.assert_allclose([p[2] - above_m for p in ring[0]], [*expected, expected[0]], atol=2e-4)
     np.testing.assert_allclose([p[2] - above_m for p in line], [2.04, 2.54], atol=2e-4)
-    assert_same(read_geojson(tmp_path / "map.geojson"), hd_map)
+    assert_same_map(read_geojson(tmp_path / "map.geojson"), hd_map)
 
 
 def test_local_metres_say_that_they_are_not_degrees(tmp_path):
@@ -174,7 +138,7 @@ def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path):
     broken = HdMap((Marking("diamond", np.full((4, 2), np.nan), 3),))
     with pytest.raises(ValueError, match="JSON compliant"):
         write_geojson(broken, path)
-    assert_same(read_geojson(path), make_map())
+    assert_same_map(read_geojson(path), make_map())
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.geojson"]
 
 
@@ -188,9 +152,6 @@ def damaged_map(origin=None, **properties):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "line 1 JSON syntax error"),
-        ("[]", "expected a JSON object"),
-        ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
         ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has no geometry, 'corn"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
@@ -200,10 +161,7 @@ def damaged_map(origin=None, **properties):
         (damaged_map(sightings=1.5), "feature 0, sightings: expected a whole number"),
         (damaged_map(sightings=2**70), "feature 0, sightings: expected a whole number"),
         (damaged_map(sightings=10**400), "feature 0, sightings: expected a finite number"),
-        (
-            damaged_map(corners_map=[[10**400, 0], [1, 0], [1, 1], [0, 1]]),
-            "corners_map: holds a number that is not finite",
-        ),
+        (damaged_map(corners_map=[[10**400, 0], [1, 0], [1, 1], [0, 1]]), "corners_map: holds a number that"),
         (damaged_map(covariance_m2=(-np.eye(8)).tolist()), "covariance_m2: not symmetric or negative"),
         (
             '{"v2hdm": {}, "features": [{"geometry": {"type": "Polygon", "coordinates": [[[0, 0, 0]]]}, '
@@ -215,11 +173,6 @@ def damaged_map(origin=None, **properties):
 def test_a_damaged_map_is_refused(tmp_path, text, message):
     (tmp_path / "map.geojson").write_text(text)
     with pytest.raises(MapFileError, match=message):
-        read_geojson(tmp_path / "map.geojson")
-
-
-def test_a_missing_map_is_named(tmp_path):
-    with pytest.raises(MapFileError, match="no such file"):
         read_geojson(tmp_path / "map.geojson")
 
 
@@ -321,17 +274,6 @@ def test_a_damaged_line_is_named(line, tmp_path):
         read_residuals(path)
 
 
-@pytest.mark.parametrize("origin", [None, GeodeticOrigin(53.5, 9.9, 40.0)])
-def test_exclusions_are_read_back_as_written(origin, tmp_path):
-    written = [Exclusion("diamond", np.array([1.25, -3.5]), 4, "its position is too uncertain", "both")]
-    write_exclusions(written, tmp_path / "excluded.geojson", origin, None)
-    (read,) = read_exclusions(tmp_path / "excluded.geojson")
-    np.testing.assert_array_equal(read.position_map, written[0].position_map)
-    assert (read.kind, read.sightings, read.reason, read.cameras) == (
-        "diamond", 4, "its position is too uncertain", "both",
-    )  # fmt: skip
-
-
 def test_exclusions_without_a_place_are_refused(tmp_path):
     (tmp_path / "excluded.geojson").write_text('{"features": [{"properties": {"class": "diamond"}}]}')
     with pytest.raises(MapFileError, match="feature 0"):
@@ -343,48 +285,36 @@ MAP = HdMap((Marking("diamond", np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 3)
 CALIBRATION = Calibration(CameraInfo("front", 640, 480, np.diag([500.0, 500.0, 1.0])), np.eye(4))
 
 
-def test_a_map_keeps_the_verdict_on_it(tmp_path):
-    write_geojson(MAP, tmp_path / "map.geojson", VERDICT)
-    assert read_verdict(tmp_path / "map.geojson") == VERDICT
-    np.testing.assert_array_equal(
-        read_geojson(tmp_path / "map.geojson").markings[0].corners_map, MAP.markings[0].corners_map
-    )
-
-
-def test_a_map_without_a_verdict_has_none(tmp_path):
-    write_geojson(MAP, tmp_path / "map.geojson")
-    assert read_verdict(tmp_path / "map.geojson") is None
+@pytest.mark.parametrize("verdict", [VERDICT, None])
+def test_a_map_keeps_the_verdict_on_it(tmp_path, verdict):
+    write_geojson(MAP, tmp_path / "map.geojson", verdict)
+    assert read_verdict(tmp_path / "map.geojson") == verdict
 
 
 @pytest.mark.parametrize(("sigma_s", "known"), [(0.001, True), (float("inf"), False)])
-def test_a_calibration_says_the_clock_and_the_verdict(tmp_path, sigma_s, known):
+def test_a_calibration_says_clock_read_out_time_and_verdict(tmp_path, sigma_s, known):
     calibration = Calibration(CALIBRATION.info, _looking_down())
     path = tmp_path / "front.yaml"
-    write_calibration(calibration, path, clock_s=(0.06, sigma_s), verdict=VERDICT)
+    write_calibration(calibration, path, clock_s=(0.06, sigma_s), read_out_s=(0.03, 0.0005), verdict=VERDICT)
     content = load_yaml(path, MapFileError)
     assert content["clock_offset_s"] == 0.06
+    assert (content["read_out_s"], content["read_out_sigma_s"]) == (0.03, 0.0005)
     assert ("clock_sigma_s" in content) is known
     assert content["verdict"] == VERDICT
     np.testing.assert_allclose(read_calibration(path).cam_from_vehicle, _looking_down())
 
 
-def test_a_calibration_says_an_estimated_read_out_time(tmp_path):
-    calibration, path = Calibration(CALIBRATION.info, _looking_down()), tmp_path / "front.yaml"
-    write_calibration(calibration, path, read_out_s=(0.03, 0.0005))
-    content = load_yaml(path, MapFileError)
-    assert (content["read_out_s"], content["read_out_sigma_s"]) == (0.03, 0.0005)
-    assert read_calibration(path).info.name == CALIBRATION.info.name
-
-
-def test_what_was_left_out_is_a_point_with_its_reason(tmp_path):
+def test_what_was_left_out_is_a_point_with_its_reason_and_is_read_back(tmp_path):
     one = Exclusion("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
     road = Road(np.array([[3.0, 4.0]]), np.array([46.2]), np.zeros((1, 2)))
     write_exclusions([one], tmp_path / "excluded.geojson", None, road)
     (feature,) = json.loads((tmp_path / "excluded.geojson").read_text())["features"]
     assert feature["geometry"] == {"type": "Point", "coordinates": [3.0, 4.0, 46.2]}
-    assert feature["properties"]["reason"] == "seen once"
-    assert feature["properties"]["cameras"] == "front"
     write_exclusions([one], tmp_path / "wgs.geojson", GeodeticOrigin(48.0, 11.0, 500.0), None)
+    for name in ("excluded", "wgs"):
+        (read,) = read_exclusions(tmp_path / f"{name}.geojson")
+        np.testing.assert_array_equal(read.position_map, one.position_map)
+        assert (read.kind, read.sightings, read.reason, read.cameras) == ("diamond", 2, "seen once", "front")
     (feature,) = json.loads((tmp_path / "wgs.geojson").read_text())["features"]
     assert feature["geometry"]["coordinates"][:2] == pytest.approx([11.0, 48.0], abs=1e-3)
 

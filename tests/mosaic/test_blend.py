@@ -12,15 +12,7 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.mosaic import blend as module
-from v2hdm.mosaic.blend import (
-    FEATHER,
-    Canvas,
-    Shot,
-    adjusted_shots,
-    lens_of,
-    recorded_shots,
-    whole,
-)
+from v2hdm.mosaic.blend import FEATHER, Canvas, Shot, adjusted_shots, lens_of, recorded_shots, whole
 from v2hdm.records import Calibration
 
 

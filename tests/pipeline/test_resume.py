@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from tests.drive.example import description
+from tests.ports import blind_copy, run_config
 from v2hdm.detection import batch
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
@@ -17,7 +17,6 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import detections
 from v2hdm.pipeline import inspect as inspection
 from v2hdm.pipeline import run as running
-from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import RunResult, run
 from v2hdm.store.cache import items_of
 from v2hdm.store.files import replace_text
@@ -36,9 +35,8 @@ def site(small_drive, tmp_path_factory):
 
 
 def config(folder, output, **changes):
-    drive = DriveConfig(path=str(folder / "drive"))
-    given = {"name": "short", "drive": drive, "output": str(folder / output), "workers": 1}
-    return RunConfig(**{**given, "cache": str(folder / "cache"), **changes})
+    given = {"cache": str(folder / "cache"), **changes}
+    return run_config(folder / "drive", folder / output, **given)
 
 
 def assert_same(folder, other):
@@ -47,12 +45,8 @@ def assert_same(folder, other):
 
 
 def test_two_processes_find_the_same_map_to_the_byte_without_the_truth(site, tmp_path):
-    blind = tmp_path / "blind"
-    shutil.copytree(site / "drive", blind, ignore=shutil.ignore_patterns("truth"))
-    with description(blind) as content:
-        content.pop("truth")
-    drive = DriveConfig(path=str(blind))
-    assert_same(run(config(tmp_path, "out", drive=drive, workers=2)).folder, site / "first" / "short")
+    blind_copy(site / "drive", tmp_path / "drive")
+    assert_same(run(config(tmp_path, "out", workers=2)).folder, site / "first" / "short")
 
 
 def refused(*_, **__):

@@ -148,19 +148,11 @@ def test_check_points_touch_no_part_of_the_map(site, documented, tmp_path):
     assert "another datum or origin" in finding.says
 
 
-@pytest.mark.parametrize(
-    ("swap", "message"),
-    [
-        (("latitude_deg,longitude_deg", "longitude_deg,latitude_deg"), "no place on the earth; are they"),
-        (("latitude_deg,longitude_deg", "x_m,y_m"), r"none of its 20 .*: 20 would as latitude and longitude"),
-    ],
-)
-def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(site, swap, message, tmp_path):
-    wrong = tmp_path / "wrong.csv"
-    wrong.write_text((site.folder / "points.csv").read_text().replace(*swap))
-    with pytest.raises(DriveError, match=message) as caught:
-        run(site.config(tmp_path / "out", SurveyOptions(file=str(wrong))))
-    assert "\n" not in str(caught.value)
+def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(site, tmp_path):
+    wrong = (site.folder / "points.csv").read_text().replace("latitude_deg,longitude_deg", "x_m,y_m")
+    (tmp_path / "wrong.csv").write_text(wrong)
+    with pytest.raises(DriveError, match=r"^[^\n]*none of its 20 .*: 20 would as latitude and longitude.*$"):
+        run(site.config(tmp_path / "out", SurveyOptions(file=str(tmp_path / "wrong.csv"))))
     assert not (tmp_path / "out").exists()
 
 
@@ -170,12 +162,3 @@ def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path):
     )
     with pytest.raises(DriveError, match=r"none\.csv: no such file"):
         run(config)
-
-
-def test_places_on_the_earth_are_refused_for_a_drive_without_an_origin(site, tmp_path):
-    shutil.copytree(site.drive, tmp_path / "drives/mysite")
-    with description(tmp_path / "drives/mysite") as content:
-        del content["origin"], content["truth"]
-    lost = Site(tmp_path).config(tmp_path / "out", SurveyOptions(file=str(site.folder / "points.csv")))
-    with pytest.raises(DriveError, match="the drive's map has none; give the drive an origin"):
-        run(lost)

@@ -101,15 +101,6 @@ def test_markings_run_counter_clockwise_and_keep_apart():
     assert gaps.min() > 1.6
 
 
-def test_a_dashed_lane_runs_through_the_middle_of_its_dashes():
-    route = build_route(RouteConfig())
-    layout = build_layout(PaintConfig(), route, np.random.default_rng(1))
-    lane = next(lane.points_map for lane in layout.lanes if lane.kind == LANE_DASH)
-    middles = np.array([m.corners_map.mean(axis=0) for m in layout.markings if m.kind == LANE_DASH])
-    assert np.linalg.norm(np.diff(lane, axis=0), axis=1).max() <= 0.5 + 1e-9
-    assert np.linalg.norm(middles[:, None] - lane[None], axis=2).min(axis=1).max() < 0.26
-
-
 def test_a_dashed_lane_bends_between_its_dashes_as_its_road_does():
     """Bent as sharply as yards are, a straight line across a gap would cut the bend by decimetres."""
     config = PaintConfig()

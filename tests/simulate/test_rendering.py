@@ -1,6 +1,5 @@
 """The 50 % point of a painted edge must lie where the polygon's projection says."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +9,7 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import DIAMOND, CameraInfo
-from v2hdm.simulate import render_drive, rendered_drive
+from v2hdm.simulate import render_drive
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Light, Paint, Scene
 from v2hdm.simulate.render.view import camera_rays
@@ -24,19 +23,9 @@ def ignore(done, total):
     pass
 
 
-class Stopped(Exception):
-    pass
-
-
 def test_two_workers_write_the_same_bytes_as_one(tiny_drive, tmp_path):
     render_drive(tiny_port(), tmp_path / "tiny", 2, ignore)
     assert contents(tmp_path / "tiny") == contents(tiny_drive)
-
-
-def test_another_seed_gives_other_pictures(tiny_drive, tmp_path):
-    render_drive(tiny_port(seed=5), tmp_path / "tiny", 1, ignore)
-    image = "front/images/000002.jpg"
-    assert (tmp_path / "tiny" / image).read_bytes() != (tiny_drive / image).read_bytes()
 
 
 def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive, tmp_path):
@@ -44,9 +33,9 @@ def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive, tmp_p
 
     def stop(done, total):
         if done == 7:
-            raise Stopped
+            raise ZeroDivisionError
 
-    with pytest.raises(Stopped):
+    with pytest.raises(ZeroDivisionError):
         render_drive(tiny_port(), folder, 1, stop)
     with pytest.raises(DriveError):
         read_drive(folder)
@@ -57,28 +46,6 @@ def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive, tmp_p
     assert seen[0] == 7
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in kept.items())
     assert contents(folder) == contents(tiny_drive)
-
-
-def test_a_rendered_drive_is_found_again_in_the_cache(tmp_path):
-    config = tiny_port()
-    calls: list[int] = []
-    first = rendered_drive(config, tmp_path, 1, lambda done, total: calls.append(done))
-    rendered = len(calls)
-    assert rendered_drive(config, tmp_path, 1, lambda done, total: calls.append(done)) == first
-    assert len(calls) == rendered
-    config.paint.wear = 0.3
-    assert rendered_drive(config, tmp_path, 1, ignore) != first
-
-
-def test_the_mapper_reads_it_like_any_other_drive(tiny_drive):
-    drive = read_drive(tiny_drive)
-    assert set(drive.cameras) == {"front", "rear"}
-    assert drive.cameras["front"].initial_ipm == "calibrated"
-    image = cv2.imread(str(drive.images[0].path))
-    assert image.shape == (64, 96, 3)
-    assert 40 < image[32:].mean() < 220
-    poses = np.array([i.map_from_vehicle for i in drive.images])
-    assert np.allclose(poses[:, 2, 3], 0.0)
 
 
 def test_recorded_poses_err_by_what_is_configured_and_images_lie_between_them(tiny_drive):

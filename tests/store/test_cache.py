@@ -32,7 +32,7 @@ from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
-from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
+from v2hdm.records import FloatArray, ImageDetections
 from v2hdm.store.cache import DRIVES, CodecError, StageCache, decode, encode, items_of, prune
 from v2hdm.store.folders import LIST, is_whole, new_entry, note_use
 from v2hdm.store.lock import IN_USE, in_use, take_lock
@@ -129,23 +129,6 @@ def test_a_use_is_an_entrys_time_of_change(tmp_path):
     assert cache.path("stage", KEY).stat().st_mtime > 1
 
 
-def test_the_base_install_imports_the_store_and_names_the_extra_that_the_cache_needs(tmp_path):
-    code = (
-        "import sys; sys.modules.update(dict.fromkeys(('msgspec', 'fsspec', 'filelock', 'scipy', 'torch')))\n"
-        "import pkgutil, importlib, v2hdm.store; from pathlib import Path\n"
-        "for one in pkgutil.iter_modules(v2hdm.store.__path__, 'v2hdm.store.'):\n"
-        "    importlib.import_module(one.name)\n"
-        "from v2hdm.store.cache import StageCache; from v2hdm.store.results import growing_folder\n"
-        "with growing_folder(Path(sys.argv[1]) / 'drawn', '--draw') as add: add('a.jpg', b'a')\n"
-        "from v2hdm.errors import ConfigError\n"
-        "try: StageCache(Path(sys.argv[1])).key(1)\n"
-        "except ConfigError as error: print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
-    assert "install the map extra, pip install 'v2hdm[map]'" in done.stdout, done.stderr
-    assert (tmp_path / "drawn" / "a.jpg").is_file()
-
-
 @dataclass(frozen=True)
 class Kept:
     """One of everything."""
@@ -223,11 +206,6 @@ def test_arrays_that_claim_to_be_larger_than_they_are_are_refused():
 def test_nesting_without_end_is_refused():
     with pytest.raises(CodecError):
         decode(b"\x91" * 100_000, list[Any])
-
-
-def test_a_marking_comes_back_as_it_was():
-    found = MarkingDetection("a", 0.1, np.eye(4, 2), np.eye(8), np.ones(4, dtype=bool))
-    assert same(decode(encode(found), MarkingDetection), found)
 
 
 KEYS = [f"{number:064x}" for number in range(4)]
@@ -433,10 +411,7 @@ def test_the_command_lists_and_prunes(cache, capsys):
     ("arguments", "says"),
     [(["list", "--cache", "nowhere"], "no such folder"), (["prune", "--gb", "-1"], "give 0 or more")],
 )
-def test_the_command_reports_in_one_line(
-    arguments, says, cache, capsys,
-    monkeypatch,
-):  # fmt: skip
+def test_the_command_reports_in_one_line(arguments, says, cache, capsys, monkeypatch):
     monkeypatch.chdir(cache.parent)
     assert run(["cache", *arguments]) == 2
     error = capsys.readouterr().err

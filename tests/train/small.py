@@ -34,16 +34,11 @@ def coco(folder: Path, **changes: object) -> Path:
 
 
 def tiny(output: Path, steps: int = 3) -> TrainConfig:
-    return TrainConfig(
-        output=str(output),
-        steps=steps,
-        batch=2,
-        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1], separable=True, wide_kinds=False),
-        data=DataConfig(
-            width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
-        ),
-        validation=ValidationConfig(images=2),
-    )
+    net = NetConfig(widths=[16, 16, 16, 16], dilations=[1], separable=True, wide_kinds=False)
+    sizes = {"width": 64, "height": 32, "render_width": 80, "render_height": 48}
+    data = DataConfig(**sizes, views_per_render=2, reservoir=4, workers=0)
+    validation = ValidationConfig(images=2)
+    return TrainConfig(output=str(output), steps=steps, batch=2, net=net, data=data, validation=validation)
 
 
 def train(config: TrainConfig) -> Checkpoint:

@@ -61,22 +61,12 @@ def reported(shown, detector, spots):
 
 def found(shown, markings):
     """The markings that must be found, by number, and are, as their class."""
-    return {
-        number
-        for number, true in enumerate(shown.markings)
-        if true.fair
-        and any(
-            m.kind == true.kind and polygon_overlap(m.corners_px, true.polygon_px) >= 0.5 for m in markings
-        )
-    }
 
+    def is_seen(true):
+        overlaps = (polygon_overlap(m.corners_px, true.polygon_px) for m in markings if m.kind == true.kind)
+        return any(overlap >= 0.5 for overlap in overlaps)
 
-def test_readings_of_quadrilaterals_are_gathered_with_their_truth(shown, detector):
-    gathered = Gathered()
-    gathered.add(0, shown, detector)
-    count = len(gathered.kind)
-    assert count == len(gathered.evidence) == len(gathered.views) == len(gathered.true) == len(gathered.lit)
-    assert gathered.true.count(True) > 3
+    return {number for number, true in enumerate(shown.markings) if true.fair and is_seen(true)}
 
 
 def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detector):
@@ -86,6 +76,9 @@ def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detec
     without.add(0, shown, detector)
     with_spots.add(0, spotted, detector, spots)
     assert (spots.light > 0).any()
+    assert without.true.count(True) > 3
+    lists = (without.kind, without.evidence, without.views, without.true, without.lit)
+    assert len({len(one) for one in lists}) == 1
     assert all(with_spots.lit)
     assert with_spots.true.count(False) > without.true.count(False)
     plain = [m for m in detector.detect(shown.image, shown.camera)[0] if len(m.outline_px) == 0]
@@ -115,9 +108,9 @@ def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
 
 def test_readings_that_were_gathered_in_parts_are_those_gathered_at_once(tmp_path):
     cv2.setNumThreads(1)
-    ranges = range(0, 2), range(2, 3), range(0, 3)
+    ranges = range(0, 1), range(1, 2), range(0, 2)
     parts = [
-        fit_judge.Part(numbers, 3, weights.NETWORK_FILE, tmp_path / f"{k}.npz")
+        fit_judge.Part(numbers, 2, weights.NETWORK_FILE, tmp_path / f"{k}.npz")
         for k, numbers in enumerate(ranges)
     ]
     first, second, whole = (Gathered.load([fit_judge.gather(part).path]) for part in parts)

@@ -164,14 +164,10 @@ def test_each_output_that_is_wrong_costs(wrong):
     assert float(total_loss(prediction, targets, LossConfig())) > 1
 
 
-def test_certain_and_wrong_costs_the_whole_dice_loss():
+def test_certain_and_wrong_costs_the_whole_dice_loss_and_a_picture_without_paint_none():
     labels = torch.full((1, 40, 40), 1)
     assert float(dice_loss(sure(torch.zeros_like(labels)), labels)) > 0.99
-
-
-def test_dice_of_a_picture_without_paint_is_zero():
-    labels = torch.zeros((1, 4, 4), dtype=torch.uint8)
-    assert float(dice_loss(sure(labels), labels)) == pytest.approx(0, abs=1e-6)
+    assert float(dice_loss(sure(0 * labels), 0 * labels)) == pytest.approx(0, abs=1e-6)
 
 
 def test_ignored_elements_get_no_gradient():
@@ -394,11 +390,6 @@ def test_the_share_of_labelled_views_is_what_was_asked_for(tmp_path, share, low,
     assert low <= from_labels <= high
 
 
-def test_without_labels_there_is_nothing_to_mix_in():
-    assert read_labels(config()) is None
-    assert TrainConfig().data.coco is None
-
-
 def test_squeezed_images_are_stretched_together_with_their_labels(tmp_path):
     labels = labelled(coco=str(coco(tmp_path)), coco_size=[2 * WIDTH, HEIGHT])
     image = labels.images[0]
@@ -502,7 +493,7 @@ ANNOTATION = {"id": 5, "image_id": 7, "category_id": 1, "segmentation": [[0, 0, 
         ({"images": [{"id": 7, "file_name": "gone.png"}]}, "image 7: .*gone.png: image listed but missing"),
         (
             {"images": [{"id": 7, "file_name": "a.png", "width": 5, "height": 5}]},
-            "a.png is 96x64 but its labels are for 5x5",
+            "is 96x64 but its labels are",
         ),
     ],
 )

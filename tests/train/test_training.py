@@ -4,20 +4,19 @@ import logging
 import math
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
 from tests.train.small import tiny, train
 from train import __main__ as door
 from train import data
-from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from train.checkpoint import load_checkpoint, save_checkpoint
 from train.config import DataConfig, LossConfig, TrainConfig
 from train.data import training_batches
 from train.distributed import Team, choose_device, joined_team
@@ -55,19 +54,14 @@ def test_the_loss_falls_on_a_batch_seen_again_and_again(tmp_path):
 
 
 def test_a_run_goes_on_where_it_was_left(tmp_path, caplog):
-    train(tiny(tmp_path, steps=2))
-    with caplog.at_level(logging.INFO):
-        state = train(tiny(tmp_path, steps=4))
-    assert state.step == 4
-    assert "resuming at step 2" in caplog.text
-
-
-def test_resumed_weights_are_those_that_were_left(tmp_path):
     left = train(tiny(tmp_path, steps=2))
-    trainer = Trainer(tiny(tmp_path, steps=9), lambda share, line: None)
+    with caplog.at_level(logging.INFO):
+        trainer = Trainer(tiny(tmp_path, steps=4), lambda share, line: None)
+    assert "resuming at step 2" in caplog.text
     for name, value in trainer.averaged.module.state_dict().items():
         torch.testing.assert_close(value, left.averaged[name])
     assert trainer.optimizer.state_dict()["state"]
+    assert trainer.run().step == 4
 
 
 def test_going_on_under_other_settings_is_refused_by_name(tmp_path):
@@ -92,14 +86,6 @@ def test_the_learning_rate_warms_up_and_ends_at_nothing(tmp_path):
     assert math.isclose(rates[100], 0.0, abs_tol=1e-9)
 
 
-def test_a_missing_and_a_damaged_checkpoint_are_named(tmp_path):
-    with pytest.raises(ConfigError, match="no checkpoint at"):
-        load_checkpoint(tmp_path / "last.pt")
-    (tmp_path / "last.pt").write_bytes(b"no such thing")
-    with pytest.raises(ConfigError, match="is no checkpoint"):
-        load_checkpoint(tmp_path / "last.pt")
-
-
 class Evil:
     def __init__(self, path):
         self.path = path
@@ -115,31 +101,13 @@ def test_no_code_of_a_checkpoint_is_run(tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
-    saved = Checkpoint(config=asdict(TrainConfig()), step=7, averaged={"w": torch.arange(3.0)}, best_iou=0.5)
-    save_checkpoint(saved, tmp_path / "deep" / "last.pt")
-    loaded = load_checkpoint(tmp_path / "deep" / "last.pt")
-    assert (loaded.config, loaded.step, loaded.best_iou) == (saved.config, 7, 0.5)
-    assert torch.equal(loaded.averaged["w"], saved.averaged["w"])
-
-
-def test_the_shipped_settings_compose_and_typos_do_not():
-    register("train", TrainConfig)
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = OmegaConf.to_object(compose("train"))
-        assert isinstance(config, TrainConfig)
-        assert config == OmegaConf.to_object(compose("train", overrides=["recipe=cpu"]))
-        assert config.minutes is not None
-        with pytest.raises(ConfigCompositionException, match="learning_rat"):
-            compose("train", overrides=["learning_rat=1"])
-
-
 @pytest.mark.parametrize("name", ["cpu", "gpu"])
 def test_a_recipe_is_the_trainers_settings_by_one_name(name):
     register("train", TrainConfig)
     with initialize_config_dir(CONF, version_base="1.3"):
         config = OmegaConf.to_object(compose("train", overrides=[f"recipe={name}"]))
         shorter = OmegaConf.to_object(compose("train", overrides=[f"recipe={name}", "minutes=1"]))
+        assert name != "cpu" or config == OmegaConf.to_object(compose("train"))
     assert config.output == f"runs/{name}"
     assert config.minutes <= 150
     assert config.start is None
@@ -298,8 +266,6 @@ def test_a_device_that_is_not_there_is_named(monkeypatch):
 
 
 def test_the_only_member_of_a_team_is_shown_what_a_process_alone_is():
-    from tests.train.small import tiny
-
     data = tiny(Path("unused"), 1).data
     alone, member = (next(training_batches(data, 5, 2, 0, *part)) for part in ([], [(0, 1)]))
     assert torch.equal(alone[0], member[0])

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from train.augment import random_crop, random_photometry
+from train.augment import random_crop
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from train.scenes import scenes
@@ -90,16 +90,19 @@ def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
     assert np.mean(brighter) > 0.75
 
 
+def turns_of(polygon):
+    """Twice the area (N,) between each two sides of a polygon, above 0 where it turns left."""
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    following = np.roll(sides, -1, axis=0)
+    return sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
+
+
 def test_paint_polygons_are_convex_and_have_the_size_asked_for():
     scenes = [random_scene(np.random.default_rng(index)) for index in range(12)]
     polygons = [paint.polygon_map for scene, _ in scenes for paint in scene.paints]
     assert polygons
     for polygon in polygons:
-        edges = np.roll(polygon, -1, axis=0) - polygon
-        turns = (
-            edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0]
-        )
-        assert (turns > -1e-9).all() or (turns < 1e-9).all()
+        assert (turns_of(polygon) > -1e-9).all() or (turns_of(polygon) < 1e-9).all()
     assert np.ptp(rhombus(np.zeros(2), 1.2, 0.6)[:, 0]) == pytest.approx(1.2)
     assert np.ptp(rectangle(np.zeros(2), 3.0, 0.15, np.pi / 2)[:, 1]) == pytest.approx(3.0)
 
@@ -170,15 +173,6 @@ def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one():
     assert several > 30
 
 
-def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature():
-    bend = Bend(0.02)
-    along = np.linspace(0, 40, 4001)
-    points = bend.to_map(np.column_stack([along, np.zeros_like(along)]))
-    assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(40, abs=1e-3)
-    np.testing.assert_allclose(points[-1], [np.sin(0.8) / 0.02, (1 - np.cos(0.8)) / 0.02], atol=1e-9)
-    np.testing.assert_allclose(Bend(0.0).to_map(np.array([[7.0, -2.0]])), [[7.0, -2.0]])
-
-
 def test_a_bend_between_straights_is_an_arc_that_they_touch():
     quarter = Bend(1 / 15, 5.0, 5.0 + 7.5 * np.pi)
     along = np.array([-3.0, 5.0, 5.0 + 7.5 * np.pi, 15.0 + 7.5 * np.pi])
@@ -225,44 +219,24 @@ def pairs(hard, count):
 
 @pytest.mark.parametrize("name", [f.name for f in fields(Hardships) if f.name not in ELSEWHERE])
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name):
-    seen = pairs(Hardships(**{name: 3.0}), 16)
+    seen = pairs(Hardships(**{name: 3.0}), 8)
     for plain, hard in seen:
         np.testing.assert_array_equal(plain.labels, hard.labels)
         np.testing.assert_array_equal(plain.hidden, hard.hidden)
     assert any((plain.image != hard.image).any() for plain, hard in seen)
 
 
-@pytest.mark.parametrize(
-    "hard",
-    [
-        Hardships(things_beside=4.0),
-        Hardships(kerbs=1.0),
-        Hardships(litter=8.0),
-        Hardships(traffic=4.0),
-        Hardships(own_vehicle=1.0),
-    ],
-)
-def test_things_beside_markings_hide_paint_and_add_none(hard):
-    seen = pairs(hard, 12)
+CROWDS = {"things_beside": 4.0, "kerbs": 1.0, "litter": 8.0, "traffic": 4.0, "own_vehicle": 1.0}
+
+
+@pytest.mark.parametrize(("name", "much"), CROWDS.items())
+def test_things_beside_markings_hide_paint_and_add_none(name, much):
+    seen = pairs(Hardships(**{name: much}), 8)
     for plain, crowded in seen:
         changed = plain.labels != crowded.labels
         assert (crowded.labels[changed] == 0).all()
         assert crowded.hidden[plain.hidden].all()
     assert any((plain.hidden != crowded.hidden).any() for plain, crowded in seen)
-
-
-def test_no_picture_without_the_later_hardships_has_changed():
-    """The first validation renders (seed 1): painted pixels, and the mean in blue, green, red."""
-    known = [
-        (0, [96.6, 102.6, 92.9]),
-        (0, [117.9, 65.9, 80.7]),
-        (82, [140.9, 146.9, 126.1]),
-        (0, [68.4, 76.4, 77.9]),
-    ]
-    for index, (painted, mean) in enumerate(known):
-        sample = training_sample(1_000_004, index, 96, 64)
-        assert int((sample.labels > 0).sum()) == pytest.approx(painted, abs=3)
-        np.testing.assert_allclose(sample.image.mean(axis=(0, 1)), mean, atol=0.3)
 
 
 def test_an_outline_of_a_diamond_is_a_diamond_and_its_middle_shows_the_ground():
@@ -285,11 +259,7 @@ def test_an_outline_of_a_diamond_is_a_diamond_and_its_middle_shows_the_ground():
 def test_stout_arrows_are_of_convex_parts_that_begin_at_their_tail_and_fit_a_lane():
     for seed in range(60):
         parts = list(stout_arrow(np.random.default_rng(seed)))
-        assert all(signed_area(part) > 0 for part in parts)
-        for part in parts:
-            edges = np.roll(part, -1, axis=0) - part
-            following = np.roll(edges, -1, axis=0)
-            assert (edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > -1e-9).all()
+        assert all(signed_area(part) > 0 and (turns_of(part) > -1e-9).all() for part in parts)
         points = np.vstack(parts)
         assert points[:, 0].min() == 0
         assert 2 < points[:, 0].max() < 6.5
@@ -299,15 +269,9 @@ def test_stout_arrows_are_of_convex_parts_that_begin_at_their_tail_and_fit_a_lan
 def test_half_of_the_arrows_face_the_camera_when_half_are_asked_to():
     turned = []
     for seed in range(60):
-        roads = [
-            street_paint(
-                np.random.default_rng(seed),
-                Brush((0.7, 0.7, 0.7), 0.0, 0.0),
-                Bend(0.0),
-                Facing(np.random.default_rng(seed), share),
-            )
-            for share in (0.0, 0.5)
-        ]
+        brush = Brush((0.7, 0.7, 0.7), 0.0, 0.0)
+        facing = [Facing(np.random.default_rng(seed), share) for share in (0.0, 0.5)]
+        roads = [street_paint(np.random.default_rng(seed), brush, Bend(0.0), one) for one in facing]
         arrows = [[p.polygon_map for p in road.paints if p.kind == ARROW] for road in roads]
         assert len(arrows[0]) == len(arrows[1])
         turned += [not np.allclose(a, b) for a, b in zip(*arrows, strict=True)]
@@ -406,10 +370,7 @@ def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera():
         outline = box_footprint(box)
         assert outline[:, 0].min() > 3
         assert len(clip_convex(paint.polygon_map, outline)) == 0
-        between = (
-            outline[:, None] * (1 - np.linspace(0, 1, 41)[:, None])
-            + np.roll(outline, -1, 0)[:, None] * (np.linspace(0, 1, 41)[:, None])
-        )
+        between = np.linspace(outline, np.roll(outline, -1, 0), 41)
         gaps = np.linalg.norm(between.reshape(-1, 1, 2) - paint.polygon_map, axis=-1)
         assert gaps.min() < 1.5
     assert things_beside(np.random.default_rng(0), [], 5.0) == ()
@@ -430,9 +391,7 @@ def test_a_line_is_followed_to_the_borders_of_the_image(model, coefficients):
         line = image_line(view, np.column_stack([along, np.full(len(along), left)]))
         assert line[:, 1].max() > 719
         inside = line[line[:, 1] < 720]
-        assert np.abs(np.diff(inside, axis=0)).max() < 110, (
-            "a step of half a metre would be most of the image"
-        )
+        assert np.abs(np.diff(inside, axis=0)).max() < 110, "half a metre would be most of the image"
         u, v = (undistort_points(info, line) - intrinsic[:2, 2]).T / 500
         on_ground = np.column_stack([u, v, np.ones(len(u))]) @ cam_from_map[:3, :3]
         on_ground *= 1.4 / -on_ground[:, 2:]
@@ -447,20 +406,6 @@ def test_what_a_folding_lens_would_show_twice_is_not_in_the_image():
     pixels = image_points(view, points)
     assert 0 < len(pixels) < 200
     assert (np.diff(pixels[:, 1]) < 0).all(), "farther along a line is farther up"
-
-
-def test_a_camera_that_looks_along_x_sees_the_road_ahead_below_its_axis():
-    cam_from_map = looking(np.array([0.0, 0.0, 2.0]), 0.0, 0.0, 0.0)
-    np.testing.assert_allclose(cam_from_map @ [10.0, 3.0, 0.0, 1.0], [-3.0, 2.0, 10.0, 1.0], atol=1e-12)
-    tilted = looking(np.array([0.0, 0.0, 2.0]), 0.0, np.arctan2(2.0, 10.0), 0.0)
-    np.testing.assert_allclose((tilted @ [10.0, 0.0, 0.0, 1.0])[:2], 0.0, atol=1e-12)
-
-
-def test_camera_rotations_are_rotations():
-    for index in range(10):
-        rotation = random_view(np.random.default_rng(index), 64, 32).cam_from_map[:3, :3]
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(rotation) == pytest.approx(1)
 
 
 def test_a_camera_on_the_side_looks_across_the_way_at_a_place_that_it_passes():
@@ -571,17 +516,6 @@ def test_crops_keep_image_labels_hidden_and_lanes_together():
             np.testing.assert_array_equal(crop.lanes_px[0][0], [column, row])
             seen += 1
     assert seen > 3
-
-
-def test_photometry_changes_values_but_not_shape_or_type_or_its_input():
-    image = np.random.default_rng(0).integers(0, 256, (32, 48, 3)).astype(np.uint8)
-    before = image.copy()
-    rng = np.random.default_rng(2)
-    for _ in range(30):
-        out = random_photometry(rng, image)
-        assert out.shape == image.shape
-        assert out.dtype == np.uint8
-    np.testing.assert_array_equal(image, before)
 
 
 def test_seams_run_along_sides_however_short():

@@ -7,9 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.cameras import mounted
+from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
 from v2hdm.records import (
     Calibration,
@@ -47,10 +46,8 @@ def poses(straight_s: float = 8.0, turn_s: float = 8.0, rate_hz: float = 20.0, s
 
 def trajectory(stamp_s: FloatArray, position: FloatArray, yaw_rad: FloatArray) -> Trajectory:
     """Poses at places (P, 3) with headings (P,)."""
-    matrices = np.tile(np.eye(4), (len(stamp_s), 1, 1))
-    zero = np.zeros(len(stamp_s))
-    matrices[:, :3, :3] = rotation_from_euler(zero, zero, yaw_rad)
-    matrices[:, :3, 3] = position
+    matrices = level(*position.T[:2], yaw_rad)
+    matrices[:, 2, 3] = position[:, 2]
     return Trajectory(stamp_s, matrices)
 
 
@@ -119,9 +116,11 @@ def noisy(k: int) -> np.ndarray:
     return np.random.default_rng(k).integers(60, 160, (720, 1280), dtype=np.uint8)
 
 
-def pictured(folder: Path, paint: Callable[[int], np.ndarray], suffix: str = ".png") -> Drive:
-    """A drive of nine images, 2.5 m apart."""
-    bare = drive(poses(straight_s=4.0, turn_s=0.5), every=10)
+def pictured(
+    folder: Path, paint: Callable[[int], np.ndarray], suffix: str = ".png", recorded: Trajectory | None = None
+) -> Drive:
+    """A drive with an image every 2.5 m, nine of them if its poses are not given."""
+    bare = drive(recorded or poses(straight_s=4.0, turn_s=0.5), every=10)
     images = []
     for k, image in enumerate(bare.images):
         path = folder / f"{k}{suffix}"

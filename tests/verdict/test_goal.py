@@ -138,12 +138,6 @@ def test_a_failed_run_promises_no_accuracy():
     assert verdict.lines[0].startswith("verdict: FAIL (1 finding, 2 checks passed): no accuracy")
 
 
-def test_checks_without_a_map_have_no_headline():
-    verdict = Verdict.of([Finding("clock", Status.PASS, 1.0, 15.0, "ms", "on one clock", "front")])
-    assert verdict.headline == ""
-    assert verdict.lines == ("verdict: PASS (nothing raised, 1 checks passed)",)
-
-
 @pytest.mark.parametrize("ratio", [0.0, 0.2, 0.5, 0.8, 1.0])
 def test_of_a_hundred_corners_95_are_within_the_radius(ratio):
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])

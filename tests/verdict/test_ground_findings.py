@@ -174,13 +174,11 @@ def test_dark_ground_that_matches_once_a_mistake_is_undone_fails():
 
 
 def test_undoing_feet_shortens_the_path():
-    metres = scaled(drive(poses()), 0.3048)
-    assert metres.images[-1].map_from_vehicle[:3, 3] == pytest.approx(
-        0.3048 * drive(poses()).images[-1].map_from_vehicle[:3, 3]
-    )
-    assert metres.trajectory.map_from_vehicle[-1, :3, :3] == pytest.approx(
-        poses().map_from_vehicle[-1, :3, :3]
-    )
+    feet, metres = drive(poses()), scaled(drive(poses()), 0.3048)
+    there, here = (one.images[-1].map_from_vehicle for one in (feet, metres))
+    assert here[:3, 3] == pytest.approx(0.3048 * there[:3, 3])
+    there, here = (one.trajectory.map_from_vehicle[-1, :3, :3] for one in (feet, metres))
+    assert here == pytest.approx(there)
 
 
 def test_a_pixel_of_an_image_upside_down_shows_the_ground_of_the_opposite_pixel():

@@ -157,10 +157,6 @@ def test_a_vehicle_that_stands_is_told_from_one_in_degrees():
     assert "nowhere moves" in told["path length"]
 
 
-def test_good_poses_do_not_jump():
-    assert not raised(check_jumps(motion(poses()), NOISE))
-
-
 def test_a_lost_fix_is_told_with_its_size_and_place():
     recorded = poses()
     recorded.map_from_vehicle[100:, 1, 3] += 0.5  # at 5 s

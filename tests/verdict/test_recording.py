@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.verdict.drives import CENTRE, camera, drive, motion, noisy, pictured, poses, raised, with_k
-from v2hdm.errors import DriveError
 from v2hdm.io.trajectory import why_no_pose
 from v2hdm.records import Camera, CentrePrior, Trajectory
 from v2hdm.verdict import Status
@@ -125,13 +124,6 @@ def test_one_list_of_images_for_two_cameras_is_told(tmp_path):
     assert "those of camera 'front' given twice" in raised(check_images(both))["own images"]
 
 
-def test_a_damaged_image_is_one_line(tmp_path):
-    damaged = pictured(tmp_path, noisy)
-    damaged.images[0].path.write_bytes(b"\x89PNG")
-    with pytest.raises(DriveError, match=r"0\.png: not a PNG"):
-        check_images(damaged)
-
-
 Spoil = Callable[[Camera], Camera]
 
 
@@ -166,10 +158,6 @@ WRONG: dict[str, tuple[Spoil, str, str]] = {
 }  # fmt: skip
 
 
-def test_a_good_camera_passes():
-    assert not raised(check_camera("front", camera()))
-
-
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_camera_is_told(name):
     spoil, check, says = WRONG[name]
@@ -182,11 +170,9 @@ def test_a_guess_borrowed_from_a_sister_vehicle_is_fine():
     assert not raised(check_camera("front", borrowed))
 
 
-@pytest.mark.parametrize(
-    ("centre", "check"), [(CENTRE * [1, 1, 20], "camera height"), (CENTRE * [1, 1, 0.05], "camera height")]
-)
-def test_a_guess_at_no_vehicle_s_height_is_told(centre, check):
-    assert check in raised(check_camera("front", camera(centre=centre)))
+@pytest.mark.parametrize("factor", [20, 0.05])
+def test_a_guess_at_no_vehicle_s_height_is_told(factor):
+    assert "camera height" in raised(check_camera("front", camera(centre=CENTRE * [1, 1, factor])))
 
 
 def test_a_camera_without_survey_is_checked_without():

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.cameras import level
 from tests.drive.example import looking_forward
 from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
 from v2hdm.io.calibration.writing import write_calibration
@@ -62,13 +63,8 @@ def verdict(status: str = "PASS") -> dict[str, object]:
     passed = {**finding, "status": "PASS", "value": 0.0004, "says": "on one clock"}
     untold = {**finding, "status": "PASS", "value": None, "says": "constant speed: drive a turn"}
     headline = f"{status}: 95 % of 12 markings within 2.1 cm; goal 5 cm"
-    return {
-        "status": status,
-        "headline": headline,
-        "findings": raised,
-        "untold": [untold],
-        "passed": [passed],
-    }
+    lists = {"findings": raised, "untold": [untold], "passed": [passed]}
+    return {"status": status, "headline": headline, **lists}
 
 
 GONE = (DIAMOND_M + np.array([4.5, 1.2])).tolist()
@@ -78,12 +74,8 @@ def changes() -> dict[str, object]:
     """As ``metrics.json`` lists them: the first marking has come 30 cm north, another one is gone."""
     seen = {"class": DIAMOND, "probability": 0.99, "found": 0, "views": 7}
     now = DIAMOND_M + PLACES[0]
-    moved = {
-        "id": 1,
-        "fate": "moved",
-        "before_map": (now - np.array([0.0, 0.3])).tolist(),
-        "after_map": now.tolist(),
-    }
+    before = (now - np.array([0.0, 0.3])).tolist()
+    moved = {"id": 1, "fate": "moved", "before_map": before, "after_map": now.tolist()}
     gone = {"id": 9, "fate": "vanished", "before_map": GONE, "after_map": None}
     by = {"shift_m": [0.0, 0.3], "shift_sigma_m": [0.01, 0.01]}
     return {"listed": [{**seen, **moved, **by}, {**seen, **gone, **dict.fromkeys(by)}]}
@@ -92,8 +84,7 @@ def changes() -> dict[str, object]:
 def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: str = "PASS") -> Drive:
     """Write a result into ``folder/result`` and its drive into ``folder/drive``, which is returned."""
     hd_map, cam_from_vehicle = small_map(kind), looking_forward(2.0, 0.25)
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, 0, 3] = 0.8 * np.arange(5)
+    poses = level(0.8 * np.arange(5))
     drive = _write_drive(folder / "drive", name, hd_map, poses, cam_from_vehicle)
     with result_folder(folder / "result") as result:
         write_geojson(hd_map, result / "map.geojson", verdict(status))
@@ -108,29 +99,12 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
         (result / "trajectory_sigma.csv").write_text("\n".join([heading, *rows]) + "\n")
         write_residuals(_residuals(drive, hd_map, poses, cam_from_vehicle), result / "residuals.csv")
         (result / "config.yaml").write_text(f"name: {name}\n")
+        columns = ("marking", "p", "p_shape", "p_residuals", "p_sightings", "disputed")
+        suspicious = [(2, 3e-5, 1e-5, 0.4, 0.2, 0.25), (99, 1.0, 1.0, 1.0, 1.0, 0.0)]
         figures = {
-            "markings": len(hd_map.markings),
-            "reprojection_rmse_px": 0.36,
-            "lanes": {"length_m": 12.0},
-            "suspicious": [
-                {
-                    "marking": 2,
-                    "p": 3e-5,
-                    "p_shape": 1e-5,
-                    "p_residuals": 0.4,
-                    "p_sightings": 0.2,
-                    "disputed": 0.25,
-                },
-                {
-                    "marking": 99,
-                    "p": 1.0,
-                    "p_shape": 1.0,
-                    "p_residuals": 1.0,
-                    "p_sightings": 1.0,
-                    "disputed": 0.0,
-                },
-            ],
-        }
+            "markings": len(hd_map.markings), "reprojection_rmse_px": 0.36, "lanes": {"length_m": 12.0},
+            "suspicious": [dict(zip(columns, one, strict=True)) for one in suspicious],
+        }  # fmt: skip
         metrics = {
             "name": name, "version": "0.1.0", "date": "2026-11-23", "verdict": verdict(status),
             "drive": {"name": name, "paths": [str(drive.root)], "cameras": ["front"], "images": 5},
