@@ -115,11 +115,13 @@ def test_an_outline_moves_to_the_edges_of_bright_paint_and_stays_where_there_are
     )
     picture = np.repeat((70 + 110 * rows[:, None] * columns)[..., None], 3, axis=2).astype(np.uint8)
     drawn = (true + np.array([[-2.0, 1.5], [1.5, -2.0], [2.0, 2.0], [1.0, -1.5]]))[::turned]
-    found = on_edges(drawn, picture)
+    found, seen = on_edges(drawn, picture)
+    assert seen.all()
     middles = (true + np.roll(true, -1, axis=0)) / 2
     off_px = [cv2.pointPolygonTest(found.astype(np.float32), one, True) for one in middles.tolist()]
     np.testing.assert_allclose(off_px, 0.0, atol=0.4)
-    plain = on_edges(drawn, np.full_like(picture, 70))
+    plain, seen = on_edges(drawn, np.full_like(picture, 70))
+    assert not seen.any()
     assert abs(signed_area(plain) - signed_area(drawn)) < 0.02 * abs(signed_area(drawn))
 
 

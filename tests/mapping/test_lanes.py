@@ -194,7 +194,15 @@ ARROW = np.array(
 def symbols_of(outlines, kinds):
     """One outline in each frame of one camera, whose shutter is global."""
     count, rows = len(outlines), tuple(np.zeros(len(one)) for one in outlines)
-    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows)
+    seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
+    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows, seen)
+
+
+def of_outlines(symbols, outlines):
+    """The symbols with other outlines, whose sides all lie along edges."""
+    seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
+    rows = tuple(np.zeros(len(one)) for one in outlines)
+    return replace(symbols, outlines_pinhole_px=tuple(outlines), row_shares=rows, seen=seen)
 
 
 def scene(arrow_x_m):
@@ -309,7 +317,7 @@ def test_the_vertices_of_arrows_of_one_stencil_have_one_order():
     rng, places = np.random.default_rng(3), np.array([[9.0, 1.0], [10.5, -1.2]])
     shapes = [shape for place in places for shape in [ARROW + place] * 4]
     symbols, rig = seen(shapes, ["arrow"] * 8, 2 * [0.0, 0.7, 1.4, 2.1])
-    symbols = replace(symbols, outlines_pinhole_px=noisy(symbols.outlines_pinhole_px, rng))
+    symbols = of_outlines(symbols, noisy(symbols.outlines_pinhole_px, rng))
     arrows = sorted(mapped(symbols, rig), key=lambda one: one.outline_map[:, 0].mean())
     off_m = [one.outline_map - place - ARROW[3] for one, place in zip(arrows, places, strict=True)]
     assert len({int(np.linalg.norm(one, axis=1).argmin()) for one in off_m}) == 1
@@ -398,6 +406,6 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
         ground = np.column_stack([ARROW + AT, np.zeros(len(ARROW)), np.ones(len(ARROW))])
         cam = ground @ (back @ np.linalg.inv(pose)).T
         behind.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
-    outlines = (*symbols.outlines_pinhole_px[:3], *behind)
-    symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]), outlines_pinhole_px=outlines)
+    symbols = of_outlines(symbols, (*symbols.outlines_pinhole_px[:3], *behind))
+    symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]))
     assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1

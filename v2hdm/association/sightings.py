@@ -57,7 +57,8 @@ def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
 class Symbols:
     """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes.
 
-    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them.
+    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them; ``seen`` are the sides that lie
+    along an edge of the paint, each from its point to the next.
     """
 
     camera: IntArray
@@ -65,9 +66,10 @@ class Symbols:
     outlines_pinhole_px: tuple[FloatArray, ...]
     kinds: tuple[str, ...]
     row_shares: tuple[FloatArray, ...]
+    seen: tuple[BoolArray, ...]
 
 
-NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), ())
+NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), (), ())
 
 
 def collect_symbols(
@@ -92,6 +94,7 @@ def collect_symbols(
         ),
         kinds=tuple(marking.kind for _, _, marking in rows),
         row_shares=tuple(row_shares(drive.cameras[name].info, one.outline_px) for _, name, one in rows),
+        seen=tuple(marking.outline_seen for _, _, marking in rows),
     )
 
 

@@ -25,14 +25,13 @@ from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Symbols
-from v2hdm.geometry.ipm import pinhole_px_from_ground, project_ground
+from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
 from v2hdm.site.candidates import Exclusion
 from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.polygons import Polygon, Traces, find_polygons
-from v2hdm.site.shapes import EDGE_SIGMA_M
 
 _CELL_M = 0.02
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
@@ -86,8 +85,8 @@ def map_symbols(
         objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
         if None in objections:
             found.append(Symbol(kind, outline, len(camera)))
-            outlines_px = [symbols.outlines_pinhole_px[n] for n in rows[own]]
-            seen.append(eyes.traces(outlines_px, image.ravel()))
+            sides = [symbols.seen[n] for n in rows[own]]
+            seen.append(eyes.traces([shapes[n] for n in own], sides, image.ravel()))
         else:
             left_out.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
     polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
@@ -100,7 +99,7 @@ def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]
 
     One that crosses itself explains nothing: then the outline stays that its sightings share.
     """
-    covariance = polygon.covariance + EDGE_SIGMA_M**2 * np.eye(polygon.vertices.size)
+    covariance = polygon.covariance
     known = [one for one in markings if one.covariance_m2 is not None]
     if known:
         middle = polygon.vertices.mean(axis=0)
@@ -137,14 +136,15 @@ class _Eyes:
         direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
         return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
 
-    def traces(self, outlines_px: Sequence[FloatArray], image: IntArray) -> Traces:
-        """Outlines, each of an ``image`` (S,), as they are beside polygons on the ground."""
-        intrinsic, cam_from_map = (
-            self.rig.intrinsic[self.camera],
-            self.rig.cam_from_map(self.camera, self.frame),
-        )
-        px_from_map = pinhole_px_from_ground(intrinsic, cam_from_map)
-        return Traces.of(outlines_px, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
+    def traces(self, shapes: Sequence[FloatArray], seen: Sequence[BoolArray], image: IntArray) -> Traces:
+        """Outlines on the ground, each of an ``image`` (S,), as they are beside polygons in the images.
+
+        A camera whose shutter rolls would have taken all of an image's rows in its middle.
+        """
+        intrinsic = self.rig.intrinsic[self.camera]
+        px_from_map = pinhole_px_from_ground(intrinsic, self.rig.cam_from_map(self.camera, self.frame))
+        outlines_px = [apply_in_front(px_from_map[k], one) for k, one in zip(image, shapes, strict=True)]
+        return Traces.of(outlines_px, seen, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
 
     def shows(self, points_map: FloatArray) -> BoolArray:
         """Which points (N, 2) lie inside which images (I, N), away from the border."""
