@@ -127,37 +127,38 @@ def find_polygons(
     for template, members in classes:
         shown, polygons = [traces[k] for k in members], [found[k] for k in members]
         if len(members) > 1:
-            template, polygons = _thinned(template, shown, polygons)
-        for _ in range(_ROUNDS if len(members) > 1 else 0):
-            template, others = template.learnt(polygons)
-            each = zip(shown, polygons, others, strict=True)
-            polygons = [_fit(trace, one.vertices, other.prior, _FEW_STEPS) for trace, one, other in each]
-        errors = template.edge_errors(polygons)
-        for k, one, error in zip(members, polygons, errors, strict=True):
+            template, polygons = _of_template(template, shown, polygons)
+        for k, one, error in zip(members, polygons, template.edge_errors(polygons), strict=True):
             found[k] = replace(one, covariance=one.covariance + error)
     return found
 
 
-def _thinned(
+def _of_template(
     template: _Template, traces: Sequence[Traces], polygons: Sequence[Polygon]
-) -> tuple[_Template, list[Polygon]]:
-    """A template without vertices that its first symbol had alone, and the symbols as polygons of it."""
-    starts = zip(traces, polygons, strict=True)
-    now = [_fit(trace, one.vertices, template.prior, _FEW_STEPS) for trace, one in starts]
+) -> tuple[_Template, Sequence[Polygon]]:
+    """Symbols as polygons of the template that they teach, without vertices that only its first one had."""
+    for _ in range(_ROUNDS):
+        template, polygons = _taught(template, traces, polygons)
     while len(template.vertices) > 3:
         kept = _but_flattest(template.vertices)
-        both = np.repeat(kept, 2)
-        fewer = replace(
-            template, vertices=template.vertices[kept], covariance=template.covariance[both][:, both]
-        )
-        tried = [
-            _fit(trace, one.vertices[kept], fewer.prior, _FEW_STEPS)
-            for trace, one in zip(traces, now, strict=True)
-        ]
-        if sum(one.evidence for one in tried) < sum(one.evidence for one in now):
+        known = template.covariance[np.ix_(*2 * [np.repeat(kept, 2)])]
+        fewer = replace(template, vertices=template.vertices[kept], covariance=known)
+        pairs = zip(traces, polygons, strict=True)
+        tried = [_fit(trace, one.vertices[kept], fewer.prior, _FEW_STEPS) for trace, one in pairs]
+        fewer, tried = _taught(fewer, traces, tried)
+        if sum(one.evidence for one in tried) < sum(one.evidence for one in polygons):
             break
-        template, now = fewer, tried
-    return template, now
+        template, polygons = _taught(fewer, traces, tried)
+    return template, polygons
+
+
+def _taught(
+    template: _Template, traces: Sequence[Traces], polygons: Sequence[Polygon]
+) -> tuple[_Template, list[Polygon]]:
+    """The template that symbols teach, and each of them by what the others do."""
+    template, others = template.learnt(polygons)
+    each = zip(traces, polygons, others, strict=True)
+    return template, [_fit(trace, one.vertices, other.prior, _FEW_STEPS) for trace, one, other in each]
 
 
 def _own_polygon(traces: Traces, outline: FloatArray) -> Polygon:
