@@ -370,7 +370,7 @@ class Symbol:
     """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
 
     These are the vertices of a polygon, in the same order for all symbols of one template, with the joint
-    covariance ``covariance_m2`` (2N, 2N); None where sightings share an outline that no polygon explains.
+    covariance ``covariance_m2`` (2N, 2N); None in maps that state none.
     ``sigma_m`` is the standard deviation a coordinate; ``heights_m`` (N,), their sigmas and ``id`` are as a
     :class:`Marking` has them.
     """

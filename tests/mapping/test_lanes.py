@@ -11,15 +11,17 @@ import pytest
 from tests.cameras import mounted
 from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
-from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.records import CameraInfo, Marking
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
-from v2hdm.site.options import LaneOptions
+from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
-from v2hdm.site.symbols import map_symbols
+from v2hdm.site.polygons import Polygon
+from v2hdm.site.symbols import CROSSES_ITSELF, map_symbols
 
-OPTIONS = LaneOptions()
+OPTIONS, ACCEPTANCE = LaneOptions(), AcceptanceOptions()
 
 
 def cloud_of(lines, dash=False, images=12, sigma_m=0.03, seed=0):
@@ -269,7 +271,7 @@ def seen(shapes, kinds, poses_x):
 
 def mapped(symbols, rig, markings=()):
     """The symbols of the map."""
-    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, 0.9)[0]
+    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, ACCEPTANCE)[0]
 
 
 def overlap(one, other):
@@ -323,6 +325,64 @@ def test_the_vertices_of_arrows_of_one_stencil_have_one_order():
     assert len({int(np.linalg.norm(one, axis=1).argmin()) for one in off_m}) == 1
     for arrow, place in zip(arrows, places, strict=True):
         assert corner_errors_m(arrow, ARROW + place).max() < 0.035
+
+
+CHEVRON = np.array([[0, -0.9], [0.8, 0], [0, 0.9], [-0.5, 0.9], [0.3, 0], [-0.5, -0.9]])
+LETTER_H = np.array(
+    [[0, 0], [1.6, 0], [1.6, 0.2], [0.9, 0.2], [0.9, 0.6], [1.6, 0.6]]
+    + [[1.6, 0.8], [0, 0.8], [0, 0.6], [0.7, 0.6], [0.7, 0.2], [0, 0.2]]
+)
+PARKING_T = np.array(
+    [[0.35, -0.5], [0.5, -0.5], [0.5, 0.5], [0.35, 0.5], [0.35, 0.08], [-0.5, 0.08], [-0.5, -0.08], [0.35, -0.08]]
+)
+
+
+@pytest.mark.parametrize("shape", [CHEVRON, LETTER_H, PARKING_T])
+def test_chevrons_letters_and_own_symbols_have_the_vertices_of_their_template(shape):
+    places, ways_m = np.array([[8.5, 1.5], [9.5, -1.6]]), [0.0, 0.7, 1.4, 2.1, 2.8, 3.5]
+    symbols, rig = seen([shape + at for at in places for _ in ways_m], ["parking_t"] * 12, 2 * ways_m)
+    symbols = of_outlines(symbols, noisy(symbols.outlines_pinhole_px, np.random.default_rng(3)))
+    found = sorted(mapped(symbols, rig), key=lambda one: one.outline_map[:, 0].mean())
+    assert len(found) == len(places)
+    for symbol, at in zip(found, places, strict=True):
+        assert corner_errors_m(symbol, shape + at).max() < 0.025
+
+
+def test_paint_that_touches_itself_has_a_polygon_that_crosses_nowhere(monkeypatch):
+    bow = np.array([[7.0, 0.5], [8.2, 1.5], [8.2, 0.5], [7.0, 1.5]])
+    given = *seen([bow] * 5, ["bow"] * 5, np.arange(5.0)), INFOS, JITTER_RAD, (), ACCEPTANCE
+    ((found,), _) = map_symbols(*given)
+    assert is_simple(found.outline_map)
+    assert overlap(found.outline_map, bow) > 0.9
+
+    crossing = Polygon(bow, *3 * [1e-6 * np.eye(8)], 0.0)
+    monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_: [crossing])
+    found, left_out = map_symbols(*given)
+    assert not found
+    assert [(one.kind, one.reason) for one in left_out] == [("bow", CROSSES_ITSELF)]
+
+
+def cut(place_m):
+    """An arrow whose shaft other paint crosses at a place along it, and which of its sides are of its own edge."""
+    shape = np.where(ARROW[:, :1] < place_m, [place_m, np.nan], ARROW)
+    shape[:, 1] = ARROW[:, 1]
+    at_cut = shape[:, 0] == place_m
+    return shape, ~(at_cut & np.roll(at_cut, -1))
+
+
+@pytest.mark.parametrize("others", [0, 4])
+def test_where_other_paint_cuts_an_arrow_its_template_says_how_long_it_is_or_it_is_left_out(others):
+    ways_m, places = [0.0, 0.7, 1.4, 2.1], np.array([[10.0, y] for y in (1.0, -1.0, 2.0, 0.0, -2.0)][: 1 + others])
+    short, own = cut(-1.0)
+    shapes = [short + places[0]] * 4 + [ARROW + at for at in places[1:] for _ in ways_m]
+    symbols, rig = seen(shapes, ["arrow"] * len(shapes), (1 + others) * ways_m)
+    symbols = replace(symbols, seen=tuple([own] * 4) + symbols.seen[4:])
+    found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), ACCEPTANCE)
+    if others:
+        arrow = min(found, key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0]))
+        assert corner_errors_m(arrow, ARROW + places[0]).max() < 0.05
+    else:
+        assert (found, [one.reason for one in left_out]) == ((), [TOO_UNCERTAIN])
 
 
 def test_an_arrow_whose_near_end_the_border_cuts_from_near_by_is_mapped_whole():
@@ -390,7 +450,7 @@ def test_without_sightings_there_are_no_symbols():
 def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m, reason):
     way_m = step_m * np.arange(8)
     shapes = [ARROW + AT + [x, 0.0] for x in way_m]
-    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), 0.9)
+    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), ACCEPTANCE)
     assert not found
     assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)
 
@@ -408,4 +468,4 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
         behind.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
     symbols = of_outlines(symbols, (*symbols.outlines_pinhole_px[:3], *behind))
     symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]))
-    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1
+    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), ACCEPTANCE)[0]) == 1

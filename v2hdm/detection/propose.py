@@ -60,8 +60,7 @@ _NAMED_ODDS, _MISSED_ODDS = float(np.log(0.79 / 0.01)), float(np.log(0.99 / 0.21
 Shares of 39 arrows and 62 lines of 24 px and more, on photographs.
 """
 
-_NAMED_OF_SYMBOL = {"symbol": 0.5, "diamond": 0.4, "lane": 0.1}
-_SELDOM_NAMED, _NAMED_RIGHTLY = 0.02, 0.8
+_NAMED_OF_SYMBOL, _SELDOM_NAMED, _NAMED_RIGHTLY = {"diamond": 0.4, "lane": 0.1}, 0.02, 0.8
 """Shares of an arrow's paint that are named of these groups, and of any other; of a marking's, of its own.
 
 Of 160 views of arrows in rendered port 2, whose shafts are taken for dashes less often than in photographs.
@@ -147,11 +146,12 @@ class Proposal:
 
         A shaft may be taken for a dash, and a head for a diamond, but hardly either for a stop line.
         """
-        cells, odds = np.count_nonzero(self.blob.level > 0), -_TOUCHING
+        cells, odds, alike = np.count_nonzero(self.blob.level > 0), -_TOUCHING, catalogue.of_family(SYMBOL, OTHER)
         for part in parts:
-            named = _NAMED_OF_SYMBOL.get(catalogue.classes[part.blob.kind].group, _SELDOM_NAMED)
-            share = np.count_nonzero(part.blob.level > 0) / cells if not part.blob.parts else 0.0
-            odds += _VOTES * share * min(np.log(named / _NAMED_RIGHTLY), 0.0)
+            if not part.blob.parts and part.blob.kind not in alike:
+                named = _NAMED_OF_SYMBOL.get(catalogue.classes[part.blob.kind].group, _SELDOM_NAMED)
+                share = np.count_nonzero(part.blob.level > 0) / cells
+                odds += _VOTES * share * float(np.log(named / _NAMED_RIGHTLY))
         return odds > 0
 
     def kinds(self, catalogue: Catalogue) -> list[str]:

@@ -91,7 +91,7 @@ class Polygon:
 
     ``covariance`` (2N, 2N), m^2, is that of the stacked vertices, ``data`` the information that the images
     alone have of them, ``pull`` (2N,) the derivative of the log prior; ``evidence`` is the log marginal
-    likelihood.
+    likelihood, ``explained`` the share of the images' outlines that lie along its edges.
     """
 
     vertices: FloatArray
@@ -99,6 +99,7 @@ class Polygon:
     data: FloatArray
     pull: FloatArray
     evidence: float
+    explained: float
 
 
 Prior = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -317,7 +318,8 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
     precision, off = np.linalg.inv(covariance), mean - vertices.ravel()
     evidence = log_likelihood - 0.5 * off @ precision @ off
     evidence -= 0.5 * (np.linalg.slogdet(data + precision)[1] + np.linalg.slogdet(covariance)[1])
-    return Polygon(vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence))
+    explained = float(weight.sum() / max(traces.weight.sum(), 1e-9))
+    return Polygon(vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence), explained)
 
 
 def _explained(

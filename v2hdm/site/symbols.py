@@ -30,6 +30,8 @@ from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
 from v2hdm.site.candidates import Exclusion
+from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.polygons import Polygon, Traces, find_polygons
 
@@ -39,6 +41,8 @@ _CELL_M = 0.02
 _MOST_CELLS = 500  # cells along the longer side of the average, beyond which they grow
 _PART = 0.3
 """Share of the weight of the images that show a place from which it is painted: some miss a part."""
+
+CROSSES_ITSELF = "its outline crosses itself, so that no polygon is its shape"
 
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
@@ -50,13 +54,12 @@ def map_symbols(
     infos: Sequence[CameraInfo],
     jitter_rad: float,
     markings: Sequence[Marking],
-    min_probability: float,
+    acceptance: AcceptanceOptions,
 ) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
-    """The symbols that at least three images show, and those that do not lie on the ground.
+    """The symbols that at least three images show, and those that ``acceptance`` leaves out.
 
     ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
-    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. A symbol
-    lies on the ground with ``min_probability``.
+    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
@@ -82,7 +85,7 @@ def map_symbols(
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
         # The border may cut one end in some images, and a shadow hide it: then the other tells.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
-        objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
+        objections = [measure_parallax(view, 1).objections(acceptance.min_probability)[0] for view in views]
         if None in objections:
             found.append(Symbol(kind, outline, len(camera)))
             sides = [symbols.seen[n] for n in rows[own]]
@@ -90,15 +93,26 @@ def map_symbols(
         else:
             left_out.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
     polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
-    found = [_with_vertices(*pair, markings) for pair in zip(found, polygons, strict=True)]
-    return tuple(found), tuple(left_out)
+    kept = []
+    for symbol, one in zip(found, polygons, strict=True):
+        reason = _objection(one, acceptance.max_sigma_m)
+        if reason is None:
+            kept.append(_with_vertices(symbol, one, markings))
+        else:
+            left_out.append(Exclusion(symbol.kind, one.vertices.mean(axis=0), symbol.sightings, reason))
+    return tuple(kept), tuple(left_out)
+
+
+def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
+    """Why a polygon is of no use, None if it is of use; what all of the map shares speaks against none."""
+    if not is_simple(polygon.vertices):
+        return CROSSES_ITSELF
+    variance = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
+    return TOO_UNCERTAIN if variance.max() > max_sigma_m**2 else None
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
-    """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do.
-
-    One that crosses itself explains nothing: then the outline stays that its sightings share.
-    """
+    """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do."""
     covariance = polygon.covariance
     known = [one for one in markings if one.covariance_m2 is not None]
     if known:
@@ -107,8 +121,6 @@ def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]
         shared = np.asarray(nearest.covariance_m2).reshape(4, 2, 4, 2).mean(axis=(0, 2))
         covariance = covariance + np.tile(shared, 2 * (len(polygon.vertices),))
     sigma_m = float(np.sqrt(np.trace(covariance) / len(covariance)))
-    if not is_simple(polygon.vertices):
-        return replace(symbol, sigma_m=sigma_m)
     return replace(symbol, outline_map=polygon.vertices, covariance_m2=covariance, sigma_m=sigma_m)
 
 
