@@ -11,17 +11,17 @@ import pytest
 from tests.cameras import mounted
 from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
-from v2hdm.geometry.planar import is_simple, signed_area
+from v2hdm.geometry.planar import signed_area
 from v2hdm.records import CameraInfo, Marking
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
-from v2hdm.site.markings import TOO_UNCERTAIN
-from v2hdm.site.options import AcceptanceOptions, LaneOptions
+from v2hdm.site.markings import LACKS_A_CORNER
+from v2hdm.site.options import LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.polygons import Polygon
-from v2hdm.site.symbols import CROSSES_ITSELF, map_symbols
+from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
-OPTIONS, ACCEPTANCE = LaneOptions(), AcceptanceOptions()
+OPTIONS = LaneOptions()
 
 
 def cloud_of(lines, dash=False, images=12, sigma_m=0.03, seed=0):
@@ -197,7 +197,9 @@ def symbols_of(outlines, kinds):
     """One outline in each frame of one camera, whose shutter is global."""
     count, rows = len(outlines), tuple(np.zeros(len(one)) for one in outlines)
     seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
-    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows, seen)
+    return Symbols(
+        np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows, seen
+    )
 
 
 def of_outlines(symbols, outlines):
@@ -271,7 +273,7 @@ def seen(shapes, kinds, poses_x):
 
 def mapped(symbols, rig, markings=()):
     """The symbols of the map."""
-    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, ACCEPTANCE)[0]
+    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, 0.9)[0]
 
 
 def overlap(one, other):
@@ -333,7 +335,16 @@ LETTER_H = np.array(
     + [[1.6, 0.8], [0, 0.8], [0, 0.6], [0.7, 0.6], [0.7, 0.2], [0, 0.2]]
 )
 PARKING_T = np.array(
-    [[0.35, -0.5], [0.5, -0.5], [0.5, 0.5], [0.35, 0.5], [0.35, 0.08], [-0.5, 0.08], [-0.5, -0.08], [0.35, -0.08]]
+    [
+        [0.35, -0.5],
+        [0.5, -0.5],
+        [0.5, 0.5],
+        [0.35, 0.5],
+        [0.35, 0.08],
+        [-0.5, 0.08],
+        [-0.5, -0.08],
+        [0.35, -0.08],
+    ]
 )
 
 
@@ -348,18 +359,15 @@ def test_chevrons_letters_and_own_symbols_have_the_vertices_of_their_template(sh
         assert corner_errors_m(symbol, shape + at).max() < 0.025
 
 
-def test_paint_that_touches_itself_has_a_polygon_that_crosses_nowhere(monkeypatch):
+def test_an_outline_that_no_simple_polygon_explains_is_left_out_by_class_and_reason(monkeypatch):
     bow = np.array([[7.0, 0.5], [8.2, 1.5], [8.2, 0.5], [7.0, 1.5]])
-    given = *seen([bow] * 5, ["bow"] * 5, np.arange(5.0)), INFOS, JITTER_RAD, (), ACCEPTANCE
-    ((found,), _) = map_symbols(*given)
-    assert is_simple(found.outline_map)
-    assert overlap(found.outline_map, bow) > 0.9
-
-    crossing = Polygon(bow, *3 * [1e-6 * np.eye(8)], 0.0)
-    monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_: [crossing])
-    found, left_out = map_symbols(*given)
-    assert not found
-    assert [(one.kind, one.reason) for one in left_out] == [("bow", CROSSES_ITSELF)]
+    given = *seen([bow] * 5, ["bow"] * 5, np.arange(5.0)), INFOS, JITTER_RAD, (), 0.9
+    for crossing in (None, Polygon(bow, *3 * [1e-6 * np.eye(8)], 0.0, 1.0)):
+        if crossing:
+            monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_, one=crossing: [one])
+        found, left_out = map_symbols(*given)
+        assert not found
+        assert [(one.kind, one.reason) for one in left_out] == [("bow", NO_POLYGON)]
 
 
 def cut(place_m):
@@ -372,17 +380,20 @@ def cut(place_m):
 
 @pytest.mark.parametrize("others", [0, 4])
 def test_where_other_paint_cuts_an_arrow_its_template_says_how_long_it_is_or_it_is_left_out(others):
-    ways_m, places = [0.0, 0.7, 1.4, 2.1], np.array([[10.0, y] for y in (1.0, -1.0, 2.0, 0.0, -2.0)][: 1 + others])
+    ways_m, places = (
+        [0.0, 0.7, 1.4, 2.1],
+        np.array([[10.0, y] for y in (1.0, -1.0, 2.0, 0.0, -2.0)][: 1 + others]),
+    )
     short, own = cut(-1.0)
     shapes = [short + places[0]] * 4 + [ARROW + at for at in places[1:] for _ in ways_m]
     symbols, rig = seen(shapes, ["arrow"] * len(shapes), (1 + others) * ways_m)
     symbols = replace(symbols, seen=tuple([own] * 4) + symbols.seen[4:])
-    found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), ACCEPTANCE)
+    found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), 0.9)
     if others:
         arrow = min(found, key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0]))
         assert corner_errors_m(arrow, ARROW + places[0]).max() < 0.05
     else:
-        assert (found, [one.reason for one in left_out]) == ((), [TOO_UNCERTAIN])
+        assert (found, [one.reason for one in left_out]) == ((), [LACKS_A_CORNER])
 
 
 def test_an_arrow_whose_near_end_the_border_cuts_from_near_by_is_mapped_whole():
@@ -450,7 +461,7 @@ def test_without_sightings_there_are_no_symbols():
 def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m, reason):
     way_m = step_m * np.arange(8)
     shapes = [ARROW + AT + [x, 0.0] for x in way_m]
-    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), ACCEPTANCE)
+    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), 0.9)
     assert not found
     assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)
 
@@ -468,4 +479,4 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
         behind.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
     symbols = of_outlines(symbols, (*symbols.outlines_pinhole_px[:3], *behind))
     symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]))
-    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), ACCEPTANCE)[0]) == 1
+    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1

@@ -39,7 +39,9 @@ _OUTLINE_SCALE = 4
 _OUTLINE_SIGMA_PX, _REACH_PX, _STEP_PX = 2.0, 6.0, 0.5
 """How far the network's outline is from an edge of paint; how far, and in what steps, that is looked for."""
 
-_EDGE_PX = 2.0  # half the width of an edge in the image, px: its blur
+_EDGE_PX, _LEAST_CONTRAST = 2.0, 0.25
+"""Half the width of an edge in the image, px: its blur. And the share of an outline's median contrast from which
+a place lies along an edge: paint that is half worn has half of it, where paint runs on there is none."""
 
 _BESIDE = 4  # points of an outline, px apart, to each side that its direction and its light are taken from
 
@@ -146,7 +148,11 @@ class Proposal:
 
         A shaft may be taken for a dash, and a head for a diamond, but hardly either for a stop line.
         """
-        cells, odds, alike = np.count_nonzero(self.blob.level > 0), -_TOUCHING, catalogue.of_family(SYMBOL, OTHER)
+        cells, odds, alike = (
+            np.count_nonzero(self.blob.level > 0),
+            -_TOUCHING,
+            catalogue.of_family(SYMBOL, OTHER),
+        )
         for part in parts:
             if not part.blob.parts and part.blob.kind not in alike:
                 named = _NAMED_OF_SYMBOL.get(catalogue.classes[part.blob.kind].group, _SELDOM_NAMED)
@@ -488,7 +494,7 @@ def on_edges(outline_px: FloatArray, bgr: np.ndarray) -> tuple[FloatArray, BoolA
     moved = points + np.median(_with_neighbours(moved_px), axis=0)[:, None] * outward
     # The ratio of the paint's light to the ground's is that of both materials, in the sun and in shadows.
     ratio = (-np.gradient(np.log(light + 1.0), axis=1) * (from_edge_px <= _EDGE_PX)).sum(axis=1)
-    lit = np.median(_with_neighbours(ratio, round(_REACH_PX)), axis=0) > np.median(ratio) / 2
+    lit = np.median(_with_neighbours(ratio, round(_REACH_PX)), axis=0) > _LEAST_CONTRAST * np.median(ratio)
     moved = moved.astype(np.float32)
     fewer = cv2.approxPolyDP(moved, _STEP_PX / 2, closed=True)[:, 0]
     kept = np.flatnonzero((moved[:, None] == fewer).all(axis=2).any(axis=1))

@@ -35,7 +35,12 @@ _SIGMA_PX, _SIGMA_WEIGHT = 0.5, 10.0
 _TURN_SIGMA_RAD = 0.25  # by how much a piece of outline is turned against its edge
 _ROUND_PX = 3.0  # how far from a corner, px, the network rounds it
 _STRAY, _STRAY_PX = 0.2, 25.0  # share of an outline that lies along no edge, and how far off it may be, px
+LEAST_EXPLAINED = (
+    1 - 2 * _STRAY
+)  # share of outlines along a polygon's edges, below which it is not their shape
+
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline that sightings share
+UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices of which images say little beside that guess
 _SIZE_SIGMA, _FREEDOM = 0.02, 4.0
 """Sigma of the logarithm of a symbol's sizes about its template's, before any is known; and how many symbols
 that guess, and the one of the vertices' own deviations, are worth."""
@@ -277,7 +282,6 @@ class _Template:
         everyone = range(len(members))
         return of(everyone), [of([k for k in everyone if k != own]) for own in everyone]
 
-
     def edge_errors(self, members: Sequence[Polygon]) -> list[FloatArray]:
         """Covariances (2N, 2N), m^2, of what all images misplace alike, given how members deviate from others."""
         if len(members) < 2:
@@ -319,7 +323,9 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
     evidence = log_likelihood - 0.5 * off @ precision @ off
     evidence -= 0.5 * (np.linalg.slogdet(data + precision)[1] + np.linalg.slogdet(covariance)[1])
     explained = float(weight.sum() / max(traces.weight.sum(), 1e-9))
-    return Polygon(vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence), explained)
+    return Polygon(
+        vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence), explained
+    )
 
 
 def _explained(
@@ -349,7 +355,9 @@ def _explained(
     )
     # Pieces lie anywhere along the polygon: of two that explain them, the shorter one is likelier.
     perimeter = np.maximum(np.nansum(length, axis=1), 1.0)
-    inlier += np.log(_CORRELATED_PX * np.bincount(image, traces.weight, len(perimeter))[image] / perimeter[image])
+    inlier += np.log(
+        _CORRELATED_PX * np.bincount(image, traces.weight, len(perimeter))[image] / perimeter[image]
+    )
     total = np.logaddexp(inlier, np.log(_STRAY / (2 * _STRAY_PX * 2 * np.pi)))
     weight = traces.weight * np.exp(inlier - total)
     normal = np.stack([-along[rows, edge, 1], along[rows, edge, 0]], axis=-1)

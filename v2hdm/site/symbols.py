@@ -30,10 +30,9 @@ from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
 from v2hdm.site.candidates import Exclusion
-from v2hdm.site.markings import TOO_UNCERTAIN
-from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.markings import LACKS_A_CORNER
 from v2hdm.site.parallax import PointViews, measure_parallax
-from v2hdm.site.polygons import Polygon, Traces, find_polygons
+from v2hdm.site.polygons import LEAST_EXPLAINED, UNSEEN_M, Polygon, Traces, find_polygons
 
 _CELL_M = 0.02
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
@@ -42,7 +41,7 @@ _MOST_CELLS = 500  # cells along the longer side of the average, beyond which th
 _PART = 0.3
 """Share of the weight of the images that show a place from which it is painted: some miss a part."""
 
-CROSSES_ITSELF = "its outline crosses itself, so that no polygon is its shape"
+NO_POLYGON = "no polygon that crosses nowhere explains its outline"
 
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
@@ -54,12 +53,13 @@ def map_symbols(
     infos: Sequence[CameraInfo],
     jitter_rad: float,
     markings: Sequence[Marking],
-    acceptance: AcceptanceOptions,
+    min_probability: float,
 ) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
-    """The symbols that at least three images show, and those that ``acceptance`` leaves out.
+    """The symbols that at least three images show, and those that are no polygons on the ground.
 
     ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
-    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol.
+    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. A symbol
+    lies on the ground with ``min_probability``.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
@@ -85,7 +85,7 @@ def map_symbols(
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
         # The border may cut one end in some images, and a shadow hide it: then the other tells.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
-        objections = [measure_parallax(view, 1).objections(acceptance.min_probability)[0] for view in views]
+        objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
         if None in objections:
             found.append(Symbol(kind, outline, len(camera)))
             sides = [symbols.seen[n] for n in rows[own]]
@@ -95,7 +95,7 @@ def map_symbols(
     polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
     kept = []
     for symbol, one in zip(found, polygons, strict=True):
-        reason = _objection(one, acceptance.max_sigma_m)
+        reason = _objection(one)
         if reason is None:
             kept.append(_with_vertices(symbol, one, markings))
         else:
@@ -103,12 +103,12 @@ def map_symbols(
     return tuple(kept), tuple(left_out)
 
 
-def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
-    """Why a polygon is of no use, None if it is of use; what all of the map shares speaks against none."""
-    if not is_simple(polygon.vertices):
-        return CROSSES_ITSELF
-    variance = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
-    return TOO_UNCERTAIN if variance.max() > max_sigma_m**2 else None
+def _objection(polygon: Polygon) -> str | None:
+    """Why a polygon is not the shape of a symbol, None if nothing says so."""
+    if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
+        return NO_POLYGON
+    variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
+    return LACKS_A_CORNER if variance_m2.max() > UNSEEN_M**2 else None
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
