@@ -283,8 +283,8 @@ class MarkingDetection:
     says which corners are points: known well in every direction.
 
     Symbols, as arrows and chevrons, are no quadrilaterals: their corners are nan and not valid, and
-    ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals. ``outline_seen`` (N,) says which of
-    its sides, each from its point to the next, lie along an edge of the paint.
+    ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals. ``outline_seen`` (N,) says which
+    of its sides, each from its point to the next, lie along an edge of the paint.
     """
 
     kind: str

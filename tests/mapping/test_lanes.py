@@ -13,9 +13,9 @@ from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
 from v2hdm.records import CameraInfo, Marking
+from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.site.lane_points import Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
-from v2hdm.site.markings import LACKS_A_CORNER
 from v2hdm.site.options import LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.polygons import Polygon
@@ -330,10 +330,8 @@ def test_the_vertices_of_arrows_of_one_stencil_have_one_order():
 
 
 CHEVRON = np.array([[0, -0.9], [0.8, 0], [0, 0.9], [-0.5, 0.9], [0.3, 0], [-0.5, -0.9]])
-LETTER_H = np.array(
-    [[0, 0], [1.6, 0], [1.6, 0.2], [0.9, 0.2], [0.9, 0.6], [1.6, 0.6]]
-    + [[1.6, 0.8], [0, 0.8], [0, 0.6], [0.7, 0.6], [0.7, 0.2], [0, 0.2]]
-)
+_HALF_H = [[0, 0], [1.6, 0], [1.6, 0.2], [0.9, 0.2], [0.9, 0.6], [1.6, 0.6]]
+LETTER_H = np.vstack([_HALF_H, np.array([1.6, 0.8]) - _HALF_H])
 PARKING_T = np.array(
     [
         [0.35, -0.5],
@@ -371,7 +369,7 @@ def test_an_outline_that_no_simple_polygon_explains_is_left_out_by_class_and_rea
 
 
 def cut(place_m):
-    """An arrow whose shaft other paint crosses at a place along it, and which of its sides are of its own edge."""
+    """An arrow whose shaft other paint crosses at a place along it, and which sides lie along its edge."""
     shape = np.where(ARROW[:, :1] < place_m, [place_m, np.nan], ARROW)
     shape[:, 1] = ARROW[:, 1]
     at_cut = shape[:, 0] == place_m

@@ -57,8 +57,8 @@ def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
 class Symbols:
     """N detected symbols: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines, classes.
 
-    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them; ``seen`` are the sides that lie
-    along an edge of the paint, each from its point to the next.
+    ``row_shares`` are of the outlines' points, as :func:`row_shares` has them; ``seen`` says
+    which sides, each from its point to the next, lie along an edge of the paint.
     """
 
     camera: IntArray

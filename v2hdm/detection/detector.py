@@ -149,9 +149,10 @@ class Detector:
             score, ground = piece.symbol_score(kind), piece.outline_vehicle
             within = found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
             after = piece.index + 1 + piece.blob.parts
+            if not within or score < self.options.min_score:
+                continue
             parts = [part for part in found.pieces if piece.index < part.index < after]
-            whole = within and score >= self.options.min_score
-            if whole and piece.is_one_symbol(parts, self.catalogue):
+            if piece.is_one_symbol(parts, self.catalogue):
                 outline = on_edges(outline_polygon(piece.blob), image_bgr)
                 symbols.append(MarkingDetection(kind, score, *nothing, *outline))
                 parts_until = after

@@ -40,8 +40,8 @@ _OUTLINE_SIGMA_PX, _REACH_PX, _STEP_PX = 2.0, 6.0, 0.5
 """How far the network's outline is from an edge of paint; how far, and in what steps, that is looked for."""
 
 _EDGE_PX, _LEAST_CONTRAST = 2.0, 0.25
-"""Half the width of an edge in the image, px: its blur. And the share of an outline's median contrast from which
-a place lies along an edge: paint that is half worn has half of it, where paint runs on there is none."""
+"""Half the width of an edge in the image, px: its blur. And the share of an outline's median contrast that
+there is at an edge: beside paint that is half worn there is half of it, where paint runs on there is none."""
 
 _BESIDE = 4  # points of an outline, px apart, to each side that its direction and its light are taken from
 

@@ -75,7 +75,7 @@ class Traces:
         px_from_map: FloatArray,
         shift_px: FloatArray,
     ) -> Traces:
-        """The pieces of outlines (K, 2), each of an ``image`` (S,), whose sides (K,) are of an edge where seen."""
+        """The pieces of outlines (K, 2), each of an ``image`` (S,), along the sides (K,) that were ``seen``."""
         pieces = []
         for outline, sides, number in zip(outlines_px, seen, image, strict=True):
             clockwise = signed_area(outline) < 0
@@ -188,7 +188,7 @@ def _anywhere(start: FloatArray) -> Prior:
 
 
 def _but_flattest(vertices: FloatArray) -> BoolArray:
-    """All vertices (N,) of a polygon but that which makes least of its area (Visvalingam and Whyatt, 1993)."""
+    """The vertices (N,) of a polygon but that with least of its area (Visvalingam and Whyatt, 1993)."""
     before, after = np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0)
     area = np.abs(signed_area(np.stack([before, vertices, after], axis=1)))
     return np.asarray(np.arange(len(vertices)) != area.argmin())
@@ -283,7 +283,7 @@ class _Template:
         return of(everyone), [of([k for k in everyone if k != own]) for own in everyone]
 
     def edge_errors(self, members: Sequence[Polygon]) -> list[FloatArray]:
-        """Covariances (2N, 2N), m^2, of what all images misplace alike, given how members deviate from others."""
+        """Covariances (2N, 2N), m^2, of what all images misplace alike, by how each member deviates."""
         if len(members) < 2:
             return [EDGE_SIGMA_M**2 * np.eye(self.vertices.size)]
         off, formal = [], []

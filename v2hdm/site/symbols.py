@@ -29,8 +29,7 @@ from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_g
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray, IntArray, Marking, Symbol
-from v2hdm.site.candidates import Exclusion
-from v2hdm.site.markings import LACKS_A_CORNER
+from v2hdm.site.candidates import LACKS_A_CORNER, Exclusion
 from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.polygons import LEAST_EXPLAINED, UNSEEN_M, Polygon, Traces, find_polygons
 
