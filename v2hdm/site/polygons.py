@@ -75,7 +75,7 @@ class Traces:
         px_from_map: FloatArray,
         shift_px: FloatArray,
     ) -> Traces:
-        """The pieces of outlines (K, 2), each of an ``image`` (S,), along the sides (K,) that were ``seen``."""
+        """The pieces of outlines (K, 2), each of an ``image`` (S,), along sides (K,) that were ``seen``."""
         pieces = []
         for outline, sides, number in zip(outlines_px, seen, image, strict=True):
             clockwise = signed_area(outline) < 0
