@@ -140,8 +140,8 @@ def find_polygons(
 
 
 def _of_template(
-    template: _Template, traces: Sequence[Traces], polygons: Sequence[Polygon]
-) -> tuple[_Template, Sequence[Polygon]]:
+    template: _Template, traces: Sequence[Traces], polygons: list[Polygon]
+) -> tuple[_Template, list[Polygon]]:
     """Symbols as polygons of the template that they teach, without vertices that only its first one had."""
     for _ in range(_ROUNDS):
         template, polygons = _taught(template, traces, polygons)
