@@ -246,6 +246,7 @@ class MarkingDetection:
     large in a direction that the image hides, as along a dash whose end lies beyond the border.
     ``corner_valid`` (4,) says which are known well in every direction. Symbols, as arrows and chevrons, have
     corners of nan, not valid, and a polygon ``outline_px`` (N, 2); it is empty for quadrilaterals.
+    ``outline_seen`` (N,) says which of its sides, from each point to the next, lie along an edge of paint.
     """
 
     kind: str
@@ -254,6 +255,7 @@ class MarkingDetection:
     covariance_px: FloatArray
     corner_valid: BoolArray
     outline_px: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    outline_seen: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
 
 @dataclass(frozen=True)
@@ -312,7 +314,11 @@ class Marking:
 
 @dataclass(frozen=True)
 class Symbol:
-    """One mapped symbol; heights and id as of a :class:`Marking`."""
+    """One mapped symbol; heights and id as of a :class:`Marking`.
+
+    The vertices of its outline have the joint covariance ``covariance_m2`` (2N, 2N); None in maps that state
+    none.
+    """
 
     kind: str
     outline_map: FloatArray  # (N, 2) m, counter-clockwise from above, in one order for all of a template

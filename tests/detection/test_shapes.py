@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import LENSES, bar, diamond, make_camera, output_of, picture, to_image, view_of
-from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import CHANNELS, SIZE
 from v2hdm.detection.lattice import blurred_coverage
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.patch import ImageQuads, LensFrames
-from v2hdm.detection.propose import Blob, find_blobs, on_edges, outline_polygon
+from v2hdm.detection.propose import Blob, Proposal, find_blobs, on_edges, outline_polygon
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import Quad, order_corners, side_frames
 from v2hdm.records import DIAMOND, LANE_DASH
@@ -92,12 +92,37 @@ def test_an_outline_moves_to_the_edges_of_bright_paint_and_stays_where_there_are
     )
     picture = np.repeat((70 + 110 * rows[:, None] * columns)[..., None], 3, axis=2).astype(np.uint8)
     drawn = (true + np.array([[-2.0, 1.5], [1.5, -2.0], [2.0, 2.0], [1.0, -1.5]]))[::turned]
-    found = on_edges(drawn, picture)
+    found, seen = on_edges(drawn, picture)
+    assert seen.all()
     middles = (true + np.roll(true, -1, axis=0)) / 2
     off_px = [cv2.pointPolygonTest(found.astype(np.float32), one, True) for one in middles.tolist()]
     np.testing.assert_allclose(off_px, 0.0, atol=0.4)
-    plain = on_edges(drawn, np.full_like(picture, 70))
+    plain, seen = on_edges(drawn, np.full_like(picture, 70))
+    assert not seen.any()
     assert abs(signed_area(plain) - signed_area(drawn)) < 0.02 * abs(signed_area(drawn))
+
+
+def test_an_outline_has_no_edge_where_paint_runs_on_beyond_it():
+    picture = np.full((80, 120, 3), 60, dtype=np.uint8)
+    picture[20:50, 30:] = 180
+    picture[40:] //= 3  # a shadow
+    found, seen = on_edges(np.array([[30.0, 20.0], [80.0, 20.0], [80.0, 50.0], [30.0, 50.0]]), picture)
+    middles = (found + np.roll(found, -1, axis=0)) / 2
+    length = np.linalg.norm(found - np.roll(found, -1, axis=0), axis=1)
+    cut = np.abs(middles[:, 0] - 80.0) < 3
+    assert length[seen & cut].sum() < 0.2 * length[cut].sum()
+    assert length[seen & ~cut].sum() > 0.9 * length[~cut].sum()
+
+
+@pytest.mark.parametrize(("other", "one"), [("stop_line", False), ("diamond", True), ("lane_dash", True)])
+def test_an_arrow_and_a_stop_line_are_two_markings_but_a_shaft_is_part_of_its_arrow(other, one):
+    labels = np.zeros((60, 60), dtype=int)
+    labels[5:25, 20:40] = 1 + PAINT_CLASSES.index("arrow")
+    labels[25:50, 25:45] = 1 + PAINT_CLASSES.index(other)
+    blobs, _ = find_blobs(output_of_labels(labels))
+    pieces = [Proposal(blob, k, {}, np.zeros((0, 2)), None, 0.0) for k, blob in enumerate(blobs)]
+    assert pieces[0].blob.parts == 2
+    assert pieces[0].is_one_symbol(pieces[1:], SHIPPED) == one
 
 
 def test_a_diamond_that_touches_a_line_is_split_from_it():

@@ -13,11 +13,13 @@ from v2hdm.association.ground import images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
 from v2hdm.records import CameraInfo, Marking
+from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
-from v2hdm.site.symbols import map_symbols
+from v2hdm.site.polygons import Polygon
+from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
 OPTIONS = LaneOptions()
 
@@ -184,7 +186,17 @@ ARROW = np.array(
 def symbols_of(outlines, kinds):
     """One outline in each frame of one camera, whose shutter is global."""
     count, rows = len(outlines), tuple(np.zeros(len(one)) for one in outlines)
-    return Symbols(np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows)
+    seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
+    return Symbols(
+        np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows, seen
+    )
+
+
+def of_outlines(symbols, outlines):
+    """The symbols with other outlines, whose sides all lie along edges."""
+    seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
+    rows = tuple(np.zeros(len(one)) for one in outlines)
+    return replace(symbols, outlines_pinhole_px=tuple(outlines), row_shares=rows, seen=seen)
 
 
 def scene(arrow_x_m):
@@ -287,12 +299,77 @@ def test_the_vertices_of_arrows_of_one_stencil_have_one_order():
     rng, places = np.random.default_rng(3), np.array([[9.0, 1.0], [10.5, -1.2]])
     shapes = [shape for place in places for shape in [ARROW + place] * 4]
     symbols, rig = seen(shapes, ["arrow"] * 8, 2 * [0.0, 0.7, 1.4, 2.1])
-    symbols = replace(symbols, outlines_pinhole_px=noisy(symbols.outlines_pinhole_px, rng))
+    symbols = of_outlines(symbols, noisy(symbols.outlines_pinhole_px, rng))
     arrows = sorted(mapped(symbols, rig), key=lambda one: one.outline_map[:, 0].mean())
     off_m = [one.outline_map - place - ARROW[3] for one, place in zip(arrows, places, strict=True)]
     assert len({int(np.linalg.norm(one, axis=1).argmin()) for one in off_m}) == 1
     for arrow, place in zip(arrows, places, strict=True):
         assert corner_errors_m(arrow, ARROW + place).max() < 0.035
+
+
+CHEVRON = np.array([[0, -0.9], [0.8, 0], [0, 0.9], [-0.5, 0.9], [0.3, 0], [-0.5, -0.9]])
+_HALF_H = [[0, 0], [1.6, 0], [1.6, 0.2], [0.9, 0.2], [0.9, 0.6], [1.6, 0.6]]
+LETTER_H = np.vstack([_HALF_H, np.array([1.6, 0.8]) - _HALF_H])
+PARKING_T = np.array(
+    [
+        [0.35, -0.5],
+        [0.5, -0.5],
+        [0.5, 0.5],
+        [0.35, 0.5],
+        [0.35, 0.08],
+        [-0.5, 0.08],
+        [-0.5, -0.08],
+        [0.35, -0.08],
+    ]
+)
+
+
+@pytest.mark.parametrize("shape", [CHEVRON, LETTER_H, PARKING_T])
+def test_chevrons_letters_and_own_symbols_have_the_vertices_of_their_template(shape):
+    places, ways_m = np.array([[8.5, 1.5], [9.5, -1.6]]), [0.0, 0.7, 1.4, 2.1, 2.8, 3.5]
+    symbols, rig = seen([shape + at for at in places for _ in ways_m], ["parking_t"] * 12, 2 * ways_m)
+    symbols = of_outlines(symbols, noisy(symbols.outlines_pinhole_px, np.random.default_rng(3)))
+    found = sorted(mapped(symbols, rig), key=lambda one: one.outline_map[:, 0].mean())
+    assert len(found) == len(places)
+    for symbol, at in zip(found, places, strict=True):
+        assert corner_errors_m(symbol, shape + at).max() < 0.025
+
+
+def test_an_outline_that_no_simple_polygon_explains_is_left_out_by_class_and_reason(monkeypatch):
+    bow = np.array([[7.0, 0.5], [8.2, 1.5], [8.2, 0.5], [7.0, 1.5]])
+    given = *seen([bow] * 5, ["bow"] * 5, np.arange(5.0)), INFOS, JITTER_RAD, (), 0.9
+    for crossing in (None, Polygon(bow, *3 * [1e-6 * np.eye(8)], 0.0, 1.0)):
+        if crossing:
+            monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_, one=crossing: [one])
+        found, left_out = map_symbols(*given)
+        assert not found
+        assert [(one.kind, one.reason) for one in left_out] == [("bow", NO_POLYGON)]
+
+
+def cut(place_m):
+    """An arrow whose shaft other paint crosses at a place along it, and which sides lie along its edge."""
+    shape = np.where(ARROW[:, :1] < place_m, [place_m, np.nan], ARROW)
+    shape[:, 1] = ARROW[:, 1]
+    at_cut = shape[:, 0] == place_m
+    return shape, ~(at_cut & np.roll(at_cut, -1))
+
+
+@pytest.mark.parametrize("others", [0, 4])
+def test_where_other_paint_cuts_an_arrow_its_template_says_how_long_it_is_or_it_is_left_out(others):
+    ways_m, places = (
+        [0.0, 0.7, 1.4, 2.1],
+        np.array([[10.0, y] for y in (1.0, -1.0, 2.0, 0.0, -2.0)][: 1 + others]),
+    )
+    short, own = cut(-1.0)
+    shapes = [short + places[0]] * 4 + [ARROW + at for at in places[1:] for _ in ways_m]
+    symbols, rig = seen(shapes, ["arrow"] * len(shapes), (1 + others) * ways_m)
+    symbols = replace(symbols, seen=tuple([own] * 4) + symbols.seen[4:])
+    found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), 0.9)
+    if others:
+        arrow = min(found, key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0]))
+        assert corner_errors_m(arrow, ARROW + places[0]).max() < 0.05
+    else:
+        assert (found, [one.reason for one in left_out]) == ((), [LACKS_A_CORNER])
 
 
 def test_an_arrow_whose_near_end_the_border_cuts_from_near_by_is_mapped_whole():
@@ -365,6 +442,6 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
     both = replace(rig, cam_from_vehicle=np.stack([rig.cam_from_vehicle[0], back]))
     both = replace(both, intrinsic=np.stack([INTRINSIC, INTRINSIC]))
     behind = [outline_px(ARROW + AT, pose, back) for pose in rig.map_from_vehicle[3:]]
-    outlines = (*symbols.outlines_pinhole_px[:3], *behind)
-    symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]), outlines_pinhole_px=outlines)
+    symbols = of_outlines(symbols, (*symbols.outlines_pinhole_px[:3], *behind))
+    symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]))
     assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1

@@ -14,7 +14,7 @@ from tests.verdict.drives import INFO, square_at
 from v2hdm.adjust import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HdMap
-from v2hdm.site.markings import LACKS_A_CORNER
+from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import check_goal
 from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground

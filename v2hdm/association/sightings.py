@@ -49,16 +49,20 @@ def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Symbols:
-    """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines and their row shares, classes."""
+    """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines and their row shares, classes.
+
+    ``seen`` says which sides, each from its point to the next, lie along an edge of the paint.
+    """
 
     camera: IntArray
     frame: IntArray
     outlines_pinhole_px: tuple[FloatArray, ...]
     kinds: tuple[str, ...]
     row_shares: tuple[FloatArray, ...]
+    seen: tuple[BoolArray, ...]
 
 
-NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), ())
+NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), (), ())
 
 
 def collect_symbols(
@@ -83,6 +87,7 @@ def collect_symbols(
         ),
         kinds=tuple(marking.kind for _, _, marking in rows),
         row_shares=tuple(row_shares(drive.cameras[name].info, one.outline_px) for _, name, one in rows),
+        seen=tuple(marking.outline_seen for _, _, marking in rows),
     )
 
 

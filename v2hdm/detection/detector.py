@@ -136,10 +136,14 @@ class Detector:
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
             score, ground = piece.symbol_score(kind), piece.outline_vehicle
             within = found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
-            if within and score >= self.options.min_score:
-                outline_px = on_edges(outline_polygon(piece.blob), image_bgr)
-                symbols.append(MarkingDetection(kind, score, *nothing, outline_px))
-                parts_until = piece.index + 1 + piece.blob.parts
+            after = piece.index + 1 + piece.blob.parts
+            if not within or score < self.options.min_score:
+                continue
+            parts = [part for part in found.pieces if piece.index < part.index < after]
+            if piece.is_one_symbol(parts, self.catalogue):
+                outline = on_edges(outline_polygon(piece.blob), image_bgr)
+                symbols.append(MarkingDetection(kind, score, *nothing, *outline))
+                parts_until = after
         return symbols
 
 

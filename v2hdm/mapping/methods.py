@@ -7,6 +7,7 @@ is the naive strategy under the IPM that the optimisation found.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -37,7 +38,7 @@ from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.site.lanes import map_lanes
 from v2hdm.site.looks import Observer
-from v2hdm.site.symbols import map_symbols
+from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
@@ -285,6 +286,8 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     odds = options.acceptance.min_probability
     seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
     symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
+    for kind, count in Counter(one.kind for one in no_symbols if one.reason == NO_POLYGON).items():
+        _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
         # A spline has the recorded heights within it.

@@ -19,6 +19,8 @@ CORRELATION = 0.2
 
 _KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
 
+LACKS_A_CORNER = "a corner was never seen twice"
+
 _OTHER_EDGE_M = 0.3
 """Sigma, m, of where a sighting sees an edge of the same marking that others do not: a worn end's, as in the
 posterior; what lies farther off is of something else."""

@@ -16,14 +16,14 @@ templates of their own.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from v2hdm.geometry.ipm import apply_in_front, homography_jacobian
 from v2hdm.geometry.planar import is_simple, signed_area
-from v2hdm.records import FloatArray, IntArray
-from v2hdm.site.shapes import SHAPE_SIGMA_M
+from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.site.shapes import EDGE_SIGMA_M, SHAPE_SIGMA_M, learn_paint_error
 
 _SPACING_PX = 4.0  # length of the pieces, px, that an outline is taken as: an element of the network's output
 _CORRELATED_PX = 20.0
@@ -35,7 +35,12 @@ _SIGMA_PX, _SIGMA_WEIGHT = 0.5, 10.0
 _TURN_SIGMA_RAD = 0.25  # by how much a piece of outline is turned against its edge
 _ROUND_PX = 3.0  # how far from a corner, px, the network rounds it
 _STRAY, _STRAY_PX = 0.2, 25.0  # share of an outline that lies along no edge, and how far off it may be, px
+LEAST_EXPLAINED = (
+    1 - 2 * _STRAY
+)  # share of outlines along a polygon's edges, below which it is not their shape
+
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline that sightings share
+UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices of which images say little beside that guess
 _SIZE_SIGMA, _FREEDOM = 0.02, 4.0
 """Sigma of the logarithm of a symbol's sizes about its template's, before any is known; and how many symbols
 that guess, and the one of the vertices' own deviations, are worth."""
@@ -63,14 +68,20 @@ class Traces:
 
     @classmethod
     def of(
-        cls, outlines_px: Sequence[FloatArray], image: IntArray, px_from_map: FloatArray, shift_px: FloatArray
+        cls,
+        outlines_px: Sequence[FloatArray],
+        seen: Sequence[BoolArray],
+        image: IntArray,
+        px_from_map: FloatArray,
+        shift_px: FloatArray,
     ) -> Traces:
-        """The pieces of outlines (K, 2), each of an ``image`` (S,)."""
+        """The pieces of outlines (K, 2), each of an ``image`` (S,), along sides (K,) that were ``seen``."""
         pieces = []
-        for outline, number in zip(outlines_px, image, strict=True):
-            ring = outline if signed_area(outline) < 0 else outline[::-1]
+        for outline, sides, number in zip(outlines_px, seen, image, strict=True):
+            clockwise = signed_area(outline) < 0
+            ring, lit = (outline, sides) if clockwise else (outline[::-1], np.roll(sides[::-1], -1))
             side = np.roll(ring, -1, axis=0) - ring
-            length = np.linalg.norm(side, axis=1)
+            length = np.linalg.norm(side, axis=1) * lit
             count = np.ceil(length / _SPACING_PX).astype(np.int64)
             own = np.repeat(np.arange(len(ring)), count)
             share = (np.arange(len(own)) - (np.cumsum(count) - count)[own] + 0.5) / count[own]
@@ -85,7 +96,7 @@ class Polygon:
 
     ``covariance`` (2N, 2N), m^2, is that of the stacked vertices, ``data`` the information that the images
     alone have of them, ``pull`` (2N,) the derivative of the log prior; ``evidence`` is the log marginal
-    likelihood.
+    likelihood, ``explained`` the share of the images' outlines that lie along its edges.
     """
 
     vertices: FloatArray
@@ -93,6 +104,7 @@ class Polygon:
     data: FloatArray
     pull: FloatArray
     evidence: float
+    explained: float
 
 
 Prior = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -111,44 +123,75 @@ def find_polygons(
             if kinds[members[0]] == kinds[k]:
                 for start in template.laid_about(outlines[k]):
                     one = _fit(traces[k], start, template.prior)
-                    best, home = (one, members) if one.evidence > best.evidence else (best, home)
+                    better = one.evidence > best.evidence and is_simple(one.vertices)
+                    best, home = (one, members) if better else (best, home)
         found[k] = best
         if home is not None:
             home.append(k)
         elif is_simple(best.vertices):
             classes.append((_Template.of(best), [k]))
     for template, members in classes:
-        for _ in range(_ROUNDS if len(members) > 1 else 0):
-            template, others = template.learnt([found[k] for k in members])
-            for k, other in zip(members, others, strict=True):
-                found[k] = _fit(traces[k], found[k].vertices, other.prior, _FEW_STEPS)
+        shown, polygons = [traces[k] for k in members], [found[k] for k in members]
+        if len(members) > 1:
+            template, polygons = _of_template(template, shown, polygons)
+        for k, one, error in zip(members, polygons, template.edge_errors(polygons), strict=True):
+            found[k] = replace(one, covariance=one.covariance + error)
     return found
+
+
+def _of_template(
+    template: _Template, traces: Sequence[Traces], polygons: list[Polygon]
+) -> tuple[_Template, list[Polygon]]:
+    """Symbols as polygons of the template that they teach, without vertices that only its first one had."""
+    for _ in range(_ROUNDS):
+        template, polygons = _taught(template, traces, polygons)
+    while len(template.vertices) > 3:
+        kept = _but_flattest(template.vertices)
+        known = template.covariance[np.ix_(*2 * [np.repeat(kept, 2)])]
+        fewer = replace(template, vertices=template.vertices[kept], covariance=known)
+        pairs = zip(traces, polygons, strict=True)
+        tried = [_fit(trace, one.vertices[kept], fewer.prior, _FEW_STEPS) for trace, one in pairs]
+        fewer, tried = _taught(fewer, traces, tried)
+        if sum(one.evidence for one in tried) < sum(one.evidence for one in polygons):
+            break
+        template, polygons = _taught(fewer, traces, tried)
+    return template, polygons
+
+
+def _taught(
+    template: _Template, traces: Sequence[Traces], polygons: Sequence[Polygon]
+) -> tuple[_Template, list[Polygon]]:
+    """The template that symbols teach, and each of them by what the others do."""
+    template, others = template.learnt(polygons)
+    each = zip(traces, polygons, others, strict=True)
+    return template, [_fit(trace, one.vertices, other.prior, _FEW_STEPS) for trace, one, other in each]
 
 
 def _own_polygon(traces: Traces, outline: FloatArray) -> Polygon:
     """The likeliest polygon about an outline, of a shape of its own: vertices go while that is likelier."""
     vertices = outline
     while len(vertices) > _MOST_VERTICES:
-        vertices = _without_flattest(vertices)
+        vertices = vertices[_but_flattest(vertices)]
     now = _fit(traces, vertices, _anywhere(vertices))
     tried = [now]
     while len(now.vertices) > 3:
-        vertices = _without_flattest(now.vertices)
+        vertices = now.vertices[_but_flattest(now.vertices)]
         now = _fit(traces, vertices, _anywhere(vertices), _FEW_STEPS)
         tried.append(now)
-    best = max(tried, key=lambda one: one.evidence)
-    return _fit(traces, best.vertices, _anywhere(best.vertices))
+    best = max(tried, key=lambda one: (is_simple(one.vertices), one.evidence))
+    refined = _fit(traces, best.vertices, _anywhere(best.vertices))
+    return refined if is_simple(refined.vertices) else best
 
 
 def _anywhere(start: FloatArray) -> Prior:
     return lambda vertices: (start.ravel(), _ANYWHERE_M**2 * np.eye(start.size))
 
 
-def _without_flattest(vertices: FloatArray) -> FloatArray:
-    """The polygon without the vertex that makes least of its area (Visvalingam and Whyatt, 1993)."""
+def _but_flattest(vertices: FloatArray) -> BoolArray:
+    """The vertices (N,) of a polygon but that with least of its area (Visvalingam and Whyatt, 1993)."""
     before, after = np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0)
     area = np.abs(signed_area(np.stack([before, vertices, after], axis=1)))
-    return np.delete(vertices, int(area.argmin()), axis=0)
+    return np.asarray(np.arange(len(vertices)) != area.argmin())
 
 
 @dataclass(frozen=True)
@@ -239,6 +282,18 @@ class _Template:
         everyone = range(len(members))
         return of(everyone), [of([k for k in everyone if k != own]) for own in everyone]
 
+    def edge_errors(self, members: Sequence[Polygon]) -> list[FloatArray]:
+        """Covariances (2N, 2N), m^2, of what all images misplace alike, by how each member deviates."""
+        if len(members) < 2:
+            return [EDGE_SIGMA_M**2 * np.eye(self.vertices.size)]
+        off, formal = [], []
+        for one, other in zip(members, self.learnt(members)[1], strict=True):
+            off += list(one.vertices - other.prior(one.vertices)[0].reshape(-1, 2))
+            formal += [one.covariance[n : n + 2, n : n + 2] for n in range(0, one.vertices.size, 2)]
+        error = learn_paint_error(off, formal)
+        own = [error.variance_m2(*pair) for pair in zip(off, formal, strict=True)]
+        return [np.diag(np.repeat(part, 2)) for part in np.split(np.array(own), len(members))]
+
 
 def _evenly(ring: FloatArray) -> FloatArray:
     """A hundred points (100, 2) evenly along a closed polygon (N, 2)."""
@@ -267,7 +322,10 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
     precision, off = np.linalg.inv(covariance), mean - vertices.ravel()
     evidence = log_likelihood - 0.5 * off @ precision @ off
     evidence -= 0.5 * (np.linalg.slogdet(data + precision)[1] + np.linalg.slogdet(covariance)[1])
-    return Polygon(vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence))
+    explained = float(weight.sum() / max(traces.weight.sum(), 1e-9))
+    return Polygon(
+        vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence), explained
+    )
 
 
 def _explained(
@@ -297,7 +355,9 @@ def _explained(
     )
     # Pieces lie anywhere along the polygon: of two that explain them, the shorter one is likelier.
     perimeter = np.maximum(np.nansum(length, axis=1), 1.0)
-    inlier += np.log(_CORRELATED_PX * np.bincount(image, traces.weight, len(perimeter)) / perimeter)[image]
+    inlier += np.log(
+        _CORRELATED_PX * np.bincount(image, traces.weight, len(perimeter))[image] / perimeter[image]
+    )
     total = np.logaddexp(inlier, np.log(_STRAY / (2 * _STRAY_PX * 2 * np.pi)))
     weight = traces.weight * np.exp(inlier - total)
     normal = np.stack([-along[rows, edge, 1], along[rows, edge, 0]], axis=-1)

@@ -25,13 +25,13 @@ from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
 from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.association.tracks import LEAST_SIGHTINGS
-from v2hdm.geometry.ipm import pinhole_px_from_ground, project_ground
+from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, Exclusion, FloatArray, IntArray, Marking, Symbol
+from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.site.parallax import PointViews, measure_parallax
-from v2hdm.site.polygons import Polygon, Traces, find_polygons
-from v2hdm.site.shapes import EDGE_SIGMA_M
+from v2hdm.site.polygons import LEAST_EXPLAINED, UNSEEN_M, Polygon, Traces, find_polygons
 
 _CELL_M = 0.02
 """Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
@@ -39,6 +39,8 @@ _CELL_M = 0.02
 _MOST_CELLS = 500  # cells along the longer side of the average, beyond which they grow
 _PART = 0.3
 """Share of the weight of the images that show a place from which it is painted: some miss a part."""
+
+NO_POLYGON = "no polygon that crosses nowhere explains its outline"
 
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
@@ -52,7 +54,7 @@ def map_symbols(
     markings: Sequence[Marking],
     min_probability: float,
 ) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
-    """The symbols that at least three images show, and those that do not lie on the ground.
+    """The symbols that at least three images show, and those that are no polygons on the ground.
 
     ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
     deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. A symbol
@@ -85,21 +87,32 @@ def map_symbols(
         objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
         if None in objections:
             found.append(Symbol(kind, outline, len(camera)))
-            outlines_px = [symbols.outlines_pinhole_px[n] for n in rows[own]]
-            seen.append(eyes.traces(outlines_px, image.ravel()))
+            sides = [symbols.seen[n] for n in rows[own]]
+            seen.append(eyes.traces([shapes[n] for n in own], sides, image.ravel()))
         else:
             left_out.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
     polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
-    found = [_with_vertices(*pair, markings) for pair in zip(found, polygons, strict=True)]
-    return tuple(found), tuple(left_out)
+    kept = []
+    for symbol, one in zip(found, polygons, strict=True):
+        reason = _objection(one)
+        if reason is None:
+            kept.append(_with_vertices(symbol, one, markings))
+        else:
+            left_out.append(Exclusion(symbol.kind, one.vertices.mean(axis=0), symbol.sightings, reason))
+    return tuple(kept), tuple(left_out)
+
+
+def _objection(polygon: Polygon) -> str | None:
+    """Why a polygon is not the shape of a symbol, None if nothing says so."""
+    if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
+        return NO_POLYGON
+    variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
+    return LACKS_A_CORNER if variance_m2.max() > UNSEEN_M**2 else None
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
-    """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do.
-
-    One that crosses itself explains nothing: then the outline stays that its sightings share.
-    """
-    covariance = polygon.covariance + EDGE_SIGMA_M**2 * np.eye(polygon.vertices.size)
+    """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do."""
+    covariance = polygon.covariance
     known = [one for one in markings if one.covariance_m2 is not None]
     if known:
         middle = polygon.vertices.mean(axis=0)
@@ -107,8 +120,6 @@ def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]
         shared = np.asarray(nearest.covariance_m2).reshape(4, 2, 4, 2).mean(axis=(0, 2))
         covariance = covariance + np.tile(shared, 2 * (len(polygon.vertices),))
     sigma_m = float(np.sqrt(np.trace(covariance) / len(covariance)))
-    if not is_simple(polygon.vertices):
-        return replace(symbol, sigma_m=sigma_m)
     return replace(symbol, outline_map=polygon.vertices, covariance_m2=covariance, sigma_m=sigma_m)
 
 
@@ -136,14 +147,15 @@ class _Eyes:
         direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
         return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
 
-    def traces(self, outlines_px: Sequence[FloatArray], image: IntArray) -> Traces:
-        """Outlines, each of an ``image`` (S,), as they are beside polygons on the ground."""
-        intrinsic, cam_from_map = (
-            self.rig.intrinsic[self.camera],
-            self.rig.cam_from_map(self.camera, self.frame),
-        )
-        px_from_map = pinhole_px_from_ground(intrinsic, cam_from_map)
-        return Traces.of(outlines_px, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
+    def traces(self, shapes: Sequence[FloatArray], seen: Sequence[BoolArray], image: IntArray) -> Traces:
+        """Outlines on the ground, each of an ``image`` (S,), as they are beside polygons in the images.
+
+        A camera whose shutter rolls would have taken all of an image's rows in its middle.
+        """
+        intrinsic = self.rig.intrinsic[self.camera]
+        px_from_map = pinhole_px_from_ground(intrinsic, self.rig.cam_from_map(self.camera, self.frame))
+        outlines_px = [apply_in_front(px_from_map[k], one) for k, one in zip(image, shapes, strict=True)]
+        return Traces.of(outlines_px, seen, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
 
     def shows(self, points_map: FloatArray) -> BoolArray:
         """Which points (N, 2) lie inside which images (I, N), away from the border."""
