@@ -56,13 +56,17 @@ def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray
     Whole means: all corners inside the camera's ROI at the true pose, at least
     :data:`FULLY_VISIBLE` of the area unoccluded, in at least :data:`MIN_SIGHTINGS` images.
     """
-    corners_map = np.array([marking.corners_map for marking in truth.map.markings]).reshape(-1, 4, 2)
-    sightings = np.zeros(len(corners_map), dtype=int)
+    plan, heights = (
+        np.array([np.zeros(4) if one is None else one for one in ours], dtype=np.float64)
+        for ours in ((m.corners_map for m in truth.map.markings), (m.heights_m for m in truth.map.markings))
+    )
+    corners = np.concatenate([plan.reshape(-1, 4, 2), heights.reshape(-1, 4, 1)], axis=2)
+    sightings = np.zeros(len(corners), dtype=int)
     for i, image in enumerate(drive.images):
         if image.camera not in cameras:
             continue
         candidates = np.flatnonzero(truth.visibility[i] >= FULLY_VISIBLE)
-        corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners_map[candidates])
+        corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners[candidates])
         inside = inside_convex(drive.cameras[image.camera].roi_vehicle, corners_vehicle).all(axis=1)
         sightings[candidates[inside]] += 1
     return sightings >= MIN_SIGHTINGS
