@@ -403,7 +403,7 @@ def build_port(config: PortConfig) -> Port:
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
         driven=drive_along(
-            route, config.route, config.disturbance, anew[_POSES], relief and partial(stands, relief)
+            route, config.route, config.disturbance, anew[_POSES], partial(stands, relief) if relief else None
         ),
     )
 

@@ -47,7 +47,7 @@ def points_seen(
     boxes: Sequence[Box],
     relief: Relief | None = None,
 ) -> BoolArray:
-    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not behind a box or crest."""
+    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not hidden."""
     centre = camera_centre(cam_from_map)
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
     seen[seen] = inside_image(info, cam_from_map, points_map[seen], relief)

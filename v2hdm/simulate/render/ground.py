@@ -267,9 +267,10 @@ class PaintLayer:
     def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
         """Paint onto the ground field's ``albedo`` (H', W, 3) and into ``labels`` (H, W)."""
         seen = in_view(view, view.homogeneous_px(view.on_ground(self._vertices)), _FARTHEST_PAINT_M)
-        paints, flat = [self._paints[k] for k in seen], view.homogeneous_px(view.on_plane(self._vertices[seen]))
+        paints = [self._paints[index] for index in seen]
+        flat = view.homogeneous_px(view.on_plane(self._vertices[seen]))
         polygons = [own[: len(one.polygon_map)] for own, one in zip(flat, paints, strict=True)]
-        draped = view.relief and [on_ground_px(view, one.polygon_map) for one in paints]
+        draped = [on_ground_px(view, one.polygon_map) for one in paints] if view.relief else None
         first = field.first_row
         tiles = [_WEAR_TILE, MEDIUM_TILE, fine_tile("asphalt")]
         padded = tuple(tile.padded for tile in tiles)

@@ -165,8 +165,8 @@ class Box:
 
     ``centre_map`` is the centre of its footprint, ``size_m`` its length, width and height,
     ``base_m`` the height of its lower side above the ground, whose height beneath the centre and slopes by x
-    and y are ``beneath``: on a slope it is sheared. ``pictures`` are of its left, rear, right and front side and its
-    top, as seen from outside, in place of the colour; None leaves that.
+    and y are ``beneath``: on a slope it is sheared. ``pictures`` are of its left, rear, right and front side
+    and its top, as seen from outside, in place of the colour; None leaves that.
     """
 
     centre_map: tuple[float, float]

@@ -121,17 +121,17 @@ class Outline:
 
 
 def outlines(
-    view: View, polygons: Sequence[FloatArray], shown: Sequence[FloatArray] | None = None
+    view: View, polygons: Sequence[FloatArray], draped: Sequence[FloatArray] | None = None
 ) -> list[Outline | None]:
     """The outlines of polygons of homogeneous pinhole pixels (N, 3); None for those out of view.
 
-    Their boundaries are those of ``shown`` (M, 3), if given: where an image shows what lies on a relief.
+    Their boundaries are those of ``draped`` (M, 3), if given: where an image shows what lies on a relief.
     """
     if not polygons:
         return []
     count, points = np.array([len(polygon) for polygon in polygons]), np.concatenate(polygons)
     ends = np.cumsum(count)
-    parts = _visible_parts(view, polygons if shown is None else shown)
+    parts = _visible_parts(view, polygons if draped is None else draped)
     place = np.arange(1, len(points) + 1)
     place[ends - 1] = ends - count
     following = points[place]
