@@ -295,15 +295,16 @@ class Surface:
         return np.column_stack([forwards, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]])
 
     def _leaning(self, points_map: FloatArray, above_m: FloatArray, frame: IntArray) -> FloatArray:
-        """By how much (K, 2) a slope moves points over the plan, (K, 2) and their height (K,) on frames' planes.
+        """How far (K, 2) from their places on the map points (K, 2), at heights (K,), are on frames' planes.
 
-        Ways along a slope g are longer than on the map by g^2 / 2, and what rises from it leans by g.
+        Ways along a slope are longer than on the map by half of its square, and what rises from it leans.
         """
-        slope = np.column_stack([one[frame] for one in self._stands[1:]])
-        away, ahead = self._from(points_map, frame), self.paths.heading[frame]
-        by = slope * (np.einsum("ki,ki->k", slope, away) / 2 + above_m)[:, None]
+        forwards, sideways = (one[frame] for one in self._stands[1:])
+        (along, across), ahead = self._from(points_map, frame).T, self.paths.heading[frame]
+        by_along = forwards * (forwards * along / 2 + sideways * across + above_m)
+        by_across = sideways * (sideways * across / 2 + above_m)
         left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        return np.asarray(by[:, :1] * ahead + by[:, 1:] * left)
+        return by_along[:, None] * ahead + by_across[:, None] * left
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
         """The derivative (K, B) of :meth:`seen_height_m` by the parameters."""
@@ -339,7 +340,9 @@ class Surface:
         """
         height_m = self.seen_height_m(points_map, np.full(len(points_map), frame))
         centre = camera_centre(cam_from_map)
-        points_map = points_map + self._leaning(points_map, height_m, np.full(len(points_map), frame))
+        place, frames = points_map, np.full(len(points_map), frame)
+        for _ in range(2):
+            points_map = place + self._leaning(points_map, height_m, frames)
         off = points_map - centre[:2]
         known = (np.linalg.norm(off, axis=1) < _REACH_M) & (height_m < centre[2] / 2)
         return points_map + off * np.where(known, height_m / (centre[2] - height_m), 0.0)[:, None]
