@@ -304,7 +304,7 @@ class Surface:
         by_along = forwards * (forwards * along / 2 + sideways * across + above_m)
         by_across = sideways * (sideways * across / 2 + above_m)
         left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        return by_along[:, None] * ahead + by_across[:, None] * left
+        return np.asarray(by_along[:, None] * ahead + by_across[:, None] * left)
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
         """The derivative (K, B) of :meth:`seen_height_m` by the parameters."""
