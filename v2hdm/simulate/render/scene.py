@@ -252,10 +252,12 @@ def ground_under(box: Box, points_map: FloatArray) -> FloatArray:
 
 def box_faces(box: Box) -> FloatArray:
     """The corners (2, 4, 3) of a box's lower and upper face, counter-clockwise from above."""
-    footprint = box_footprint(box)
-    under = ground_under(box, footprint)
-    levels = (box.base_m, box.base_m + box.size_m[2])
-    return np.stack([np.column_stack([footprint, level + under]) for level in levels])
+    faces, footprint = np.empty((2, 4, 3)), box_footprint(box)
+    faces[..., :2] = footprint
+    faces[0, :, 2], faces[1, :, 2] = box.base_m, box.base_m + box.size_m[2]
+    if any(box.beneath):
+        faces[..., 2] += ground_under(box, footprint)
+    return faces
 
 
 def standing(box: Box, relief: Relief | None) -> Box:
