@@ -51,7 +51,7 @@ _GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and ho
 _SIDE_M = 10.0  # ground farther beside the path is as high as there, but for the cross-section
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
-_WHEELS_M = (1.4, 0.8)  # half of wheelbase and track, over which the slope is the vehicle's
+_WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
 
 _CURVATURE = 1e-3  # usual second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
@@ -238,21 +238,39 @@ class Surface:
         return csr_array(hstack([csr_array(_hinges(left_m)), spline]))
 
     def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
-        """Height, slope along the heading and to the left (F, B each) under each frame by the parameters."""
+        """Height, slope along the heading and to the left (F, B each) of frames' planes by the parameters.
+
+        A plane touches the ground under the wheels: on a crown its origin is lower than the ground there.
+        """
         paths, (long, wide) = self.paths, _WHEELS_M
         # Between two places the path is a chord, up to 5 mm off a bend, but the vehicle was on it.
         station, _ = paths.beside(paths.position_map, np.arange(len(paths.place)))
-        left = np.zeros(len(station))
-        sense = diags_array(paths.sense[paths.place] / (2 * long))
-        forwards = sense @ (self._columns(station + long, left) - self._columns(station - long, left))
-        sideways = (self._columns(station, left + wide) - self._columns(station, left - wide)) / (2 * wide)
-        return self._columns(station, left), csr_array(forwards), sideways
+        left = np.full(len(station), wide)
+        rear, front = (
+            (self._columns(at, left), self._columns(at, -left))
+            for at in (station, station + long * paths.sense[paths.place])
+        )
+        height, ahead = (rear[0] + rear[1]) / 2, (front[0] + front[1]) / 2
+        sideways = (rear[0] - rear[1] + front[0] - front[1]) / (4 * wide)
+        return height, (ahead - height) / long, sideways
 
     def _from(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Points (K, 2) ahead and to the left of the vehicle at frames (K,), m."""
         off, ahead = points_map - self.paths.position_map[frame], self.paths.heading[frame]
         forwards = np.einsum("ki,ki->k", off, ahead)
         return np.column_stack([forwards, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]])
+
+    def _leaning(self, points_map: FloatArray, above_m: FloatArray, frame: IntArray) -> FloatArray:
+        """How far (K, 2) from their places on the map points (K, 2), at heights (K,), are on frames' planes.
+
+        Ways along a slope are longer than on the map by half of its square, and what rises from it leans.
+        """
+        forwards, sideways = (one[frame] for one in self._stands[1:])
+        (along, across), ahead = self._from(points_map, frame).T, self.paths.heading[frame]
+        by_along = forwards * (forwards * along / 2 + sideways * across + above_m)
+        by_across = sideways * (sideways * across / 2 + above_m)
+        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        return np.asarray(by_along[:, None] * ahead + by_across[:, None] * left)
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
         """The derivative (K, B) of :meth:`seen_height_m` by the parameters."""
@@ -288,6 +306,9 @@ class Surface:
         """
         height_m = self.seen_height_m(points_map, np.full(len(points_map), frame))
         centre = camera_centre(cam_from_map)
+        place, frames = points_map, np.full(len(points_map), frame)
+        for _ in range(2):
+            points_map = place + self._leaning(points_map, height_m, frames)
         off = points_map - centre[:2]
         known = (np.linalg.norm(off, axis=1) < _REACH_M) & (height_m < centre[2] / 2)
         return points_map + off * np.where(known, height_m / (centre[2] - height_m), 0.0)[:, None]
@@ -428,9 +449,13 @@ class Surface:
         down, out = np.where(found, rays[:, 2], -1.0), np.zeros_like(plane)
         last = np.where(found, -centre_map[:, 2] / down, 0.0)
 
-        def above(far: FloatArray) -> FloatArray:
+        def on_map(far: FloatArray) -> FloatArray:
             points = centre_map + far[:, None] * rays
-            return np.asarray(points[:, 2] - self.seen_height_m(points[:, :2], frame))
+            return points[:, :2] - self._leaning(points[:, :2], points[:, 2], frame)
+
+        def above(far: FloatArray) -> FloatArray:
+            height_m = self.seen_height_m(on_map(far), frame)
+            return np.asarray(centre_map[:, 2] + far * rays[:, 2] - height_m)
 
         before = above(last)
         far = last - before / down
@@ -440,7 +465,7 @@ class Surface:
                 fall = np.where(np.abs(far - last) > 1e-12, (off - before) / (far - last), down)
             last, before, far = far, off, far - off / np.where(fall < 0, fall, down)
         found &= (np.abs(above(far)) < _SURE_M) & (far > 0)
-        out[found] = (centre_map[:, :2] + far[:, None] * rays[:, :2])[found]
+        out[found] = on_map(far)[found]
         return np.where(found[:, None], out, plane), found
 
     def flattened_px(

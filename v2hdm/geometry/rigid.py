@@ -40,9 +40,10 @@ def camera_centre(cam_from_frame: FloatArray) -> FloatArray:
 
 
 def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
-    """Ground points (..., 2) m of the map as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
-    offset = np.concatenate([points_map, np.zeros((*np.shape(points_map)[:-1], 1))], axis=-1)
-    return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
+    """Points (..., 2 or 3) m of the map's ground as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
+    if points_map.shape[-1] == 2:
+        points_map = np.concatenate([points_map, np.zeros((*points_map.shape[:-1], 1))], axis=-1)
+    return np.asarray(((points_map - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
 
 
 def make_transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:

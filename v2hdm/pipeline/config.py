@@ -165,6 +165,12 @@ _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
     (Within(0.1), "simulate.paint.", "stop_line_spacing_m"),
     (SHARE, "simulate.surface.", "albedo wet_fraction"),
     (NOT_NEGATIVE, "simulate.surface.", "contrast stains joint_width_m tyre_marks"),
+    # Steeper, a vehicle would slide; a higher kerb is a wall.
+    (Within(0, 0.15), "simulate.relief.", "grade crown ramp bank"),
+    (Within(0, 0.3), "simulate.relief.", "gully_m kerb_m"),
+    (NOT_NEGATIVE, "simulate.relief.", "ramp_at_m"),
+    (Within(1), "simulate.relief.", "ramp_length_m"),
+    (Within(1, 15), "simulate.relief.", "gully_offset_m kerb_offset_m"),
     (NOT_NEGATIVE, "simulate.yard.", "stack_fill stack_clearance_m sun_strength"),
     (NOT_NEGATIVE, "simulate.exposure.", "level_sigma read_noise"),
     (Within(0, 1e5), "simulate.surface.", "patches oil_stains"),

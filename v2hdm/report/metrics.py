@@ -22,6 +22,7 @@ from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HdMap, Lane, Ma
 
 MATCH_GATE_M = 2.0  # a mapped marking farther than this from every true one of its class is false
 MIN_SIGHTINGS = 3  # images that show all of a marking in the region of interest, for it to be driven past
+_TWO_SIDED_95 = 1.96  # standard deviations to either side
 FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unoccluded
 
 
@@ -47,13 +48,17 @@ class ExtrinsicMetrics:
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
     """Which true markings (J,) the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
-    corners_map = np.array([marking.corners_map for marking in truth.map.markings]).reshape(-1, 4, 2)
-    sightings = np.zeros(len(corners_map), dtype=int)
+    plan, heights = (
+        np.array([np.zeros(4) if one is None else one for one in ours], dtype=np.float64)
+        for ours in ((m.corners_map for m in truth.map.markings), (m.heights_m for m in truth.map.markings))
+    )
+    corners = np.concatenate([plan.reshape(-1, 4, 2), heights.reshape(-1, 4, 1)], axis=2)
+    sightings = np.zeros(len(corners), dtype=int)
     for i, image in enumerate(drive.images):
         if image.camera not in cameras:
             continue
         candidates = np.flatnonzero(truth.visibility[i] >= FULLY_VISIBLE)
-        corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners_map[candidates])
+        corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners[candidates])
         inside = inside_convex(drive.cameras[image.camera].roi_vehicle, corners_vehicle).all(axis=1)
         sightings[candidates[inside]] += 1
     return sightings >= MIN_SIGHTINGS
@@ -100,11 +105,34 @@ def match_markings(
 
 def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatArray:
     """Error vectors (4 M, 2) of paired markings, over the best of the four cyclic corner orders."""
-    errors = []
-    for estimate, reference in zip(mapped, true, strict=True):
-        shifted = [np.roll(estimate.corners_map, s, axis=0) - reference.corners_map for s in range(4)]
-        errors.append(min(shifted, key=lambda e: float((e**2).sum())))
+    pairs = zip(mapped, true, _first_corners(mapped, true), strict=True)
+    errors = [np.roll(one.corners_map, shift, axis=0) - other.corners_map for one, other, shift in pairs]
     return np.concatenate(errors) if errors else np.empty((0, 2))
+
+
+def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[str, float]:
+    """RMSE, m, of the heights of paired markings' corners, and the share within 1.96 of their sigmas.
+
+    Empty where no pair has heights; the share is left out where they have no sigmas.
+    """
+    off, inside = [], []
+    for one, other, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
+        if one.heights_m is None or other.heights_m is None:
+            continue
+        off.append(one.heights_m - np.roll(other.heights_m, -shift))
+        if one.heights_sigma_m is not None:
+            inside.append(np.abs(off[-1]) < _TWO_SIDED_95 * one.heights_sigma_m)
+    figures = {"height_rmse_m": float(np.sqrt(np.mean(np.square(off))))} if off else {}
+    return figures | ({"heights_inside_95": float(np.mean(inside))} if inside else {})
+
+
+def _first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
+    """By how many corners each marking of pairs is turned to agree best with the true one."""
+    shifts = []
+    for one, other in zip(mapped, true, strict=True):
+        off = [np.roll(one.corners_map, s, axis=0) - other.corners_map for s in range(4)]
+        shifts.append(int(np.argmin([(each**2).sum() for each in off])))
+    return shifts
 
 
 def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> ExtrinsicMetrics:
@@ -205,6 +233,10 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
     figures: dict[str, Any] = {"markings": len(hd_map.markings)}
     if truth is not None and expected is not None:
         figures |= asdict(marking_metrics(hd_map, truth, expected))
+        rows, columns = match_markings(hd_map.markings, truth.map.markings)
+        figures |= height_figures(
+            [hd_map.markings[row] for row in rows], [truth.map.markings[column] for column in columns]
+        )
         shown = dict.fromkeys(m.kind for m in (*truth.map.markings, *hd_map.markings))
         kinds = dict.fromkeys((*CORNERED_CLASSES, *shown))
         by_class = {kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in kinds}
@@ -240,9 +272,10 @@ def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
     start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
     if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
         return f"{cameras}: {_own_words(best)}"
+    heights = f", heights {100 * best['height_rmse_m']:.1f} cm" if "height_rmse_m" in best else ""
     return (
         f"{cameras}: corners {100 * start['corner_rmse_m']:.1f} cm off before, "
-        f"{100 * best['corner_rmse_m']:.1f} cm after the optimisation"
+        f"{100 * best['corner_rmse_m']:.1f} cm after the optimisation{heights}"
     )
 
 

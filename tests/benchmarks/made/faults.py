@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from tests.benchmarks.made.world import World, beside, make
+from tests.benchmarks.made.world import HALF_TRACK_M, World, beside, make
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import FloatArray, Trajectory
 
@@ -136,7 +136,8 @@ def _crown(fall: float, line_m: float, world: World) -> World:
     """The road falls to both sides of a crown to the left of the vehicle, which leans with its own side."""
     corners = world.corners_map.copy()
     _, left_m = beside(world.port.route, corners[..., :2].reshape(-1, 2))
-    lower_m = 2 * np.maximum(left_m - line_m, 0.0) if line_m else np.abs(left_m)
+    # Over the crown itself the wheels stand lower, and so does the vehicle's origin.
+    lower_m = 2 * np.maximum(left_m - line_m, 0.0) if line_m else np.abs(left_m) - HALF_TRACK_M
     corners[..., 2] -= fall * lower_m.reshape(corners.shape[:2])
     return replace(world, corners_map=corners)
 

@@ -23,6 +23,9 @@ from v2hdm.simulate.port.route import Route, correlated_noise
 MAX_GAP_S = 0.5
 """As users read drives."""
 
+WHEELBASE_M, HALF_TRACK_M = 2.8, 0.8
+"""Of the vehicle, whose origin is under the rear axle."""
+
 _TRUE, _RECORDED, _ROAD = 40, 41, 43  # streams of a seed
 _GRID_M = 0.1
 
@@ -169,10 +172,11 @@ def _driven(recipe: Recipe, port: Port, ground: Ground, stamp_s: FloatArray) -> 
     noise = smooth_noise if errors.smooth else _rough_noise
     sway = noise(station, errors.roll_pitch_rad, errors.roll_pitch_over_m, rng, 2)
     heave = noise(station, errors.heave_m, errors.heave_over_m, rng, 1)[:, 0]
-    grade, fall = (np.interp(station, ground.station_m, own) for own in (ground.grade, ground.fall))
-    position = np.column_stack(
-        [port.route.points_at(station), ground.height_at(station, np.zeros(len(station))) + heave]
-    )
+    sides = HALF_TRACK_M * np.array([[1.0], [-1.0]])
+    rear, front = (ground.height_at(station + ahead_m, sides) for ahead_m in (0.0, WHEELBASE_M))
+    grade = (front - rear).mean(axis=0) / WHEELBASE_M
+    fall = (rear + front)[0] / (4 * HALF_TRACK_M) - (rear + front)[1] / (4 * HALF_TRACK_M)
+    position = np.column_stack([port.route.points_at(station), rear.mean(axis=0) + heave])
     return poses_of(
         position, np.arctan(fall) + sway[:, 0], sway[:, 1] - np.arctan(grade), port.route.yaw_at(station)
     )

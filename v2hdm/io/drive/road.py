@@ -30,7 +30,7 @@ _ROAD_M, _HEIGHTS_M = 5.0, 10.0
 # Slow sway of a vehicle by acceleration and in bends: 0.17 deg, as on KITTI drives, over a few seconds.
 _SWAY_RAD, _SWAY_M = 0.003, 10.0
 # GNSS heights are half again as uncertain as positions: no satellite is below the antenna.
-_HEIGHT_SIGMAS = 1.5
+HEIGHT_SIGMAS = 1.5
 _HEIGHT_M = 5.0  # way over which an error of the height is of one piece
 _CROSS_FALL = 0.02  # slope of a road that drains, expected where only heights along a line are known
 
@@ -75,7 +75,7 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float = 0.02) -> Laid:
     measured = np.abs(lean).max(axis=0) > _ROUNDING
     if not measured.any() and not poses[:, 2, 3].any():
         return Laid(recorded, None, np.zeros(2))
-    height_sigma_m = _HEIGHT_SIGMAS * position_sigma_m
+    height_sigma_m = HEIGHT_SIGMAS * position_sigma_m
     if not measured.all():
         # By its heights alone, which hardly say anything of the slope across a straight road.
         pieces = np.sqrt(2.0 * np.pi) * _HEIGHTS_M / _HEIGHT_M
@@ -90,10 +90,10 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float = 0.02) -> Laid:
     relative[:, ~measured] = 0.0
     flat = poses.copy()
     flat[:, 2, 3] = 0.0
-    roll, pitch = _roll_pitch(relative).T
+    roll, pitch = roll_pitch(relative).T
     flat[:, :3, :3] = rotation_from_euler(roll, pitch, yaw)
     road = Road(stations.points_map, ground_m, ground_slope)
-    return Laid(Trajectory(recorded.stamp_s, flat), road, _roll_pitch(mount[None])[0])
+    return Laid(Trajectory(recorded.stamp_s, flat), road, roll_pitch(mount[None])[0])
 
 
 def log_road(laid: Laid, where: Path) -> None:
@@ -150,7 +150,7 @@ def _with_mount(lean: FloatArray, yaw: FloatArray, measured: BoolArray) -> Float
     return np.stack([_turned(lean, yaw), *(-_turned(direction, yaw) for direction in directions)], axis=2)
 
 
-def _roll_pitch(lean: FloatArray) -> FloatArray:
+def roll_pitch(lean: FloatArray) -> FloatArray:
     """Roll and pitch (P, 2) of a floor with these slopes forward and left (P, 2)."""
     pitch = -np.arctan(lean[:, 0])
     return np.column_stack([np.arctan(lean[:, 1] * np.cos(pitch)), pitch])

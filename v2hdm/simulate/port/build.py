@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -25,8 +26,10 @@ from v2hdm.simulate.port.config import (
     YardConfig,
 )
 from v2hdm.simulate.port.paint import build_layout
+from v2hdm.simulate.port.relief import build_relief, stands
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_route, drive_along
 from v2hdm.simulate.render import scene as parts
+from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
 from v2hdm.simulate.render.scene import RECTANGLE, Bgr, Box, box_footprint, convex_hull, placed
 
@@ -304,7 +307,8 @@ class Port:
     def moving_boxes(self, frame: int) -> tuple[Box, ...]:
         """The moving trucks at the time of an image."""
         stamp = float(self.driven.stamp_s[frame])
-        return tuple(box for truck in self.trucks for box in truck.boxes(self.route, stamp))
+        boxes = [box for truck in self.trucks for box in truck.boxes(self.route, stamp)]
+        return tuple(parts.standing(box, self.renderer.scene.relief) for box in boxes)
 
     def picture(self, camera: str, frame: int) -> Rendered:
         """Render an image and its labels: a function of the configuration, the camera and the frame alone."""
@@ -385,18 +389,31 @@ def build_port(config: PortConfig) -> Port:
         raise ConfigError(f"port '{config.name}', route.pieces: {problem}")
     layout = build_layout(config.paint, route, streams[_LAYOUT])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
-    cameras = _surveyed_cameras(config)
-    scene, classes = replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
+    relief = build_relief(config.relief, route)
+    boxes = tuple(parts.standing(box, relief) for box in scene.boxes)
+    scene = replace(scene, paints=tuple(layout.paints), boxes=boxes, relief=relief)
+    cameras, classes = _surveyed_cameras(config), (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,
         route=route,
         renderer=Renderer(scene, classes),
         trucks=moving_trucks(config.yard, route, anew[_TRUCKS]),
-        hd_map=layout.hd_map(ORIGIN),
+        hd_map=_raised(layout.hd_map(ORIGIN), relief),
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
-        driven=drive_along(route, config.route, config.disturbance, anew[_POSES]),
+        driven=drive_along(
+            route, config.route, config.disturbance, anew[_POSES], partial(stands, relief) if relief else None
+        ),
     )
+
+
+def _raised(hd_map: HdMap, relief: Relief | None) -> HdMap:
+    """The map with the heights of its ground."""
+    if relief is None:
+        return hd_map
+    markings = (replace(one, heights_m=relief.height_m(one.corners_map)) for one in hd_map.markings)
+    lanes = (replace(one, heights_m=relief.height_m(one.points_map)) for one in hd_map.lanes)
+    return replace(hd_map, markings=tuple(markings), lanes=tuple(lanes))
 
 
 def _check(config: PortConfig) -> None:

@@ -215,6 +215,35 @@ class SurfaceConfig:
 
 
 @dataclass(kw_only=True)
+class ReliefConfig:
+    """Heights of the ground, which is a plane where none is given. Slopes are metres up per metre.
+
+    Attributes:
+        grade: slope along the map's x axis, in which the route begins.
+        crown: slope down to both sides of the route, for 10 m.
+        ramp: slope up in the route's direction between ``ramp_at_m`` and ``ramp_length_m`` later.
+        bank: slope up to the left of the route there.
+        ramp_at_m: way along the route where the ramp begins.
+        ramp_length_m: of the ramp; its slopes ease in and out over 12 m.
+        gully_m: depth of gullies along the route, on both sides.
+        gully_offset_m: of the gullies from the route.
+        kerb_m: height of a kerb to the left of the route, beyond which the ground is as high.
+        kerb_offset_m: of the kerb from the route.
+    """
+
+    grade: float = 0.0
+    crown: float = 0.0
+    ramp: float = 0.0
+    bank: float = 0.0
+    ramp_at_m: float = 0.0
+    ramp_length_m: float = 25.0
+    gully_m: float = 0.0
+    gully_offset_m: float = 4.5
+    kerb_m: float = 0.0
+    kerb_offset_m: float = 6.0
+
+
+@dataclass(kw_only=True)
 class YardConfig:
     """Things that stand and drive in the port, and the light.
 
@@ -309,5 +338,6 @@ class PortConfig:
     route: RouteConfig = field(default_factory=RouteConfig)
     paint: PaintConfig = field(default_factory=PaintConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    relief: ReliefConfig = field(default_factory=ReliefConfig)
     yard: YardConfig = field(default_factory=YardConfig)
     exposure: ExposureConfig = field(default_factory=ExposureConfig)

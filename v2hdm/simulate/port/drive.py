@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
@@ -28,10 +27,11 @@ from v2hdm.io.trajectory import read_image_list
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.simulate.port.route import measured_disturbances, pose_noise
+from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
-from v2hdm.simulate.render.scene import Box
+from v2hdm.simulate.render.scene import Box, ground_under
 from v2hdm.store.files import whole_file
 from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
@@ -41,28 +41,45 @@ _NEAR_M = 0.3
 
 
 def points_seen(
-    info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, boxes: Sequence[Box]
+    info: CameraInfo,
+    cam_from_map: FloatArray,
+    points_map: FloatArray,
+    boxes: Sequence[Box],
+    relief: Relief | None = None,
 ) -> BoolArray:
-    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not behind a box."""
+    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not hidden."""
     centre = camera_centre(cam_from_map)
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
-    seen[seen] = inside_image(info, cam_from_map, points_map[seen])
+    seen[seen] = inside_image(info, cam_from_map, points_map[seen], relief)
     near = []
     for box in boxes:
         # Before the camera, near enough, and not above all its sight lines to the ground.
         reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
-        depth = float(cam_from_map[2, :2] @ np.array(box.centre_map) + cam_from_map[2, 3])
-        if box.base_m < centre[2] and -reach < depth < _FARTHEST_M + reach:
+        depth = float(cam_from_map[2, :3] @ (*box.centre_map, box.beneath[0]) + cam_from_map[2, 3])
+        above_m = centre[2] - ground_under(box, centre[:2])
+        if box.base_m < above_m and -reach < depth < _FARTHEST_M + reach:
             near.append(box)
-    if seen.any() and near:
-        seen[seen] = ~hidden_by(near, centre, points_map[seen])
+    if seen.any() and (near or relief is not None):
+        points = _on_ground(points_map[seen], relief)
+        hidden = hidden_by(near, centre, points)
+        seen[seen] = ~(hidden if relief is None else hidden | relief.hides(centre, points))
     return np.asarray(seen)
 
 
-def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> BoolArray:
+def _on_ground(points_map: FloatArray, relief: Relief | None) -> FloatArray:
+    """Points (N, 2) with their heights, (N, 3)."""
+    heights = np.zeros(len(points_map)) if relief is None else relief.height_m(points_map)
+    return np.column_stack([points_map, heights])
+
+
+def inside_image(
+    info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, relief: Relief | None = None
+) -> BoolArray:
     """Which ground points (N, 2) fall between the image's borders."""
-    pinhole, depth_m = project_ground(info.intrinsic, cam_from_map, points_map)
-    inside = depth_m > _NEAR_M
+    points_cam = _on_ground(points_map, relief) @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
+    inside = points_cam[:, 2] > _NEAR_M
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pinhole = (points_cam @ info.intrinsic.T)[:, :2] / points_cam[:, 2:]
     # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
     margin = np.array([info.width, info.height]) * 0.25
     inside &= ((pinhole > -margin) & (pinhole < 5.0 * margin)).all(axis=1)
@@ -72,17 +89,19 @@ def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatAr
 
 
 def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
-    """Which sight lines from ``centre_map`` (3,) to ground points (N, 2) pass through a box.
+    """Which sight lines from ``centre_map`` (3,) to ground points (N, 2 or 3) pass through a box.
 
-    The slab test (Kay and Kajiya 1986) in the frame of every box.
+    The slab test (Kay and Kajiya 1986) in the frame of every box, in which its faces are level.
     """
     hidden = np.zeros(len(points_map), dtype=np.bool_)
+    points = points_map if points_map.shape[1] == 3 else _on_ground(points_map, None)
     for box in boxes:
         cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
         turn = np.array([[cos, -sin], [sin, cos]])
-        eye = np.append((centre_map[:2] - box.centre_map) @ turn, centre_map[2] - box.base_m)
-        ground = (points_map - box.centre_map) @ turn
-        ray = np.column_stack([ground, np.full(len(ground), -box.base_m)]) - eye
+        ends = np.vstack([centre_map, points])
+        above_m = ends[:, 2] - ground_under(box, ends[:, :2]) - box.base_m
+        eye, *ground = np.column_stack([(ends[:, :2] - box.centre_map) @ turn, above_m])
+        ray = np.reshape(ground, (-1, 3)) - eye
         half = np.array([box.size_m[0] / 2, box.size_m[1] / 2])
         low, high = np.append(-half, 0.0), np.append(half, box.size_m[2])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -116,9 +135,11 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Step
 def folder_of_port(config: PortConfig, cache: Path) -> Path:
     """Where a port's drive belongs in a cache: named by the port and a hash of what it is rendered from."""
     content = asdict(config)
-    # Ports that were rendered before there were visits and stencils stay the same.
+    # Ports that were rendered before there were visits, stencils and reliefs stay the same.
     if not config.visit:
         del content["visit"]
+    if config.relief == ReliefConfig():
+        del content["relief"]
     if not config.paint.stencils:
         del content["paint"]["stencils"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
@@ -211,15 +232,17 @@ def _truth(port: Port, images: list[Image]) -> Truth:
     vertices = [lane.points_map for lane in port.hd_map.lanes]
     points = np.vstack([samples.reshape(-1, 2), *vertices])
     visibility = np.zeros((len(images), len(corners)))
+    scene, relief = port.renderer.scene, port.renderer.scene.relief
     passed = np.zeros(len(points) - samples.size // 2, dtype=int)
     for i, image in enumerate(images):
         frame = i // len(port.cameras)
         camera = port.cameras[image.camera]
-        boxes = port.renderer.scene.boxes + port.moving_boxes(frame)
-        seen = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes)
+        boxes = scene.boxes + port.moving_boxes(frame)
+        seen = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes, relief)
         visibility[i] = seen[: samples.size // 2].reshape(-1, per_marking).mean(axis=1)
         on_lanes = seen[samples.size // 2 :]
-        vertices_vehicle = ground_in_vehicle(image.map_from_vehicle, points[samples.size // 2 :][on_lanes])
+        on_lane = _on_ground(points[samples.size // 2 :][on_lanes], relief)
+        vertices_vehicle = ground_in_vehicle(image.map_from_vehicle, on_lane)
         on_lanes[on_lanes] = inside_convex(camera.roi_vehicle, vertices_vehicle)
         passed += on_lanes
     flags = np.split(passed >= _LANE_SIGHTINGS, np.cumsum([len(v) for v in vertices])[:-1])

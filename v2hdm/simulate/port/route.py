@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from v2hdm.geometry.rigid import heading_rad, make_transform, rotation_from_euler
 from v2hdm.geometry.trajectory import interpolate
+from v2hdm.io.drive.road import HEIGHT_SIGMAS
 from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
 
@@ -95,11 +97,15 @@ _LEAD_S = 0.35
 
 @dataclass(frozen=True)
 class DrivenPoses:
-    """The drive in time: images at ``stamp_s`` (I,), where the vehicle truly was and what was recorded."""
+    """The drive in time: images at ``stamp_s`` (I,), where the vehicle truly was and what was recorded.
+
+    ``above_plane`` (I, 4, 4) are the true poses without the ground's heights and slopes.
+    """
 
     stamp_s: FloatArray
     map_from_vehicle: FloatArray
     recorded: Trajectory
+    above_plane: FloatArray
 
 
 def correlated_noise(
@@ -113,13 +119,22 @@ def correlated_noise(
     return np.asarray(sigma * out)
 
 
+Stands = Callable[[FloatArray, FloatArray], FloatArray]
+"""Height, roll and pitch (N, 3) that the ground gives a vehicle at points (N, 2) with headings (N,)."""
+
+
 def drive_along(
-    route: Route, config: RouteConfig, disturbance: DisturbanceConfig, rng: np.random.Generator
+    route: Route,
+    config: RouteConfig,
+    disturbance: DisturbanceConfig,
+    rng: np.random.Generator,
+    stands: Stands | None = None,
 ) -> DrivenPoses:
     """Drive a route: image times, true poses with suspension jitter, recorded poses with receiver errors.
 
-    The receiver measures position and heading; roll, pitch and height are recorded as zero. Its times
-    are not those of the images.
+    On a plane the receiver measures position and heading; roll, pitch and height are recorded as zero. Where
+    the vehicle ``stands`` otherwise, height, roll and pitch are recorded, too, without the suspension's. Its
+    times are not those of the images.
     """
     lead_m = route.speed_mps * _LEAD_S
     stations = np.arange(lead_m, route.length_m - lead_m, config.image_spacing_m)
@@ -134,7 +149,11 @@ def drive_along(
     jitter = correlated_noise(stamp_s, sigma, disturbance.jitter_correlation_s, rng, 2)
     jitter += rng.normal(0.0, sigma, (len(stamp_s), 2))
     heave = correlated_noise(stamp_s, disturbance.heave_m, disturbance.jitter_correlation_s, rng)
-    true = _poses(route.points_at(station), heave[:, 0], jitter, route.yaw_at(station))
+    at, yaw = route.points_at(station), route.yaw_at(station)
+    true = above_plane = _poses(at, heave[:, 0], jitter, yaw)
+    if stands is not None:
+        ground = stands(at, yaw)
+        true = _poses(at, ground[:, 0] + heave[:, 0], ground[:, 1:] + jitter, yaw)
 
     station = route.station_at(recorded_s)
     points = route.points_at(station)
@@ -143,8 +162,15 @@ def drive_along(
     sigma = np.deg2rad(disturbance.heading_deg) / np.sqrt(2.0)
     yaw = route.yaw_at(station) + rng.normal(0.0, sigma, len(recorded_s))
     yaw += correlated_noise(recorded_s, sigma, disturbance.heading_correlation_s, rng)[:, 0]
-    level = np.zeros((len(recorded_s), 2))
-    return DrivenPoses(stamp_s, true, Trajectory(recorded_s, _poses(points, level[:, 0], level, yaw)))
+    ground = np.zeros((len(recorded_s), 3))
+    if stands is not None:
+        ground = stands(route.points_at(station), route.yaw_at(station))
+        drift, over_m = disturbance.rtk_correlated_m, disturbance.rtk_correlation_m
+        errors = correlated_noise(station, drift, over_m, rng)[:, 0]
+        errors += rng.normal(0.0, disturbance.rtk_white_m, len(errors))
+        ground[:, 0] += HEIGHT_SIGMAS * errors
+    recorded = Trajectory(recorded_s, _poses(points, ground[:, 0], ground[:, 1:], yaw))
+    return DrivenPoses(stamp_s, true, recorded, above_plane)
 
 
 def _poses(points: FloatArray, height: FloatArray, tilt: FloatArray, yaw: FloatArray) -> FloatArray:
@@ -172,7 +198,7 @@ def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:
 def measured_disturbances(config: DisturbanceConfig, driven: DrivenPoses) -> dict[str, float]:
     """The configured standard deviations, per axis, and under ``actual_`` their values at the images."""
     recorded, _ = interpolate(driven.recorded, driven.stamp_s, np.inf)
-    true = driven.map_from_vehicle
+    true = driven.above_plane
     tilt = np.stack([true[:, 2, 0], true[:, 2, 1]])
     turned = np.angle(np.exp(1j * (heading_rad(recorded) - heading_rad(true))))
 

@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.geometry.planar import densified
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render import kernels
+from v2hdm.simulate.render.relief import Relief, meet_ground
 from v2hdm.simulate.render.scene import (
     Float32,
     Ground,
@@ -34,6 +36,8 @@ from v2hdm.simulate.render.view import (
 
 _FARTHEST_M = 400.0
 _SHADOWS_TO_M = 90.0
+_NEAR_M = 0.05
+_DRAPED_M = 1.0  # between points of an outline on a relief
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class GroundField:
 
     ``x_m``, ``y_m`` are map coordinates, ``depth_m`` runs along the optical axis, ``footprint_m`` is the
     ground length of a pixel along the ray. Pixels above the horizon have ``below`` False and are far away.
+    ``rays`` are two (H, W): pinhole pixels at which the plane beneath the camera shows what pixels show.
+    ``slope`` are those of the ground by x and y, None where it is a plane.
     """
 
     first_row: int
@@ -50,6 +56,8 @@ class GroundField:
     depth_m: Float32
     footprint_m: Float32
     below: NDArray[np.bool_]
+    rays: tuple[Float32, Float32]
+    slope: tuple[Float32, Float32] | None = None
 
     @property
     def planes(self) -> tuple[Float32, Float32, Float32]:
@@ -58,7 +66,9 @@ class GroundField:
 
 
 def intersect_ground(view: View) -> GroundField | None:
-    """Where the pixels' rays meet the plane z = 0, or None when no pixel looks down."""
+    """Where the pixels' rays meet the ground, or None when no pixel looks at it."""
+    if view.relief is not None:
+        return _intersect_relief(view, view.relief)
     info = view.rays.info
     map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
     centre = view.centre_map
@@ -74,7 +84,28 @@ def intersect_ground(view: View) -> GroundField | None:
     x = _plane(view, map_from_ray[0], rows) * depth + np.float32(centre[0])
     y = _plane(view, map_from_ray[1], rows) * depth + np.float32(centre[1])
     footprint = depth * depth * np.float32(1.0 / (info.intrinsic[1, 1] * centre[2]))
-    return GroundField(first, x, y, depth, footprint, below[rows])
+    rays = view.rays.u_pinhole_px, view.rays.v_pinhole_px
+    return GroundField(first, x, y, depth, footprint, below[rows], rays)
+
+
+def _intersect_relief(view: View, relief: Relief) -> GroundField | None:
+    info, rays = view.rays.info, (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
+    found, below = np.empty((6, *rays[0].shape), dtype=np.float32), np.empty(rays[0].shape, dtype=np.bool_)
+    map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
+    at, per_focal = view.centre_map, float(1.0 / info.intrinsic[1, 1])
+    meet_ground(relief.placed, rays, map_from_ray, at, _FARTHEST_M, per_focal, found, below)
+    ground_rows = np.flatnonzero(below.any(axis=1))
+    if len(ground_rows) == 0:
+        return None
+    # A homography of the plane: the images of its origin and of the points a metre along x and y.
+    origin, along_x, along_y = view.homogeneous_px(view.on_plane(np.array([[0.0, 0], [1, 0], [0, 1]])))
+    u, v, depth = (
+        found[0] * a + found[1] * b + c
+        for a, b, c in np.column_stack([along_x - origin, along_y - origin, origin]).astype(np.float32)
+    )
+    depth = np.where(depth > _NEAR_M, depth, np.float32(np.inf))
+    x, y, far, footprint, by_x, by_y = found[:, (first := int(ground_rows[0])) :]
+    return GroundField(first, x, y, far, footprint, below[first:], (u / depth, v / depth), (by_x, by_y))
 
 
 def _plane(view: View, row: NDArray[np.float64], rows: slice) -> Float32:
@@ -190,8 +221,11 @@ def _penumbra_px(shadow: Shadow, view: View) -> FloatArray:
 
 
 def on_ground_px(view: View, polygon_map: FloatArray) -> FloatArray:
-    """A polygon (N, 2) on the ground as homogeneous pinhole pixels (N, 3)."""
-    return view.homogeneous_px(np.column_stack([polygon_map, np.zeros(len(polygon_map))]))
+    """A polygon (N, 2) on the ground as homogeneous pinhole pixels (M, 3); on a relief with more points."""
+    if view.relief is not None:
+        longest_m = float(np.linalg.norm(polygon_map - following_row(polygon_map), axis=1).max())
+        polygon_map = densified(polygon_map, int(np.ceil(longest_m / _DRAPED_M)))
+    return view.homogeneous_px(view.on_ground(polygon_map))
 
 
 def inward_lines(polygon: NDArray[np.float64]) -> Float32:
@@ -224,27 +258,28 @@ class PaintLayer:
         self._paints = paints
         self._label = {kind: label for label, kind in enumerate(classes, start=1)}
         most = max((len(p.polygon_map) for p in paints), default=3)
-        self._vertices = np.zeros((len(paints), most, 3))
+        self._vertices = np.zeros((len(paints), most, 2))
         for row, paint in zip(self._vertices, paints, strict=True):
             polygon = np.asarray(paint.polygon_map, dtype=np.float64)
-            row[: len(polygon), :2] = polygon
-            row[len(polygon) :, :2] = polygon[-1]
+            row[: len(polygon)] = polygon
+            row[len(polygon) :] = polygon[-1]
 
     def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
         """Paint onto the ground field's ``albedo`` (H', W, 3) and into ``labels`` (H, W)."""
-        homogeneous = view.homogeneous_px(self._vertices)
-        seen = in_view(view, homogeneous, _FARTHEST_PAINT_M)
+        seen = in_view(view, view.homogeneous_px(view.on_ground(self._vertices)), _FARTHEST_PAINT_M)
         paints = [self._paints[index] for index in seen]
-        polygons = [homogeneous[k, : len(one.polygon_map)] for k, one in zip(seen, paints, strict=True)]
-        rays, first = (view.rays.u_pinhole_px, view.rays.v_pinhole_px), field.first_row
+        flat = view.homogeneous_px(view.on_plane(self._vertices[seen]))
+        polygons = [own[: len(one.polygon_map)] for own, one in zip(flat, paints, strict=True)]
+        draped = [on_ground_px(view, one.polygon_map) for one in paints] if view.relief else None
+        first = field.first_row
         tiles = [_WEAR_TILE, MEDIUM_TILE, fine_tile("asphalt")]
         padded = tuple(tile.padded for tile in tiles)
-        for paint, shape in zip(paints, outlines(view, polygons), strict=True):
+        for paint, shape in zip(paints, outlines(view, polygons, draped), strict=True):
             if shape is None:
                 continue
             shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
             kernels.draw_paint(
-                *bands_of(view, shape, first), first, edges_of(shape), rays, field.planes, padded,
+                *bands_of(view, shape, first), first, edges_of(shape), field.rays, field.planes, padded,
                 np.array([scale_of(tile, shift) for tile in tiles], dtype=np.float32), _look(paint),
                 self._label[paint.kind], albedo, labels,
             )  # fmt: skip

@@ -31,7 +31,7 @@ from v2hdm.simulate.render.scene import (
     Picture,
     Scene,
     Shadow,
-    box_footprint,
+    box_faces,
     box_shadow,
     noise_tile,
     sample,
@@ -66,9 +66,7 @@ def draw_boxes(
     centre = view.centre_map
     if not boxes:
         return
-    footprints = np.array([box_footprint(box) for box in boxes])
-    levels = np.array([[box.base_m, box.base_m + box.size_m[2]] for box in boxes])
-    corners = np.concatenate([np.insert(footprints, 2, level[:, None], axis=2) for level in levels.T], axis=1)
+    corners = np.array([box_faces(box).reshape(8, 3) for box in boxes])
     visible = [boxes[k] for k in in_view(view, view.homogeneous_px(corners), _FARTHEST_M)]
 
     def distance(box: Box) -> float:
@@ -85,19 +83,17 @@ def draw_boxes(
 
 
 def _faces(box: Box) -> list[_Face]:
-    footprint = box_footprint(box)
-    low, high = box.base_m, box.base_m + box.size_m[2]
+    low, high = box_faces(box)
     faces = []
     pictures = (*box.pictures, *(None,) * 6)
     for k in range(4):
-        a, b = footprint[k], footprint[(k + 1) % 4]
+        after = (k + 1) % 4
+        a, b = low[k, :2], low[after, :2]
         along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
-        corners = np.array([[*a, low], [*b, low], [*b, high], [*a, high]])
+        corners = np.array([low[k], low[after], high[after], high[k]])
         faces.append(_Face(corners, np.array([along[1], -along[0], 0.0]), True, pictures[k]))
-    for level, up, picture in ((high, 1.0, pictures[4]), (low, -1.0, None)):
-        if level > 0:
-            corners = np.column_stack([footprint, np.full(4, level)])
-            faces.append(_Face(corners, np.array([0.0, 0.0, up]), False, picture))
+    for corners, up, picture in ((high, 1.0, pictures[4]), (low, -1.0, None)):
+        faces.append(_Face(corners, np.array([0.0, 0.0, up]), False, picture))
     return faces
 
 
@@ -227,7 +223,7 @@ class Renderer:
         in the scene for this image only. ``before_lens`` draws on the radiance (H, W, 3) what moves with the
         camera, and sets ``hidden`` (H, W) where that is opaque.
         """
-        view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64))
+        view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64), self.scene.relief)
         labels = np.zeros((info.height, info.width), dtype=np.uint8)
         hidden = np.zeros((info.height, info.width), dtype=np.bool_)
         boxes = self.scene.boxes + moving_boxes
@@ -271,7 +267,10 @@ class Renderer:
         self._paint.draw(view, ground, albedo, labels)
         sun = on_ground.sun_visibility(shadows, scene.shades, view, ground)
         wet = on_ground.wetness(scene.ground, ground)
-        centre = view.centre_map.astype(np.float32)
+        centre = np.append(view.centre_map[:2], view.height_m).astype(np.float32)
+        if ground.slope is not None:
+            east, north, up = scene.light.sun_direction_map
+            sun *= np.maximum(1 - (ground.slope[0] * east + ground.slope[1] * north) / max(up, 0.1), 0)
         light, height = scene.light, max(scene.light.sun_direction_map[2], 0.0)
         lights = np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr], np.float32)
         kernels.light_ground(albedo, sun, wet, (ground.x_m, ground.y_m), centre, lights)
@@ -359,8 +358,9 @@ def _flow(view: View, motion: Motion) -> Float32:
     step = _FLOW_STEP_PX
     x = (rays.u_pinhole_px[::step, ::step] - k[0, 2]) / k[0, 0]
     y = (rays.v_pinhole_px[::step, ::step] - k[1, 2]) / k[1, 1]
-    up_cam = view.cam_from_map[:3, 2]
-    inverse_depth = np.maximum(-(up_cam[0] * x + up_cam[1] * y + up_cam[2]) / view.centre_map[2], 0.0)
+    _, by_x, by_y = view.beneath
+    up_cam = view.cam_from_map[:3, :3] @ [-by_x, -by_y, 1.0]
+    inverse_depth = np.maximum(-(up_cam[0] * x + up_cam[1] * y + up_cam[2]) / view.height_m, 0.0)
     vx, vy, vz = motion.velocity_cam
     wx, wy, wz = motion.angular_velocity_cam
     flow_x = (x * vz - vx) * inverse_depth + x * y * wx - (1 + x * x) * wy + y * wz

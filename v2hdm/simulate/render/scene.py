@@ -1,6 +1,6 @@
 """A scene: the ground, the paint on it, what stands on it, the light; and the endless textures of them all.
 
-Everything lies in the ``map`` frame of :mod:`v2hdm.records` (metres, z up, ground at z = 0).
+Everything lies in the ``map`` frame of :mod:`v2hdm.records` (metres, z up, ground at z = 0 or on a relief).
 Colours are linear reflectances or radiances in blue, green, red order, as OpenCV stores them.
 
 Textures are seamless tiles of noise, sampled in metres and faded out where they would alias. A tile is
@@ -12,7 +12,7 @@ its amplitude therefore fades with the pixel's footprint (frequency clamping, No
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from v2hdm.records import FloatArray
+from v2hdm.simulate.render.relief import Relief
 
 Float32 = NDArray[np.float32]
 
@@ -163,8 +164,9 @@ class Box:
     """An upright cuboid that hides what lies behind it and casts a shadow: container, truck, wall, pole.
 
     ``centre_map`` is the centre of its footprint, ``size_m`` its length, width and height,
-    ``base_m`` the height of its lower side. ``pictures`` are of its left, rear, right and front side and its
-    top, as seen from outside, in place of the colour; None leaves that.
+    ``base_m`` the height of its lower side above the ground, whose height beneath the centre and slopes by x
+    and y are ``beneath``: on a slope it is sheared. ``pictures`` are of its left, rear, right and front side
+    and its top, as seen from outside, in place of the colour; None leaves that.
     """
 
     centre_map: tuple[float, float]
@@ -172,6 +174,7 @@ class Box:
     yaw_rad: float = 0.0
     albedo_bgr: Bgr = (0.3, 0.3, 0.3)
     base_m: float = 0.0
+    beneath: tuple[float, float, float] = (0.0, 0.0, 0.0)
     corrugated: bool = False
     pictures: tuple[Picture | None, ...] = ()
     seed: int = 0
@@ -222,6 +225,7 @@ class Scene:
     shades: tuple[Shade, ...] = ()
     light: Light = field(default_factory=Light)
     backdrop: Backdrop = field(default_factory=Backdrop)
+    relief: Relief | None = None
 
 
 def convex_hull(points: FloatArray) -> FloatArray:
@@ -239,6 +243,26 @@ def placed(shape: FloatArray, centre_map: FloatArray | tuple[float, float], yaw_
 def box_footprint(box: Box) -> FloatArray:
     """The four corners (4, 2) of a box's base in the map, counter-clockwise."""
     return placed(RECTANGLE * (box.size_m[0] / 2, box.size_m[1] / 2), box.centre_map, box.yaw_rad)
+
+
+def ground_under(box: Box, points_map: FloatArray) -> FloatArray:
+    """Heights (N,) at points (N, 2) of the plane on which a box stands."""
+    return np.asarray(box.beneath[0] + (points_map - box.centre_map) @ box.beneath[1:])
+
+
+def box_faces(box: Box) -> FloatArray:
+    """The corners (2, 4, 3) of a box's lower and upper face, counter-clockwise from above."""
+    faces, footprint = np.empty((2, 4, 3)), box_footprint(box)
+    faces[..., :2] = footprint
+    faces[0, :, 2], faces[1, :, 2] = box.base_m, box.base_m + box.size_m[2]
+    if any(box.beneath):
+        faces[..., 2] += ground_under(box, footprint)
+    return faces
+
+
+def standing(box: Box, relief: Relief | None) -> Box:
+    """The box on the ground of a relief."""
+    return box if relief is None else replace(box, beneath=relief.plane_of(box_footprint(box)))
 
 
 def box_shadow(box: Box, light: Light, softness_m: float = 0.08) -> Shadow:

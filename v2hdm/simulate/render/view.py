@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray, IntArray
 from v2hdm.simulate.render import kernels
+from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.scene import Float32
 
 _GRID_STEP_PX = 8
@@ -68,10 +69,11 @@ def camera_rays(info: CameraInfo) -> Rays:
 
 @dataclass(frozen=True)
 class View:
-    """A camera at ``cam_from_map`` (4 x 4)."""
+    """A camera at ``cam_from_map`` (4 x 4), over a ``relief`` or else over the plane z = 0."""
 
     rays: Rays
     cam_from_map: FloatArray
+    relief: Relief | None = None
 
     @property
     def centre_map(self) -> FloatArray:
@@ -82,6 +84,28 @@ class View:
         """Map points (..., 3) as homogeneous pinhole pixels (..., 3), the last element their depth in m."""
         cam = points_map @ self.cam_from_map[:3, :3].T + self.cam_from_map[:3, 3]
         return np.asarray(cam @ self.rays.info.intrinsic.T)
+
+    @cached_property
+    def beneath(self) -> FloatArray:
+        """Height, m, and slopes by x and y (3,) of the plane that touches the ground beneath the camera."""
+        return np.zeros(3) if self.relief is None else self.relief.with_slopes(self.centre_map[:2])
+
+    @property
+    def height_m(self) -> float:
+        """How high above the ground the camera is."""
+        return float(self.centre_map[2] - self.beneath[0])
+
+    def on_plane(self, points_map: FloatArray) -> FloatArray:
+        """Points (..., 2) on the plane that touches the ground beneath the camera, (..., 3)."""
+        height_m, *slope = self.beneath
+        z = height_m + (points_map - self.centre_map[:2]) @ slope
+        return np.concatenate([points_map, z[..., None]], axis=-1)
+
+    def on_ground(self, points_map: FloatArray) -> FloatArray:
+        """Points (..., 2) on the ground, (..., 3)."""
+        if self.relief is None:
+            return self.on_plane(points_map)
+        return np.concatenate([points_map, self.relief.height_m(points_map)[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -96,13 +120,18 @@ class Outline:
     boundary_px: FloatArray
 
 
-def outlines(view: View, polygons: Sequence[FloatArray]) -> list[Outline | None]:
-    """The outlines of polygons of homogeneous pinhole pixels (N, 3); None for those out of view."""
+def outlines(
+    view: View, polygons: Sequence[FloatArray], draped: Sequence[FloatArray] | None = None
+) -> list[Outline | None]:
+    """The outlines of polygons of homogeneous pinhole pixels (N, 3); None for those out of view.
+
+    Their boundaries are those of ``draped`` (M, 3), if given: where an image shows what lies on a relief.
+    """
     if not polygons:
         return []
     count, points = np.array([len(polygon) for polygon in polygons]), np.concatenate(polygons)
     ends = np.cumsum(count)
-    parts = _visible_parts(view, polygons, points, ends - count)
+    parts = _visible_parts(view, polygons if draped is None else draped)
     place = np.arange(1, len(points) + 1)
     place[ends - 1] = ends - count
     following = points[place]
@@ -147,16 +176,15 @@ def following_row(array: FloatArray) -> FloatArray:
     return np.concatenate([array[1:], array[:1]])
 
 
-def _visible_parts(
-    view: View, polygons: Sequence[FloatArray], points: FloatArray, begins: IntArray
-) -> list[FloatArray]:
-    """The parts (M, 3) of homogeneous polygons, whose ``points`` follow, in front of and near the image."""
+def _visible_parts(view: View, polygons: Sequence[FloatArray]) -> list[FloatArray]:
+    """The parts (M, 3) of homogeneous polygons in front of and near the image."""
+    begins = np.cumsum([0, *(len(polygon) for polygon in polygons[:-1])])
     u0, v0, u1, v1 = view.rays.bounds
     sides = [[1.0, 0.0, _MARGIN_PX - u0], [-1.0, 0.0, u1 + _MARGIN_PX]]
     sides += [[0.0, 1.0, _MARGIN_PX - v0], [0.0, -1.0, v1 + _MARGIN_PX]]
     limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
-    inside = points @ limits.T >= least
+    inside = np.concatenate(polygons) @ limits.T >= least
     whole = np.all(np.logical_and.reduceat(inside, begins), axis=1).tolist()
     near = np.all(np.logical_or.reduceat(inside, begins), axis=1).tolist()
     parts = [polygon if one else polygon[:0] for polygon, one in zip(polygons, near, strict=True)]

@@ -133,20 +133,26 @@ def check_result(
     return findings
 
 
+_OVER_PLANES = ("ground residual", "poses against ground")
+"""Checks of images against bare ground, which they take for a plane around each image."""
+
+
 def over_ground(findings: Iterable[Finding], best: MethodResult, is_tried: bool) -> list[Finding]:
     """The findings on the inputs as the map answers them, of which the ground is a surface or a plane.
 
-    Where it is a surface no bend matters. A small one in the recorded heights is their noise if a surface was
-    tried (``is_tried``, as ``mapping.ground=auto`` has it) and explained the markings no better.
+    Where it is a surface no bend matters, nor what warns of images that do not move as over a plane. A small
+    bend in the recorded heights is their noise if a surface was tried (``is_tried``, as
+    ``mapping.ground=auto`` has it) and explained the markings no better.
     """
     if best.hd_map.ground:
-        fine, answered = "the ground bends, and is mapped as a surface", tuple(Status)
+        fine = "the ground bends, and is mapped as a surface"
+        answered = {"road": tuple(Status), **dict.fromkeys(_OVER_PLANES, (Status.WARN,))}
     else:
         fine = "the recorded heights bend, but what the markings show is a plane"
-        answered = (Status.WARN,) if is_tried else ()
+        answered = {"road": (Status.WARN,)} if is_tried else {}
     return [
         replace(one, status=Status.PASS, says=fine, limit=None)
-        if one.check == "road" and one.status in answered
+        if one.status in answered.get(one.check, ())
         else one
         for one in findings
     ]
