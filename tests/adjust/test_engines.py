@@ -10,7 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
-from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
+from v2hdm.adjust import (
+    ControlPoints,
+    Drift,
+    KnownLengths,
+    PoseSigma,
+    SolveOptions,
+    Status,
+    model,
+    score_faults,
+    solve,
+)
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.engines.autograd import TorchEngine
@@ -260,3 +270,19 @@ def test_residuals_and_gradients_of_a_solve_by_torch_are_those_of_kornia(monkeyp
     for one in evaluated:
         assert min(one[name] for name in ("transform_points", "project_points", "exp")) > 0
     assert calls["project_points"] > len(evaluated)
+
+
+def test_score_tests_are_the_same_by_either_engine():
+    problem = make_scene().problem
+    numba, by_torch = (
+        {
+            (one.fault, one.camera, one.axis, one.item): one
+            for one in score_faults(problem, solve(problem, each))
+        }
+        for each in (SolveOptions(engine="numba"), SolveOptions(engine="torch"))
+    )
+    assert numba.keys() == by_torch.keys()
+    for key, one in numba.items():
+        np.testing.assert_allclose(
+            [by_torch[key].value, by_torch[key].gain], [one.value, one.gain], rtol=1e-3
+        )

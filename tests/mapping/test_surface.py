@@ -13,7 +13,7 @@ from tests.benchmarks.made.draw import draw
 from tests.benchmarks.right_drives import Job, map_one
 from tests.cameras import apply, level
 from tests.ports import small_port
-from v2hdm.adjust import SolveOptions, height_information, solve
+from v2hdm.adjust import SolveOptions, height_information, moves_with_heights, solve
 from v2hdm.association.surface import KNOTS_M, Paths, Recorded, Surface
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
@@ -284,6 +284,16 @@ def test_a_step_of_heights_is_that_to_the_least_cost_of_everything_anew(engine):
     sigma = information[0, 0] ** -0.5
     assert sigma == pytest.approx(bend**-0.5, rel=0.05)
     assert -gradient[0] / information[0, 0] == pytest.approx(-slope / bend, abs=0.05 * sigma)
+    held = moves_with_heights(middle, heights[:, None])
+    moved = (high.corners_map - low.corners_map) / 0.02
+    np.testing.assert_allclose(held.corners[..., 0], moved, atol=0.05 * np.abs(moved).max())
+    turned = high.cam_from_vehicle @ np.linalg.inv(low.cam_from_vehicle) / 0.02
+    np.testing.assert_allclose(
+        held.extrinsic[:, :3, 0], turned[:, :3, 3], atol=0.05 * np.abs(turned[:, :3, 3]).max()
+    )
+    wider = replace(middle.covariance, held=held)
+    more = wider.corners(np.array([[0, 1]])) - middle.covariance.corners(np.array([[0, 1]]))
+    np.testing.assert_allclose(more[0], np.outer(*2 * [held.corners[:2].ravel()]), atol=1e-12)
 
 
 @pytest.fixture(scope="module")

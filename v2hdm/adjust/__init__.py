@@ -18,7 +18,7 @@ from v2hdm.adjust.problem import (
 )  # fmt: skip
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
-from v2hdm.adjust.sensitivity import height_information
+from v2hdm.adjust.sensitivity import height_information, moves_with_heights
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.validation import Verdict, line_variance_factor
@@ -26,6 +26,6 @@ from v2hdm.adjust.validation import Verdict, line_variance_factor
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
     "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
-    "height_information", "line_variance_factor", "observability", "pose_innovations", "predicts_better",
-    "score_faults", "select_model", "sigmas_of", "solve", "with_model",
+    "height_information", "line_variance_factor", "moves_with_heights", "observability", "pose_innovations",
+    "predicts_better", "score_faults", "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

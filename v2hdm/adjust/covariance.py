@@ -23,6 +23,15 @@ _FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved for together
 
 
 @dataclass(frozen=True)
+class Moves:
+    """How the solution moves with B independent errors, of one sigma each, of what a solve takes as known."""
+
+    corners: FloatArray  # (N, 2, B) m
+    extrinsic: FloatArray  # (C, 6, B) left tangents
+    poses: FloatArray  # (J, 6, B) tangents
+
+
+@dataclass(frozen=True)
 class Covariance:
     """Marginal covariances at the solution, of whatever was estimated beside marginalised out.
 
@@ -31,6 +40,7 @@ class Covariance:
     """
 
     descent: Descent
+    held: Moves | None = None  # with what was held, and is uncertain as well
 
     @property
     def whitening(self) -> Whitening:
@@ -39,7 +49,8 @@ class Covariance:
 
     def extrinsic(self) -> FloatArray:
         """Covariance (C, 6, 6) of each camera's left tangent: translation m, rotation rad."""
-        return np.stack([block[:6, :6] for block in self._cameras()])
+        own = np.stack([block[:6, :6] for block in self._cameras()])
+        return own if self.held is None else own + self.held.extrinsic @ self.held.extrinsic.swapaxes(1, 2)
 
     def clock_s2(self) -> FloatArray:
         """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is.
@@ -70,7 +81,7 @@ class Covariance:
             tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
             root = whitening.reduced_factor.solve(torch.cat([tiles, tip]))
             out[own.cpu().numpy()] = root.square().sum(0).view(len(own), 6).cpu().numpy()
-        return out
+        return out if self.held is None else out + np.square(self.held.poses).sum(axis=2)
 
     def camera_information(self) -> FloatArray:
         """Marginal information (C (6 + Q), C (6 + Q)) of the cameras' left tangents and clock offsets."""
@@ -80,7 +91,11 @@ class Covariance:
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
         parts = np.array_split(groups, min(max(-(-groups.size // _at_once(self.whitening)), 1), len(groups)))
-        return np.concatenate([self._corners(part) for part in parts])
+        own = np.concatenate([self._corners(part) for part in parts])
+        if self.held is None:
+            return own
+        moved = self.held.corners[groups].reshape(*own.shape[:2], -1)
+        return own + moved @ moved.swapaxes(1, 2)
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays

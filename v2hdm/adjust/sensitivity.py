@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.covariance import Moves
 from v2hdm.adjust.model import Estimate, Gradient, points_in_camera, prior_residuals, rigid, robustified
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
@@ -117,7 +118,6 @@ class Sensitivity:
         estimated = self._along(self._coupling(column))
         return {name: column.get(name, torch.zeros_like(row)) - row for name, row in estimated.items()}
 
-    @torch.no_grad()
     def _along(self, whitened: Tensor) -> Rows:
         """Derivatives of all residuals along a step of all that is estimated, whitened."""
         base, arrays = self.whitening.estimate, self.arrays
@@ -163,7 +163,7 @@ class Sensitivity:
 
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, one after another, (R,)."""
-        return np.concatenate([rows[name].flatten().cpu().numpy() for name in self.residuals])
+        return np.concatenate([rows[name].detach().flatten().cpu().numpy() for name in self.residuals])
 
     @cached_property
     def _stretch_of(self) -> tuple[IntArray, IntArray]:
@@ -235,3 +235,23 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()
     gradient[seen] -= (coupled @ solved.whitening.gradient).cpu().numpy()
     return information, gradient
+
+
+def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
+    """How a solution moves with B errors of the heights (K, B), m, of what its observations show."""
+    solved = Sensitivity.at(solution.covariance.whitening)
+    whitening, arrays = solved.whitening, solved.arrays
+    weighted = raised(solved, torch.ones_like(solved.root))["observations"] * solved.root
+    corners, extrinsic, poses = [], [], []
+    for column in torch.as_tensor(heights[arrays.order.cpu().numpy()].T).to(weighted):
+        whitened = whitening.whiten([whitening.pull(weighted * column)])[0]
+        step, tangents, own = whitening.step(whitened)
+        at = whitening.linearised.evaluate(step, tangents, own).estimate
+        corners.append(whitening.estimate.corners_map - at.corners_map)
+        extrinsic.append(-step.extrinsic)
+        poses.append(-step.frame_state)
+    of_corners = np.empty((*whitening.estimate.corners_map.shape, len(corners)))
+    of_corners[arrays.corner_order.cpu().numpy()] = torch.stack(corners, dim=-1).cpu().numpy()
+    of_poses = np.zeros((arrays.frame_count, 6, len(poses)))
+    of_poses[:, list(arrays.states)] = torch.stack(poses, dim=-1).cpu().numpy()
+    return Moves(of_corners, torch.stack(extrinsic, dim=-1).cpu().numpy(), of_poses)

@@ -65,6 +65,7 @@ _SURE_M = 1e-7  # of its end
 _STEP_PX = 0.5  # of the differences by pixel
 _LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell from the road's, all the way
 _MOST_RECORDED = 500  # places of the path whose records are taken, evenly
+_FORGOTTEN = 1e-3  # share of the variance of all heights that is left out with the many errors that are small
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
 
 FILE = "ground.json"  # in a result folder
@@ -279,6 +280,14 @@ class Surface:
         for axis in (0, 1):
             plane = plane + diags_array(away[:, axis]) @ stands[1 + axis][frame]
         return csr_array(self._columns(*self.paths.beside(points_map, frame)) - plane)
+
+    def seen_errors_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
+        """Independent errors (K, B), one sigma each, of :meth:`seen_height_m`: those that matter of them."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        errors = self.seen_columns(points_map, frame) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        squared, ways = np.linalg.eigh(errors.T @ errors)
+        rest = np.cumsum(squared) > _FORGOTTEN * squared.sum()
+        return np.asarray(errors @ ways[:, rest])
 
     def seen_height_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Heights (K,) of the ground at points (K, 2) above the planes that frames (K,) stand on."""

@@ -21,6 +21,7 @@ from v2hdm.adjust import (
     Status,
     estimate_noise,
     height_information,
+    moves_with_heights,
     predicts_better,
     select_model,
 )
@@ -198,6 +199,7 @@ class Optimiser:
         ``ungated`` was over all; ``usable`` (S, 4) are the corners accepted. Raises MappingError where no
         candidate is accepted.
         """
+        final = self._with_errors_of_ground(final)
         located = locate(self.sightings, final.rig)
         located.informs[:] &= usable
         fused = fuse_groups(final.association, located, jitter_rad=0.0)
@@ -246,6 +248,18 @@ class Optimiser:
             initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
             suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
         )
+
+    def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
+        """``bundle``, less sure of everything by what is not known of the heights it was solved over."""
+        if self.surface is None:
+            return bundle
+        frame = self._seen.frame[bundle.row]
+        if bundle.knots is not None:
+            frame = np.concatenate([frame, bundle.knots.frame])
+        points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
+        held = moves_with_heights(bundle.solution, self.surface.seen_errors_m(points_map, frame))
+        covariance = replace(bundle.solution.covariance, held=held)
+        return replace(bundle, solution=replace(bundle.solution, covariance=covariance))
 
     def _counts(self, rig: Rig, bundle: Bundle, accepted: BoolArray, corners_map: FloatArray) -> Counts:
         """How often candidates of corners (G, 4, 2) were seen, by observations (K,), accepted or not."""
