@@ -25,7 +25,7 @@ def quiet(*_):
 def config(memory, tmp_path):
     make_drive(tmp_path / "drive")
     drive = DriveConfig(path=str(tmp_path / "drive"))
-    return RunConfig(drive=drive, output=f"{memory}/results", cache=str(tmp_path / "local"))
+    return RunConfig(mosaic=False, drive=drive, output=f"{memory}/results", cache=str(tmp_path / "local"))
 
 
 class Work:

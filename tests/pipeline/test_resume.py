@@ -100,7 +100,7 @@ def test_a_finished_result_is_known_without_torch(site):
         "import sys\n"
         "from v2hdm.pipeline.config import DriveConfig, RunConfig\nfrom v2hdm.pipeline.run import run\n"
         f"run(RunConfig(name='short', drive=DriveConfig(path={str(site / 'drive')!r}), workers=1,"
-        f" output={str(site / 'first')!r}, cache={str(site / 'cache')!r}))\n"
+        f" mosaic=False, output={str(site / 'first')!r}, cache={str(site / 'cache')!r}))\n"
         "print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
@@ -156,7 +156,7 @@ def put(cache, stage, *rest):
     return found
 StageCache.put = put
 drive = DriveConfig(path=sys.argv[1])
-run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], workers=1))
+run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], workers=1, mosaic=False))
 """
 
 
