@@ -16,7 +16,7 @@ from v2hdm.records import CameraInfo, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud
 from v2hdm.site.lanes import map_lanes
-from v2hdm.site.options import LaneOptions
+from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.polygons import Polygon
 from v2hdm.site.symbols import NO_POLYGON, map_symbols
@@ -251,7 +251,7 @@ def outline_px(shape, pose, cam_from_vehicle):
 
 def mapped(symbols, rig, markings=()):
     """The symbols of the map."""
-    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, 0.9)[0]
+    return map_symbols(symbols, rig, INFOS, JITTER_RAD, markings, AcceptanceOptions())[0]
 
 
 def overlap(one, other):
@@ -337,7 +337,7 @@ def test_chevrons_letters_and_own_symbols_have_the_vertices_of_their_template(sh
 
 def test_an_outline_that_no_simple_polygon_explains_is_left_out_by_class_and_reason(monkeypatch):
     bow = np.array([[7.0, 0.5], [8.2, 1.5], [8.2, 0.5], [7.0, 1.5]])
-    given = *seen([bow] * 5, ["bow"] * 5, np.arange(5.0)), INFOS, JITTER_RAD, (), 0.9
+    given = *seen([bow] * 5, ["bow"] * 5, np.arange(5.0)), INFOS, JITTER_RAD, (), AcceptanceOptions()
     for crossing in (None, Polygon(bow, *3 * [1e-6 * np.eye(8)], 0.0, 1.0)):
         if crossing:
             monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_, one=crossing: [one])
@@ -364,7 +364,7 @@ def test_where_other_paint_cuts_an_arrow_its_template_says_how_long_it_is_or_it_
     shapes = [short + places[0]] * 4 + [ARROW + at for at in places[1:] for _ in ways_m]
     symbols, rig = seen(shapes, ["arrow"] * len(shapes), (1 + others) * ways_m)
     symbols = replace(symbols, seen=tuple([own] * 4) + symbols.seen[4:])
-    found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), 0.9)
+    found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), AcceptanceOptions())
     if others:
         arrow = min(found, key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0]))
         assert corner_errors_m(arrow, ARROW + places[0]).max() < 0.05
@@ -430,7 +430,9 @@ def test_paint_that_is_a_marking_is_no_symbol():
 def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m, reason):
     way_m = step_m * np.arange(8)
     shapes = [ARROW + AT + [x, 0.0] for x in way_m]
-    found, (left_out,) = map_symbols(*seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), 0.9)
+    found, (left_out,) = map_symbols(
+        *seen(shapes, ["arrow"] * 8, way_m), INFOS, JITTER_RAD, (), AcceptanceOptions()
+    )
     assert not found
     assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)
 
@@ -444,4 +446,4 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
     behind = [outline_px(ARROW + AT, pose, back) for pose in rig.map_from_vehicle[3:]]
     symbols = of_outlines(symbols, (*symbols.outlines_pinhole_px[:3], *behind))
     symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]))
-    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), 0.9)[0]) == 1
+    assert len(map_symbols(symbols, both, INFOS * 2, JITTER_RAD, (), AcceptanceOptions())[0]) == 1

@@ -421,3 +421,11 @@ def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_wor
     ]
     counts.log_odds[7] = 7.0
     assert verdict(candidates, counts).verdict[7] is None
+
+
+def test_residuals_without_bound_leave_a_corner_with_a_finite_variance():
+    squared, freedom = np.full((10, 4), 16.0), np.full((10, 4), 16.0)
+    squared[3, 2] = np.inf
+    scatter = scatter_of(squared, freedom)
+    assert np.isfinite(scatter).all()
+    assert scatter[3, 2] > 1e3 * scatter[0, 0]

@@ -20,7 +20,7 @@ from v2hdm.pipeline.config import RunConfig, check_choice
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.pipeline.run import RunResult
 from v2hdm.records import Calibration, Exclusion, HdMap
-from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.candidates import TOO_UNCERTAIN
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.goal import _corner_radii_m, check_goal, ground_ahead
 

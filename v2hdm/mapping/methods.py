@@ -283,9 +283,10 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
-    odds = options.acceptance.min_probability
     seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
-    symbols, no_symbols = map_symbols(seen, bundle.rig, infos, jitter_rad, optimised.markings, odds)
+    symbols, no_symbols = map_symbols(
+        seen, bundle.rig, infos, jitter_rad, optimised.markings, options.acceptance
+    )
     for kind, count in Counter(one.kind for one in no_symbols if one.reason == NO_POLYGON).items():
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)

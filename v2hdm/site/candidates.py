@@ -19,7 +19,7 @@ CORRELATION = 0.2
 
 _KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
 
-LACKS_A_CORNER = "a corner was never seen twice"
+TOO_UNCERTAIN, LACKS_A_CORNER = "its position is too uncertain", "a corner was never seen twice"
 
 _OTHER_EDGE_M = 0.3
 """Sigma, m, of where a sighting sees an edge of the same marking that others do not: a worn end's, as in the
@@ -161,6 +161,7 @@ def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, fl
 def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
     """How many times the usual the variance (G, 4) of corners' images is, at least once, by all corners'."""
     known = freedom > 0
+    squared = np.minimum(squared, _LARGEST * np.maximum(freedom, 1.0))  # infinite in the camera's plane
     scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])
     after = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))
     return np.asarray(np.where(known, np.maximum(after / scale, 1.0), 1.0))

@@ -29,7 +29,8 @@ from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_g
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, Exclusion, FloatArray, IntArray, Marking, Symbol
-from v2hdm.site.candidates import LACKS_A_CORNER
+from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
+from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.polygons import LEAST_EXPLAINED, UNSEEN_M, Polygon, Traces, find_polygons
 
@@ -52,13 +53,13 @@ def map_symbols(
     infos: Sequence[CameraInfo],
     jitter_rad: float,
     markings: Sequence[Marking],
-    min_probability: float,
+    options: AcceptanceOptions,
 ) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
     """The symbols that at least three images show, and those that are no polygons on the ground.
 
     ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
-    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. A symbol
-    lies on the ground with ``min_probability``.
+    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. Symbols
+    are held to the same ``options`` as markings.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
@@ -84,7 +85,7 @@ def map_symbols(
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
         # The border may cut one end in some images, and a shadow hide it: then the other tells.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
-        objections = [measure_parallax(view, 1).objections(min_probability)[0] for view in views]
+        objections = [measure_parallax(view, 1).objections(options.min_probability)[0] for view in views]
         if None in objections:
             found.append(Symbol(kind, outline, len(camera)))
             sides = [symbols.seen[n] for n in rows[own]]
@@ -94,7 +95,7 @@ def map_symbols(
     polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
     kept = []
     for symbol, one in zip(found, polygons, strict=True):
-        reason = _objection(one)
+        reason = _objection(one, options.max_sigma_m)
         if reason is None:
             kept.append(_with_vertices(symbol, one, markings))
         else:
@@ -102,12 +103,14 @@ def map_symbols(
     return tuple(kept), tuple(left_out)
 
 
-def _objection(polygon: Polygon) -> str | None:
+def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
     """Why a polygon is not the shape of a symbol, None if nothing says so."""
     if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
         return NO_POLYGON
     variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
-    return LACKS_A_CORNER if variance_m2.max() > UNSEEN_M**2 else None
+    if variance_m2.max() > UNSEEN_M**2:
+        return LACKS_A_CORNER
+    return TOO_UNCERTAIN if variance_m2.max() > max_sigma_m**2 else None
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:

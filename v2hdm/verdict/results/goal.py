@@ -15,8 +15,7 @@ from scipy.optimize import brentq
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import Calibration, FloatArray, Marking
-from v2hdm.site.candidates import LACKS_A_CORNER
-from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.verdict.results.solution import doubted, name_of_input, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status
 

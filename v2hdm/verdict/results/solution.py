@@ -31,8 +31,7 @@ from v2hdm.mapping.recovery import (
 )
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
-from v2hdm.site.candidates import LACKS_A_CORNER
-from v2hdm.site.markings import TOO_UNCERTAIN
+from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results.agreement import (
     check_against_ground,
