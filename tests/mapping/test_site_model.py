@@ -429,3 +429,22 @@ def test_residuals_without_bound_leave_a_corner_with_a_finite_variance():
     scatter = scatter_of(squared, freedom)
     assert np.isfinite(scatter).all()
     assert scatter[3, 2] > 1e3 * scatter[0, 0]
+
+
+def bend(radius_m=15.0, apart_m=6.0):
+    """Dashes of two lines, ever farther beside the middle of a bend, and twelve of the straight before it."""
+    dashes = []
+    for side in (-1, 1):
+        for k, beside_m in enumerate(np.linspace(0.8, 2.6, 10)):
+            radius, angle = radius_m + side * beside_m, k * apart_m / radius_m
+            turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            place = [radius * np.sin(angle), radius_m - radius * np.cos(angle)]
+            dashes.append(DASH * [radius / radius_m, 1.0] @ turned + place)
+    return np.array(dashes + [DASH - [10.0 + apart_m * k, 0.0] for k in range(12)])
+
+
+def test_dashes_of_a_bend_are_as_much_longer_as_they_stand_farther_apart():
+    true = bend()
+    found = of_one_class(solved(true, np.random.default_rng(23), 0.005))
+    assert found.probability[:, WRONG_END].max() < 0.02
+    assert np.sqrt(np.diagonal(found.candidates.covariance_m2, axis1=1, axis2=2)).max() < 0.05

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import betaln, logsumexp
 from scipy.stats import f, norm, t
 
@@ -62,6 +63,7 @@ far at most they lie beside an arc between them: lines are farther apart."""
 
 _SERIES_UNEVEN = 0.2  # share by which the ways to the dash before and to the next differ where none lacks
 _SERIES_STRETCH = 1.5  # most by which a bend stretches or shrinks a line: 4 m beside a middle of 12 m radius
+_SERIES_NEAR = 32  # dashes nearest to one, among which those of its line are looked for
 _SERIES_LEAST = 3  # dashes of their class's length that others follow: enough for a median
 
 _MISPLACED_M = 0.3  # sigma, m, of a worn end or a corner from another edge (17 worn ends: .08 to .74 m)
@@ -466,14 +468,15 @@ def _in_series(
     length_m, rows = np.linalg.norm(sides, axis=2).max(axis=1), np.arange(len(sides))
     axis = sides[rows, np.linalg.norm(sides, axis=2).argmax(axis=1)] / length_m[:, None]
     centre = candidates.corners_map.mean(axis=1)
-    to = centre - centre[:, None]
-    along = np.einsum("ijk,ik->ij", to, axis)
+    near = cKDTree(centre).query(centre, min(_SERIES_NEAR, len(centre)))[1].reshape(len(centre), -1)
+    to, others = centre[near] - centre[:, None], axis[near]
+    along, alike = np.einsum("nki,ni->nk", to, axis), np.einsum("nki,ni->nk", others, axis)
     across = to[..., 1] * axis[:, None, 0] - to[..., 0] * axis[:, None, 1]
-    alike = axis @ axis.T
+    across_other = to[..., 0] * others[..., 1] - to[..., 1] * others[..., 0]
     turn = np.arccos(np.clip(np.abs(alike), 0.0, 1.0))
     # The chord between two points of a circle makes equal angles with the tangents there.
-    beside_m = np.abs(across - np.sign(alike) * across.T) / 2
-    follows = (weight > 0.5) & (np.abs(along) > length_m[:, None])
+    beside_m = np.abs(across - np.sign(alike) * across_other) / 2
+    follows = (weight[near] > 0.5) & (np.abs(along) > length_m[:, None])
     follows &= (turn < _SERIES_TURN_RAD) & (beside_m < _SERIES_BESIDE_M)
     arc_m = np.linalg.norm(to, axis=2) / np.sinc(turn / 2 / np.pi)
     ahead, behind = (np.where(follows & (sign * along > 0), arc_m, np.inf).min(axis=1) for sign in (1, -1))
