@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -126,6 +126,17 @@ class TiledMatrix:
         return cls(pattern, values, columns, tiles[TIP, TIP], tiles, np.array(keys), np.array(at))
 
 
+class _Flat(NamedTuple):
+    """A factor as kernels read it."""
+
+    values: FloatArray  # all tiles but the tip
+    at: IntArray  # (G,) where each column begins among the values
+    rows: IntArray  # of the vector that all panels act on
+    begin: IntArray  # (G + 1,) where each panel's begin among the rows
+    size: int  # rows and columns of a tile
+    tip: FloatArray
+
+
 @dataclass(frozen=True)
 class TiledCholesky:
     """L of a positive definite matrix in tiles of ``size``, the tip last."""
@@ -147,16 +158,16 @@ class TiledCholesky:
         return torch.cat([tile.diagonal() for tile in (*self.diagonal, self.tip)]).square()
 
     @cached_property
-    def _flat(self) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
-        """The values, where each column begins among them, all panels' rows, and where each panel's begin."""
+    def _flat(self) -> _Flat:
         at = np.array([tile.storage_offset() for tile in self.diagonal])
-        begin = np.cumsum([0, *map(len, self.rows)])
-        return self.values.numpy(), at, torch.cat(self.rows).numpy(), begin
+        begin, tip = np.cumsum([0, *map(len, self.rows)]), np.ascontiguousarray(self.tip.numpy())
+        rows = torch.cat(self.rows).numpy()
+        return _Flat(self.values.numpy(), at, rows, begin, len(self.diagonal[0]), tip)
 
     def _substitute(self, substitute: Callable[..., None], right: Tensor) -> Tensor:
         """Solve for one column by a kernel: a loop over tiles takes Python ten times as long."""
         out = right[:, 0].clone(memory_format=torch.contiguous_format)
-        substitute(*self._flat, len(self.diagonal[0]), np.ascontiguousarray(self.tip.numpy()), out.numpy())
+        substitute(self._flat, out.numpy())
         return out[:, None]
 
     def _is_one_column(self, right: Tensor) -> bool:
@@ -222,16 +233,9 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
 
 
 @kernel
-def _substitute_forward(
-    values: FloatArray,
-    at: IntArray,
-    rows: IntArray,
-    begin: IntArray,
-    size: int,
-    tip: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Overwrite b with L^-1 b, of what :attr:`TiledCholesky._flat` lists."""
+def _substitute_forward(factor: _Flat, out: FloatArray) -> None:
+    """Overwrite b with L^-1 b."""
+    values, at, rows, begin, size, tip = factor
     for g in range(len(at)):
         own = g * size
         for i in range(size):
@@ -253,16 +257,9 @@ def _substitute_forward(
 
 
 @kernel
-def _substitute_backward(
-    values: FloatArray,
-    at: IntArray,
-    rows: IntArray,
-    begin: IntArray,
-    size: int,
-    tip: FloatArray,
-    out: FloatArray,
-) -> None:
+def _substitute_backward(factor: _Flat, out: FloatArray) -> None:
     """Overwrite b with L^-T b."""
+    values, at, rows, begin, size, tip = factor
     own = len(out) - len(tip)
     for i in range(len(tip) - 1, -1, -1):
         out[own + i] /= tip[i, i]

@@ -47,7 +47,10 @@ class Detector:
 
     @classmethod
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
-        """Load ``path``, ``options.model`` or the shipped model; raises DetectorError where it fails."""
+        """Load a model: ``path``, else ``options.model``, else the one that is shipped.
+
+        Raises DetectorError where the model cannot be used, or the shipped files do not belong together.
+        """
         options = options or DetectorOptions()
         check_weights()
         path = path if path is not None else options.model
@@ -56,7 +59,10 @@ class Detector:
     def detect(
         self, image_bgr: np.ndarray, camera: Camera
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
-        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError."""
+        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
+
+        Raises DetectorError where the image is not of that form or not of the camera's size.
+        """
         output = self.run_network(image_bgr, camera)
         with lap("propose"):
             found = self.propose(output, camera)

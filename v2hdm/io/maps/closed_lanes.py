@@ -62,17 +62,16 @@ def connections(lanes: Sequence[ClosedLane], lines_map: Sequence[FloatArray]) ->
 
 def _next_along(lanes: Sequence[ClosedLane], side: str) -> dict[int, int]:
     """For each lane that has one, the next lane along the line on one ``side`` of both."""
-    starts: dict[tuple[int, bool], list[tuple[int, int]]] = {}
+    starts: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    ends = []
     for number, lane in enumerate(lanes):
         line, order = getattr(lane, side)
-        ahead = bool(order[-1] > order[0])
-        starts.setdefault((line, ahead), []).append((int(order[0]) if ahead else -int(order[0]), number))
+        turn = 1 if order[-1] > order[0] else -1
+        starts.setdefault((line, turn), []).append((turn * int(order[0]), number))
+        ends.append(((line, turn), turn * int(order[-1])))
     after = {}
-    for number, lane in enumerate(lanes):
-        line, order = getattr(lane, side)
-        ahead = bool(order[-1] > order[0])
-        end = int(order[-1]) if ahead else -int(order[-1])
-        beyond = [start for start in starts[line, ahead] if start[0] >= end]
+    for number, (way, end) in enumerate(ends):
+        beyond = [start for start in starts[way] if start[0] >= end]
         if beyond:
             after[number] = min(beyond)[1]
     return after
