@@ -134,11 +134,8 @@ class Proposal:
 
         A shaft may be taken for a dash, and a head for a diamond, but hardly either for a stop line.
         """
-        cells, odds, alike = (
-            np.count_nonzero(self.blob.level > 0),
-            -_TOUCHING,
-            catalogue.of_family(SYMBOL, OTHER),
-        )
+        cells, odds = np.count_nonzero(self.blob.level > 0), -_TOUCHING
+        alike = catalogue.of_family(SYMBOL, OTHER)
         for part in parts:
             if not part.blob.parts and part.blob.kind not in alike:
                 named = _NAMED_OF_SYMBOL.get(catalogue.classes[part.blob.kind].group, _SELDOM_NAMED)

@@ -35,9 +35,7 @@ _SIGMA_PX, _SIGMA_WEIGHT = 0.5, 10.0
 _TURN_SIGMA_RAD = 0.25  # by how much a piece of outline is turned against its edge
 _ROUND_PX = 3.0  # how far from a corner, px, the network rounds it
 _STRAY, _STRAY_PX = 0.2, 25.0  # share of an outline that lies along no edge, and how far off it may be, px
-LEAST_EXPLAINED = (
-    1 - 2 * _STRAY
-)  # share of outlines along a polygon's edges, below which it is not their shape
+LEAST_EXPLAINED = 1 - 2 * _STRAY  # least share of the outlines that lies along the edges of their polygon
 
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline that sightings share
 UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices of which images say little beside that guess
