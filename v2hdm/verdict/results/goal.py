@@ -25,7 +25,10 @@ _CIRCLE_95 = 2.4477  # radius, in sigmas of a coordinate, where both have the sa
 
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
-    """The map, in the frame of ``poses`` or ``survey``, against the 95 % radius ``goal_m``; each mounting."""
+    """The map against the largest 95 % radius ``goal_m``, then each mounting.
+
+    ``frame`` is what the map's frame rests on, ``poses`` or ``survey``.
+    """
     markings, goal = best.hd_map.markings, f"; goal {100 * goal_m:g} cm"
     if markings:
         radius_m = np.array([_corner_radii_m(one) for one in markings])
@@ -93,7 +96,10 @@ def _corner_radii_m(marking: Marking) -> FloatArray:
 
 
 def _radius_of_all_m(radius_m: FloatArray) -> float:
-    """The radius that holds 95 % of all corners, each within its own (N,) at 95 % of a circular normal."""
+    """The radius that holds 95 % of all corners, given the radius (N,) that holds each with 95 %.
+
+    Errors are circular normal: with 1 - .05^((r / own)^2) a corner lies within r.
+    """
     if np.mean(np.isfinite(radius_m)) < _SHARE:
         return float("inf")
 
@@ -113,7 +119,10 @@ def _own_m(marking: Marking) -> float:
 
 
 def ground_ahead(calibration: Calibration) -> tuple[float, str]:
-    """The 95 % radius, m, to which a mounting knows the ground at least 10 m ahead, inf; what would help."""
+    """The 95 % radius, m, of a ground point as a mounting places it, and what would make it smaller.
+
+    The point is where the camera looks, or 10 m ahead where that is farther; infinite if unknown.
+    """
     moves, covariance = _ground_jacobian(calibration.cam_from_vehicle), calibration.covariance
     if covariance is None:
         return float("inf"), "it saw no marking of the map"
