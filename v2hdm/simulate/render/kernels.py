@@ -63,7 +63,7 @@ def _fade(footprint_m: Any, per_wave: Any) -> Any:
 
 @exactly_inlined
 def _coverage(edges: NDArray[np.float32], u: Any, v: Any) -> Any:
-    """How much of a pixel an outline covers; see :func:`v2hdm.simulate.render.view.coverage`."""
+    """How much of a pixel an outline covers, by its edges (:func:`.view.edges_of`)."""
     count = len(edges)
     if count == 4:
         first = _clip(u * edges[0, 0] + v * edges[0, 1] + edges[0, 2], _ZERO, _ONE)
