@@ -12,11 +12,15 @@ from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
 from v2hdm.ground.adjust import _by_stretch
-from v2hdm.ground.patches import read_grey
+from v2hdm.ground.model import guessed_mount
+from v2hdm.ground.motion import motion_of
+from v2hdm.ground.patches import Matcher, read_grey
+from v2hdm.ground.prior import Stated
+from v2hdm.ground.start import contradicts
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.records import Trajectory
-from v2hdm.verdict.inputs.ground import scaled
+from v2hdm.verdict.inputs.ground import scaled, upside_down
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
 FEW = GroundOptions(pairs=14, clock_pairs=6, readings=False, free=())
@@ -154,6 +158,23 @@ def test_a_floor_without_texture_over_the_noise_tells_nothing(tmp_path, contrast
 def test_a_rough_floor_that_lies_elsewhere_contradicts_the_poses(tmp_path, grain):
     feet = scaled(make_drive(tmp_path, 0.0, TRUE, 20.0, grain), 1 / 0.3048)
     assert estimate_ground(feet, "front", FEW).status is GroundStatus.NO_MATCH
+
+
+@pytest.mark.parametrize(
+    ("spoil", "wrong"),
+    [
+        (lambda drive: drive, False),
+        (lambda drive: with_guess(drive, extrinsic(roll_deg=0.0, pitch_deg=25.0, yaw_deg=4.0)), False),
+        (lambda drive: scaled(drive, 0.3048), True),
+        (lambda drive: scaled(drive, 1 / 0.3048), True),
+        (upside_down, True),
+    ],
+)
+def test_the_motion_that_images_show_tells_wrong_poses_from_a_wrong_guess(straight, spoil, wrong):
+    drive = spoil(straight)
+    camera, motion = drive.cameras["front"], motion_of(drive, "front", Reading.AS_GIVEN)
+    stated = Stated(drive, camera, motion, guessed_mount(camera))
+    assert contradicts(Matcher(drive, "front", motion), stated) is wrong
 
 
 def test_ground_that_matches_but_is_too_little_to_solve_for_contradicts_nothing(straight):

@@ -22,7 +22,7 @@ from v2hdm.ground.results import (
     Parameter,
     Reading,
 )
-from v2hdm.ground.start import Readings, contradicts, start_pairs, try_readings
+from v2hdm.ground.start import Readings, contradicts, try_readings
 from v2hdm.records import Calibration, Drive, PoseNoise
 from v2hdm.workers import share_out
 
@@ -109,9 +109,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
             solved = solved or _solve(matcher, stated, start.mount, options, _HELD_STAGES)
         if solved is not None:
             out = _found(out, solved, options.free)
-        elif out.status is GroundStatus.NO_MATCH and not contradicts(
-            matcher, stated.guess, start_pairs(stated), start.share
-        ):
+        elif out.status is GroundStatus.NO_MATCH and not contradicts(matcher, stated):
             out = replace(out, status=GroundStatus.NO_TEXTURE)
     return replace(out, seconds=time.perf_counter() - began_s)
 

@@ -300,15 +300,10 @@ class Matcher:
         observations = Observations(pairs[pair, 0], pairs[pair, 1], first_px, second_px, pair)
         return Round(observations, sought, len(pair) / sought if sought else 0.0)
 
-    def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> tuple[int, float]:
-        """How many patches of first images are found again in the second ones, anywhere, and their share."""
-        roi, here = self._roi, np.eye(4)
-        found = [
-            match_anywhere(View(self._read(a), mount, here), View(self._read(b), mount, here), roi, grid_m)
-            for a, b in pairs.tolist()
-        ]
-        count, sought = sum(map(len, found)), sum(one.sought for one in found)
-        return count, count / sought if sought else 0.0
+    def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> list[Matches]:
+        """Patches of first images that are found again in the second ones, anywhere, by pair (P, 2)."""
+        views = [[View(self._read(row), mount, np.eye(4)) for row in pair] for pair in pairs.tolist()]
+        return [match_anywhere(first, second, self._roi, grid_m) for first, second in views]
 
     def _read(self, row: int) -> ImageArray:
         """The image of a row of the motion, as grey values."""

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.ground.adjust import adjust
-from v2hdm.ground.model import Mount
+from v2hdm.ground.model import Mount, hit_ground
 from v2hdm.ground.motion import changing_pairs, motion_of, spread_pairs
-from v2hdm.ground.patches import Matcher
+from v2hdm.ground.patches import Matcher, Matches
 from v2hdm.ground.prior import Stated
 from v2hdm.ground.results import Reading
-from v2hdm.records import Drive, IntArray
+from v2hdm.records import Drive, FloatArray, IntArray
 
 _PAIRS, _GRID_M = 10, 0.06
 # Distance between the images of a pair that a start is found by: a wrong guess shifts the ground by a part
@@ -34,6 +35,9 @@ _APART_M = (1.2, 2.8)
 _TURN_RAD = np.deg2rad(2)  # a turn between the images of a pair that is no noise of the path
 _READING_SEARCH_M = 0.6
 _RIVAL = 0.5  # as given, the share of matching patches must not fall below this part of another reading's
+# Factor by which the ground may move otherwise than stated: under guesses 10 deg off in pitch it moves .75 to
+# 1.06 times as far, and positions in feet make it 3.3 times.
+_STRETCHED = 2.0
 # Share from which on another reading is one: on even asphalt of real roads a fifth of the patches match.
 _CLEAR_SHARE = 0.2
 
@@ -71,14 +75,35 @@ def start_pairs(stated: Stated) -> IntArray:
     return pairs
 
 
-def contradicts(matcher: Matcher, guess: Mount, pairs: IntArray, share: float) -> bool:
-    """Whether ground that does not match in ``pairs`` says that something stated is wrong.
+def contradicts(matcher: Matcher, stated: Stated) -> bool:
+    """Whether ground that does not match in the pairs of a start says that something stated is wrong.
 
-    It does where enough patches are found again, by no pose and no clock, and far fewer as stated: only their
-    ``share``. Where they are found nowhere it is the texture that lacks, which says nothing.
+    It does where enough patches are found again, by no pose and no clock, and the vehicle moved between most
+    images by less than half or more than twice as far as stated, or turned otherwise: no error of the guess
+    does that. Where they are found nowhere it is the texture that lacks, which says nothing.
     """
-    count, anywhere = matcher.match_anywhere(guess, pairs[:: -(-len(pairs) // _PAIRS)], _GRID_M)
-    return count >= _LEAST_MATCHES and _RIVAL * anywhere > share
+    pairs = start_pairs(stated)
+    pairs = pairs[:: -(-len(pairs) // _PAIRS)]
+    found = matcher.match_anywhere(stated.guess, pairs, _GRID_M)
+    if sum(map(len, found)) < _LEAST_MATCHES:
+        return False
+    far, turns_rad = [], []
+    for matches, (first, second) in zip(found, stated.poses()[pairs], strict=True):
+        seen = _motion(matches, stated.guess) if len(matches) else None
+        if seen is not None:
+            moved = np.linalg.inv(first) @ second
+            ahead = moved[:2, 3]
+            far.append(seen[:, 2] @ ahead / (ahead @ ahead))
+            turns_rad.append(heading_rad(seen[:, :2].T @ moved[:2, :2]))
+    return bool(not 1 / _STRETCHED < np.median(far) < _STRETCHED or np.median(np.abs(turns_rad)) > _TURN_RAD)
+
+
+def _motion(matches: Matches, mount: Mount) -> FloatArray | None:
+    """Pose (2, 3) of the vehicle at the second image in that at the first, but for a common scale."""
+    here = np.broadcast_to(np.eye(4), (len(matches), 4, 4))
+    first, second = (hit_ground(mount, px, here).points_map for px in (matches.first_px, matches.second_px))
+    known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    return cv2.estimateAffinePartial2D(second[known], first[known])[0]
 
 
 def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, guess: Mount) -> Start:

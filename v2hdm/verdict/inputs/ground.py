@@ -62,7 +62,7 @@ NO_MATCH = (
 _UNTOLD = {
     GroundStatus.TOO_LITTLE: "too little ground is in view, or too little motion, to check lens, clock and "
     "mounting by it: drive further, or widen roi_vehicle",
-    GroundStatus.NO_TEXTURE: "the ground shows too little texture over the images' noise to check lens and "
+    GroundStatus.NO_TEXTURE: "too little of the ground is found again in other images to check lens and "
     "mounting by it: drive by day or with more light, shorter exposure, or on rougher ground",
 }
 
