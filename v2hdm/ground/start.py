@@ -103,7 +103,8 @@ def _motion(matches: Matches, mount: Mount) -> FloatArray | None:
     here = np.broadcast_to(np.eye(4), (len(matches), 4, 4))
     first, second = (hit_ground(mount, px, here).points_map for px in (matches.first_px, matches.second_px))
     known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
-    return cv2.estimateAffinePartial2D(second[known], first[known])[0]
+    found, _ = cv2.estimateAffinePartial2D(second[known], first[known])
+    return None if found is None else found.astype(np.float64)
 
 
 def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, guess: Mount) -> Start:
