@@ -179,6 +179,7 @@ def adjusted_shots(
 
 
 TILE_PX = 64  # side of a tile, px of the canvas
+_NODE_PX = 8  # distance of the points of a tile at which the lens is evaluated, px of the canvas
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
@@ -324,9 +325,12 @@ class _Sums:
         self._tiles = np.unique(np.concatenate([tiles for _, tiles in views]), axis=0)
         self._at = {(int(c), int(r)): k for k, (c, r) in enumerate(self._tiles)}
         self._sums = torch.zeros((len(self._tiles), 4, TILE_PX, TILE_PX), device=device)
-        self._pixels = torch.cartesian_prod(*2 * [torch.arange(TILE_PX, device=device)]).flip(1)
-        x, y = (self._pixels / TILE_PX).T
-        self._across = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=1)
+        at = torch.arange(0, TILE_PX + 1, _NODE_PX, device=device).float()
+        self._nodes = torch.cartesian_prod(at, at).flip(1)
+        x, y = (self._nodes / TILE_PX).T
+        self._from_corners = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=1)
+        apart = (torch.arange(TILE_PX, device=device)[:, None] - at).abs()
+        self._from_nodes = (1 - apart / _NODE_PX).clamp(min=0)  # hat functions (TILE_PX, nodes)
 
     def add(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> None:
         """Add an image to the tiles (T, 2) of (column, row) that it shows."""
@@ -340,25 +344,33 @@ class _Sums:
         self._sums.index_add_(0, at, values)
 
     def _warp(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
-        """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...)."""
-        points = (TILE_PX * torch.from_numpy(tiles).to(self._device)[:, None] + self._pixels).float()
+        """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...).
+
+        The lens is evaluated at nodes. Times the third coordinate, where a pixel lies is linear on the ground
+        but for the lens: interpolated so, a pixel is off by 0.05 px at most (a lens of 74 deg).
+        """
+        points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
         if shot.on_plane is not None:
-            points = points + self._across @ self._moved_px(tiles, shot.on_plane, map_from_sheet).to(points)
+            points = points + self._from_corners @ self._moved_px(tiles, shot.on_plane, map_from_sheet).to(
+                points
+            )
         pinhole_px_from_sheet = shot.pinhole_px_from_map @ map_from_sheet
         homography = torch.from_numpy(pinhole_px_from_sheet).to(points)
         third = points @ homography[2, :2] + homography[2, 2]
         pinhole_px = transform_points(homography.expand(len(tiles), 3, 3), points)
         px = tensors.distort_points(source.lens.info, pinhole_px.reshape(-1, 2)).reshape(points.shape)
         height, width = source.values.shape[1:]
-        x, y = (
-            2 * (px - px.new_tensor(source.corner_px)) / px.new_tensor([width - 1, height - 1]) - 1
-        ).unbind(-1)
-        density = float(np.linalg.det(pinhole_px_from_sheet)) / third**3
-        # A tile may reach beyond the horizon, where no image shows the ground.
-        known = torch.where(
-            third > 0, torch.stack([x, y, density]), px.new_tensor([-9.0, -9.0, 0.0])[:, None, None]
+        placed = 2 * (px - px.new_tensor(source.corner_px)) / px.new_tensor([width - 1, height - 1]) - 1
+        nodes = torch.stack([*(placed * third[..., None]).unbind(-1), third])
+        side = len(self._from_nodes.T)
+        x, y, third = self._from_nodes @ nodes.reshape(3, len(tiles), side, side) @ self._from_nodes.T
+        seen = third > 0  # a tile may reach beyond the horizon, where no image shows the ground
+        depth = torch.where(seen, third, torch.ones_like(third))
+        density = float(np.linalg.det(pinhole_px_from_sheet)) / depth**3
+        out = x.new_tensor(-9.0)
+        return torch.stack(
+            [torch.where(seen, x / depth, out), torch.where(seen, y / depth, out), density * seen]
         )
-        return known.reshape(3, len(tiles), TILE_PX, TILE_PX)
 
     @staticmethod
     def _moved_px(
