@@ -179,7 +179,7 @@ def adjusted_shots(
 
 
 TILE_PX = 64  # side of a tile, px of the canvas
-_NODE_PX = 8  # distance of the points of a tile at which the lens is evaluated, px of the canvas
+_NODE_PX = 4  # distance of the points of a tile at which the lens is evaluated, px of the canvas
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
@@ -347,7 +347,7 @@ class _Sums:
         """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...).
 
         The lens is evaluated at nodes. Times the third coordinate, where a pixel lies is linear on the ground
-        but for the lens: interpolated so, a pixel is off by 0.05 px at most (a lens of 74 deg).
+        but for the lens: interpolated so, a pixel is off by .01 px at most, and by .1 px a metre from a fisheye.
         """
         points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
         if shot.on_plane is not None:
