@@ -347,7 +347,7 @@ class _Sums:
         """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...).
 
         The lens is evaluated at nodes. Times the third coordinate, where a pixel lies is linear on the ground
-        but for the lens: interpolated so, a pixel is off by .01 px at most, and by .1 px a metre from a fisheye.
+        but for the lens: interpolated so, a pixel is off by .01 px at most, by .1 px a metre from a fisheye.
         """
         points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
         if shot.on_plane is not None:
