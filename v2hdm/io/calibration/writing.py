@@ -61,7 +61,7 @@ def write_calibration(
 
 
 def _entries(calibration: Calibration) -> dict[str, Any]:
-    """What files with all of a calibration have in common: numbers, words and arrays."""
+    """The entries that files with all of a calibration share: numbers, words and arrays."""
     info, covariance = calibration.info, calibration.covariance
     return {
         "camera_name": info.name,
