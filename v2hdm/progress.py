@@ -29,7 +29,7 @@ def silent(task: str, done: int, total: int) -> None:
 
 
 def progress_lines(write: Callable[[str], None]) -> Progress:
-    """For a log: a line when a task begins and when it ends, and every ten seconds between."""
+    """A :class:`Progress` for a log: a line when a task begins and ends, and every ten seconds between."""
     written_s: dict[str, float] = {}
 
     def advance(task: str, done: int, total: int) -> None:

@@ -60,10 +60,10 @@ def main() -> None:
             print(f"{name}: no image was registered")
             continue
         mean = mean_pose(cam_from_map[known] @ recorded[known]) if of is None else of
-        off = extrinsic_metrics(mean, truth.cam_from_vehicle[given.camera])
+        turned_deg, off_m = extrinsic_metrics(mean, truth.cam_from_vehicle[given.camera]).values()
         errors = corner_errors_m(truth, rows, cam_from_map, drive.cameras[given.camera].info)
         print(
-            f"{name}: camera {off.rotation_error_deg:.3f} deg, {100 * off.translation_error_m:.1f} cm off; "
+            f"{name}: camera {turned_deg:.3f} deg, {100 * off_m:.1f} cm off; "
             f"perfect tracks of {len(errors)} corners {100 * rms(errors):.1f} cm RMSE, "
             f"median {100 * np.median(np.linalg.norm(errors, axis=1)):.1f} cm"
         )

@@ -9,7 +9,7 @@ from tests.faults.making import edit, front, write
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import ReadOptions, read_drive, truth
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.report.page import facts
+from v2hdm.store.files import read_csv
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,10 @@ def test_a_region_of_which_the_image_shows_a_part_is_taken_whatever_the_sign_of_
 
 @pytest.mark.parametrize(
     ("read", "error"),
-    [(lambda path: list(truth._rows(path, ["a", "b"])), DriveError), (facts._table, MapFileError)],
+    [
+        (lambda path: list(truth._rows(path, ["a", "b"])), DriveError),
+        (lambda path: read_csv(path, MapFileError), MapFileError),
+    ],
     ids=["truth", "result"],
 )
 def test_a_cell_that_is_longer_than_csv_takes_is_one_line(read, error, tmp_path):

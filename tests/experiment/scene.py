@@ -5,20 +5,20 @@ from typing import Any
 import numpy as np
 
 from v2hdm.experiment.plan import DriveConfig, ExperimentConfig, Site
-from v2hdm.records import DIAMOND
+from v2hdm.records import DIAMOND, LANE_LINE, HdMap, Lane, Marking, Truth
 
 DIAMOND_CORNERS = np.array([[0.5, 0.0], [0.0, 0.25], [-0.5, 0.0], [0.0, -0.25]])
 TRUE = DIAMOND_CORNERS + np.column_stack([5.0 + 4.0 * np.arange(5), np.full(5, 2.0)])[:, None]
 CALIBRATED, ESTIMATED = "calibrated", "estimated"
 
 
-def plain_map(corners: np.ndarray) -> dict[str, Any]:
-    return {"kinds": [DIAMOND] * len(corners), "corners": corners.tolist(), "sightings": [5] * len(corners)}
+def diamonds(corners: np.ndarray, lanes: tuple[Lane, ...] = ()) -> HdMap:
+    return HdMap(tuple(Marking(DIAMOND, own, 5) for own in corners), lanes)
 
 
-def shifted(metres: float, markings: int = 5) -> dict[str, Any]:
+def shifted(metres: float, markings: int = 5) -> HdMap:
     """The first true markings, all of them too far east."""
-    return plain_map(TRUE[:markings] + np.array([metres, 0.0]))
+    return diamonds(TRUE[:markings] + np.array([metres, 0.0]))
 
 
 def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) -> dict[str, Any]:
@@ -29,9 +29,10 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
         for name, count in (("front", 4), ("rear", 4), ("both", 5))
     }
     route = np.column_stack([np.linspace(0, 25, 26), np.zeros(26)]).tolist()
+    true = diamonds(TRUE, (Lane(LANE_LINE, np.array([[0.0, 1.0], [20.0, 1.0]]), 1),))
     return {
         "port": port, "seed": seed, "started_from": started_from, "route": route, "failures": [],
-        "truth": plain_map(TRUE), "true_lanes": [[[0.0, 1.0], [20.0, 1.0]]],
+        "truth": Truth(true, {}, np.empty((0, 4, 4)), np.empty((0, len(TRUE))), (), {}),
         "maps": maps,
         "expected": {name: [True] * 5 for name in maps},
     }  # fmt: skip

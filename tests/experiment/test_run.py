@@ -8,7 +8,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from matplotlib.colors import to_rgb
 
-from tests.experiment.scene import CALIBRATED, ESTIMATED, TRUE, experiment, plain_map, record
+from tests.experiment.scene import CALIBRATED, ESTIMATED, TRUE, diamonds, experiment, record
 from v2hdm.cli.compose import conf_dir, register, to_dataclass
 from v2hdm.cli.main import run
 from v2hdm.errors import ConfigError
@@ -107,7 +107,7 @@ def test_shared_markings_are_those_that_every_method_has_mapped():
     plain = record("port1", 1, CALIBRATED)
     worse = TRUE + np.array([0.01, 0.0])
     worse[3:] += np.array([0.3, 0.0])  # the two that ENI lacks
-    plain["maps"]["both"]["Opt"] = plain_map(worse)
+    plain["maps"]["both"]["Opt"] = diamonds(worse)
     row = measure(plain).rows["both"]["Opt"]
     assert row.shared == 3
     assert row.shared_rmse_m == pytest.approx(0.01)
@@ -117,7 +117,7 @@ def test_shared_markings_are_those_that_every_method_has_mapped():
 def test_errors_come_in_the_order_in_which_the_vehicle_passed():
     plain = record("port1", 1, CALIBRATED)
     shuffled = [3, 1, 4, 0, 2]
-    plain["maps"]["both"]["Opt"] = plain_map(TRUE[shuffled] + 0.01)
+    plain["maps"]["both"]["Opt"] = diamonds(TRUE[shuffled] + 0.01)
     found = measure(plain).matched["both"]["Opt"]
     assert found.true.tolist() == [0, 1, 2, 3, 4]
 

@@ -69,8 +69,8 @@ def test_extrinsic_error_is_the_angle_and_the_distance_of_the_centres():
     estimate[:3, :3] = rotation
     estimate[:3, 3] = -rotation @ [0.03, 0.0, 0.04]
     result = extrinsic_metrics(estimate, true)
-    assert result.rotation_error_deg == pytest.approx(2.0)
-    assert result.translation_error_m == pytest.approx(0.05)
+    assert result["rotation_error_deg"] == pytest.approx(2.0)
+    assert result["translation_error_m"] == pytest.approx(0.05)
 
 
 def test_a_lane_five_centimetres_aside_over_the_visible_half_is_all_of_what_was_visible():

@@ -113,17 +113,17 @@ class Arrays:
 
     @cached_property
     def frame_count(self) -> int:
-        """J."""
+        """The number of frames, J."""
         return self.vehicle_from_map.shape[0]
 
     @cached_property
     def camera_count(self) -> int:
-        """C."""
+        """The number of cameras, C."""
         return self.centre.shape[0]
 
     @cached_property
     def corner_count(self) -> int:
-        """N."""
+        """The number of corners, N."""
         return self.corner_order.shape[0]
 
     @cached_property
@@ -138,12 +138,12 @@ class Arrays:
 
     @cached_property
     def pair_count(self) -> int:
-        """P."""
+        """The number of pairs, P."""
         return self.camera_count * self.moment_count
 
     @cached_property
     def moment_count(self) -> int:
-        """M, or J where frames are moments."""
+        """The number of moments, M, or J where frames are moments."""
         return self.clock_twist.shape[0]
 
     def camera_of(self, pair: Tensor) -> Tensor:

@@ -72,7 +72,7 @@ class Observations:
 
     @property
     def columns(self) -> tuple[IntArray | FloatArray, ...]:
-        """All but the rows."""
+        """All columns but the row shares, in the order of the fields."""
         return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
 
     def take(self, rows: IntArray | BoolArray) -> Observations:
@@ -211,9 +211,9 @@ class Problem:
     visit: IntArray | None = None
 
     def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
-        """With the cameras and frames of some ``observations`` alone, and which of its own these are.
+        """The problem of the cameras and frames of ``observations`` alone, and their indices (C,), (J,) here.
 
-        What is known of corners is left out: they are those of the observations.
+        Corners are those of the observations; what this problem knows of its own is left out.
         """
         cameras, camera = np.unique(observations.camera, return_inverse=True)
         frames, frame = np.unique(observations.frame, return_inverse=True)

@@ -78,7 +78,7 @@ class Fault(Enum):
 
     @property
     def unit(self) -> str:
-        """Of the value and its sigma."""
+        """The unit of the value and its sigma; empty where it is a pure number."""
         return _UNITS.get(self, "m")
 
 

@@ -44,7 +44,7 @@ class Sensitivity:
 
     @classmethod
     def at(cls, whitening: Whitening) -> Sensitivity:
-        """That of a solution, by its Hessian."""
+        """The sensitivity at a solution, by its Hessian."""
         engine, estimate = whitening.engine, whitening.estimate
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))

@@ -130,7 +130,7 @@ class _Line(logging.LogRecord):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Be the process of a command line; returns the exit code."""
+    """Run the command line of this process; returns the exit code."""
     answer_signals()
     logging.setLogRecordFactory(_Line)
     child = os.fork() if _is_limited() else 0
@@ -152,7 +152,7 @@ def _is_limited() -> bool:
 
 
 def script() -> int:
-    """Be an old console script, such as ``v2hdm-map``."""
+    """Run an old console script, such as ``v2hdm-map``, as the command that it was."""
     name = Path(sys.argv[0]).stem.removeprefix("v2hdm-")
     return main([*_OLD.get(name, name).split(), *sys.argv[1:]])
 
@@ -188,7 +188,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
 
 
 def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add what commands that read a drive have in common; ``result`` ends the name of the default folder."""
+    """Add the arguments of commands that read a drive; ``result`` ends the name of the default folder."""
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
     parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
     parser.add_argument("--format", default="auto", help="of the drive, as folder or kitti (default: auto)")
@@ -197,7 +197,7 @@ def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
 
 
 def drive_of(parsed: argparse.Namespace) -> Drive:
-    """The drive that the arguments of :func:`add_drive` name; ``parsed.workers`` is a number of them then."""
+    """Read the drive of :func:`add_drive`; ``parsed.workers``, if 0, becomes the number of cores."""
     import cv2
 
     from v2hdm.io.drive import ReadOptions, read_drive

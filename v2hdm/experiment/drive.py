@@ -6,7 +6,7 @@ that tables, figures and text need of a finished one is there in seconds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
 from v2hdm.pipeline.survey import take_survey
 from v2hdm.progress import Progress
-from v2hdm.records import DIAMOND, LANE_LINE, Drive, FloatArray, HdMap, IntArray, Lane, Marking, Truth
+from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
 from v2hdm.simulate import rendered_drive
@@ -34,7 +34,10 @@ from v2hdm.store.cache import StageCache
 
 
 def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:
-    """The record of a drive and of its maps by every recipe; raises V2hdmError where it has no truth."""
+    """The record of a drive and of its maps by every recipe, as :func:`measure` takes it.
+
+    Raises V2hdmError where the drive cannot be read or has no truth.
+    """
     folder = Path(job.site.drive.path or "")
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))
@@ -65,8 +68,7 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
         "port": job.port,
         "seed": job.seed,
         "started_from": " and ".join(sorted({camera.initial_ipm for camera in drive.cameras.values()})),
-        "truth": _plain_map(truth.map.markings),
-        "true_lanes": [lane.points_map for lane in truth.map.lanes],
+        "truth": truth,
         "route": drive.route_map,
         "expected": {name: driven_past(drive, truth, members) for name, members in sets.items()},
         "maps": {name: {} for name in sets},
@@ -80,15 +82,7 @@ def _add(record: dict[str, Any], recipe: str, sets: Mapping[str, Mapping[str, Me
         for method, result in methods.items():
             if recipe == OURS or method not in NAIVE_IPMS:
                 row = method if recipe == OURS else f"{method}, {recipe}"
-                record["maps"][name][row] = _plain_map(result.hd_map.markings)
-
-
-def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
-    return {
-        "kinds": [marking.kind for marking in markings],
-        "corners": [marking.corners_map for marking in markings],
-        "sightings": [marking.sightings for marking in markings],
-    }
+                record["maps"][name][row] = result.hd_map
 
 
 ROWS: tuple[str, ...] = (
@@ -137,31 +131,15 @@ class Measured:
         return self.port if self.seed is None else f"{self.port} seed {self.seed}"
 
 
-def markings_of(plain: Mapping[str, Any]) -> tuple[Marking, ...]:
-    """The markings of a map in a drive's record."""
-    corners = np.array(plain["corners"], dtype=np.float64).reshape(-1, 4, 2)
-    return tuple(
-        Marking(kind, own, sightings)
-        for kind, own, sightings in zip(plain["kinds"], corners, plain["sightings"], strict=True)
-    )
-
-
-def truth_of(record: Mapping[str, Any]) -> Truth:
-    """The true map of a drive's record."""
-    true = markings_of(record["truth"])
-    lanes = tuple(Lane(LANE_LINE, np.array(line), 1) for line in record["true_lanes"])
-    return Truth(HdMap(true, lanes), {}, np.empty((0, 4, 4)), np.empty((0, len(true))), (), {})
-
-
 def measure(record: Mapping[str, Any]) -> Measured:
     """The figures of a drive's record."""
-    truth = truth_of(record)
+    truth: Truth = record["truth"]
     true = truth.map.markings
     passed = _passed(true, np.array(record["route"], dtype=np.float64))
     rows: dict[str, Mapping[str, Row]] = {}
     matched: dict[str, Mapping[str, Matched]] = {}
-    for cameras, plain_maps in record["maps"].items():
-        maps = {row: HdMap(markings_of(plain_maps[row])) for row in ROWS if row in plain_maps}
+    for cameras, by_row in record["maps"].items():
+        maps = {row: by_row[row] for row in ROWS if row in by_row}
         found = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
         shared = set(range(len(true))).intersection(*(one.true.tolist() for one in found.values()))
         expected = np.array(record["expected"][cameras], dtype=np.bool_)

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from v2hdm.experiment.drive import Matched, Measured, truth_of
+from v2hdm.experiment.drive import Matched, Measured
 from v2hdm.records import FloatArray, Truth
 from v2hdm.report import style
 
@@ -64,7 +64,7 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
     common, rows, columns = np.intersect1d(before.true, after.true, return_indices=True)
     if not len(common):
         return None
-    truth = truth_of(record)
+    truth: Truth = record["truth"]
     true = np.array([marking.corners_map for marking in truth.map.markings])[common]
     moved = {"ENI": true + before.errors_m[rows], "ONI": true + after.errors_m[columns]}
     links = np.stack([one.reshape(-1, 2) for one in moved.values()], axis=1)

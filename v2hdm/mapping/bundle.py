@@ -33,7 +33,7 @@ from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.io.maps.surveyed import match
-from v2hdm.mapping.lanes import Knots
+from v2hdm.mapping.lanes import OPEN_END_PX, Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
@@ -69,9 +69,6 @@ HEAVE_SIGMA_M = 0.01
 
 LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
-
-_OPEN_END_PX = 1000.0
-"""Sigma, px, of where along its side a corner lies that is no point: anywhere in the image."""
 
 VARIANCE_FACTORS = (0.05, 20.0)
 """Between these a detector's own statement may be corrected."""
@@ -202,7 +199,7 @@ def solve_bundle(
     knots, corners_start = lanes or (None, None)
     on_line = known_elsewhere(association, sightings.valid & usable, usable)
     at = row, association.corner_order()[row, corner]
-    observations = _observations(sightings, at, on_line, corner_index[group, corner], model)
+    observations = observations_at(sightings, at, corner_index[group, corner], model, on_line)
     first = int(corner_index.max(initial=-1)) + 1
     if knots is not None:
         observations = _joined(observations, knots.observations(first))
@@ -233,12 +230,20 @@ def solve_bundle(
     return Bundle(adjusted, model, problem, solution, association, *seen, corner_index, index, frames, knots)
 
 
-def _observations(
-    sightings: Sightings, at: tuple[IntArray, IntArray], on_line: BoolArray, corner: IntArray, model: Model
+def observations_at(
+    sightings: Sightings,
+    at: tuple[IntArray, IntArray],
+    corner: IntArray,
+    model: Model,
+    on_line: BoolArray | None = None,
 ) -> Observations:
-    """Observations of ``corner`` (K,) by corners ``at`` (row, corner; K each) of the sightings."""
-    covariance_px, ends = sightings.covariance_px[at], on_line[at]
-    covariance_px[ends] = line_only(covariance_px[ends], _OPEN_END_PX)
+    """Observations of ``corner`` (K,) by corners ``at`` (row, corner; K each) of the sightings.
+
+    Those ``on_line`` (S, 4) say on which line their corner lies, and not where on it.
+    """
+    covariance_px = sightings.covariance_px[at]
+    if on_line is not None:
+        covariance_px[on_line[at]] = line_only(covariance_px[on_line[at]], OPEN_END_PX)
     return Observations(
         camera=sightings.camera[at[0]],
         frame=sightings.frame[at[0]],

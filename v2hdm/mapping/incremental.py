@@ -26,7 +26,7 @@ from v2hdm.association.tracks import (
 )
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
-from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths
+from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths, observations_at
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
@@ -206,17 +206,8 @@ class IncrementalMapper:
         points = np.bincount(corner[self._sightings.valid[row, own]], minlength=4) > 0
         if np.count_nonzero(points) < 2:
             return None
-        sightings, model = self._sightings, self._model
         known, dense = np.unique(corner, return_inverse=True)
-        seen = Observations(
-            camera=sightings.camera[row],
-            frame=sightings.frame[row],
-            corner=dense.astype(np.int64),
-            pinhole_px=sightings.corners_pinhole_px[row, own],
-            covariance_px=model.variance_factor
-            * (sightings.covariance_px[row, own] + model.floor_px**2 * np.eye(2)),
-            row_share=sightings.row_share[row, own],
-        )
+        seen = observations_at(self._sightings, (row, own), dense.astype(np.int64), self._model)
         corners = np.full((4, 2), np.nan)
         try:
             corners[known] = self.grown.preview(Sighted(seen))

@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 _SPACING_M = 2.0  # distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle
 
 _HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
-_OPEN_END_PX = 1000.0  # sigma along the line of where an image shows it: anywhere
+OPEN_END_PX = 1000.0  # sigma along its line of what an image shows as no point: anywhere
 _SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
 
@@ -214,7 +214,7 @@ def _passing(
     own_px = OWN_SIGMA_M * (normal * (px_by_map @ left[..., None])[..., 0]).sum(axis=1)
     variance = loss * (CENTRE_SIGMA_PX**2 + own_px**2)
     covariance_px = variance[:, None, None] * normal[:, :, None] * normal[:, None]
-    covariance_px += _OPEN_END_PX**2 * line[:, :, None] * line[:, None]
+    covariance_px += OPEN_END_PX**2 * line[:, :, None] * line[:, None]
     return image, at, cloud.points_px[nearest] + off_px, covariance_px, cloud.row_share[nearest]
 
 

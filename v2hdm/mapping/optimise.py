@@ -127,9 +127,9 @@ class Optimiser:
         """``pose_noise`` is that of each visit; gates take the largest of each kind."""
         self._seen, self._views = sightings, views
         self.sightings = sightings
-        """As if all that they show lay on a plane."""
+        """The sightings, moved to where they would be if all that they show lay on a plane."""
         self.surface: Surface | None = None
-        """That of the ground, where it is not a plane."""
+        """The surface of the ground, where it is not a plane."""
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)

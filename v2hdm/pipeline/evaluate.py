@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -18,17 +18,11 @@ from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_f
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """The figures of a run."""
+def evaluate(drive: Drive, methods: CameraSets) -> tuple[dict[str, Any], list[str]]:
+    """Compare every method on every camera set with the truth, where the drive has one.
 
-    metrics: Mapping[str, Any]  # for ``metrics.json``
-    headlines: Sequence[str]  # sentences for a reader
-    truth: Truth | None  # None on a real drive
-
-
-def evaluate(drive: Drive, methods: CameraSets) -> Judgement:
-    """Compare every method on every camera set with the truth, where the drive has one."""
+    Returns the figures for ``metrics.json``, and sentences for a reader.
+    """
     truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
     for name, by_method in methods.items():
@@ -46,7 +40,7 @@ def evaluate(drive: Drive, methods: CameraSets) -> Judgement:
         disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
         headlines.insert(0, f"disturbances: {disturbed}")
     headlines += list(methods.values())[-1]["Opt"].certainty.values()
-    return Judgement(metrics, headlines, truth)
+    return metrics, headlines
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:

@@ -218,13 +218,12 @@ def _judge(
         before = over_ground(checked.findings, best, survey.mapping.ground == AUTO)
         verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])
     with context.timed("evaluate"):
-        judgement = evaluate(result.drive, methods)
+        metrics, headlines = evaluate(result.drive, methods)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
-    figures = {**judgement.metrics, **changes, "seconds": context.seconds}
-    headlines = tuple(judgement.headlines)
+    figures = {**metrics, **changes, "seconds": context.seconds}
     if compared is not None:
         figures["check_points"] = compared.figures()
-        headlines = (*headlines, compared.headline)
+        headlines.append(compared.headline)
     return replace(
         result,
         verdict=verdict,
@@ -232,6 +231,5 @@ def _judge(
         headlines=headlines,
         detections=tuple(detections),
         methods=methods,
-        judgement=judgement,
         check_points=compared,
     )

@@ -36,7 +36,7 @@ from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.camera_sets import BEST
 from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.evaluate import CameraSets, Judgement
+from v2hdm.pipeline.evaluate import CameraSets
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.photos import save_overlay
@@ -108,8 +108,7 @@ class Result:
         figures: those of ``metrics.json`` beside what it begins with.
         headlines: sentences for a reader.
         detections: in each image of ``drive``.
-        methods: results by camera set, then by method; those of all cameras come last.
-        judgement: the figures of the evaluation; None where no map was made.
+        methods: results by camera set, then by method, those of all cameras last; empty where no map came.
         check_points: a survey's check points against the map; None without any.
 
     >>> saved = result.save(folder / "port")
@@ -130,7 +129,6 @@ class Result:
     headlines: Sequence[str] = ()
     detections: Sequence[ImageDetections] = ()
     methods: CameraSets = field(default_factory=dict)
-    judgement: Judgement | None = None
     check_points: CheckTable | None = None
 
     @property
@@ -204,7 +202,7 @@ class Result:
         from v2hdm.mosaic.result import write_mosaic
         from v2hdm.report.page.document import write_page
 
-        if self.judgement is not None:
+        if self.methods:
             _write_map(folder, self, formats, crs)
             for name, methods in self.methods.items() if all_maps else ():
                 for method, made in methods.items():

@@ -38,14 +38,6 @@ class MarkingMetrics:
     corner_bias_m: float  # length of the corners' mean error vector
 
 
-@dataclass(frozen=True)
-class ExtrinsicMetrics:
-    """Angle between two camera orientations and distance of the camera centres."""
-
-    rotation_error_deg: float
-    translation_error_m: float
-
-
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
     """Which true markings (J,) the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
     plan, heights = (
@@ -135,11 +127,12 @@ def _first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[i
     return shifts
 
 
-def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> ExtrinsicMetrics:
-    """Compare two extrinsics (4 x 4 each)."""
+def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> dict[str, float]:
+    """The angle (deg) between two camera orientations (4, 4) and the distance (m) of the camera centres."""
     turn = Rotation.from_matrix(cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T)
     shift_m = camera_centre(cam_from_vehicle) - camera_centre(true_cam_from_vehicle)
-    return ExtrinsicMetrics(float(np.rad2deg(turn.magnitude())), float(np.linalg.norm(shift_m)))
+    angle_deg, distance_m = np.rad2deg(turn.magnitude()), np.linalg.norm(shift_m)
+    return {"rotation_error_deg": float(angle_deg), "translation_error_m": float(distance_m)}
 
 
 def rms(errors: FloatArray) -> float:
@@ -262,7 +255,7 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
     figures = {"yaw_change_deg": yaw, "pitch_change_deg": pitch, "roll_change_deg": roll}
     figures |= {f"{axis}_change_m": float(value) for axis, value in zip("xyz", shift_m, strict=True)}
     if true is not None:
-        figures |= asdict(extrinsic_metrics(estimate, true))
+        figures |= extrinsic_metrics(estimate, true)
     return figures
 
 

@@ -130,10 +130,16 @@ def file_digest(path: Path) -> str:
 
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     """The mapping at the top of a YAML file, whose keys are texts; else raises ``error``, with the line."""
-    content = read_yaml(path, error)
-    if not isinstance(content, dict):
-        raise error(f"{path}: expected 'key: value' entries, got {shown(content)}; see its description")
-    return content
+    return take_mapping(read_yaml(path, error), str(path), error)
+
+
+def read_csv(path: Path, error: type[V2hdmError]) -> list[list[str]]:
+    """The rows of a CSV file; raises ``error``, with the line, where it is none."""
+    reader = csv.reader(io.StringIO(read_text(path, error)))
+    try:
+        return list(reader)
+    except csv.Error as failure:
+        raise error(f"{path}: line {reader.line_num}: {failure}; mend that line") from None
 
 
 def dump_yaml(content: Mapping[str, Any]) -> str:

@@ -177,9 +177,7 @@ def _camera(
 ) -> CameraInfo:
     """The checked camera; ``size_at`` names width and height in errors."""
     width, height = (take_size_px(one, at, DriveError) for one, at in zip(size, size_at, strict=True))
-    info = CameraInfo(name, width, height, matrix, *lens)
-    check_camera(info, where, DriveError)
-    return info
+    return check_camera(CameraInfo(name, width, height, matrix, *lens), where, DriveError)
 
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:

@@ -115,7 +115,8 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
     if intrinsic[0, 0] <= 0 or intrinsic[1, 1] <= 0 or zeros.any() or intrinsic[2, 2] != 1:
         raise DriveError(f"{at}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it")
-    return _checked(CameraInfo(name, width, height, intrinsic, model, tuple(distortion.tolist())), where)
+    info = CameraInfo(name, width, height, intrinsic, model, tuple(distortion.tolist()))
+    return check_camera(info, where, DriveError)
 
 
 def _coefficients_of(model: str, where: str, advice: str) -> int:
@@ -124,11 +125,6 @@ def _coefficients_of(model: str, where: str, advice: str) -> int:
         known = ", ".join(DISTORTION_COEFFICIENTS)
         raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {known}")
     return DISTORTION_COEFFICIENTS[model]
-
-
-def _checked(info: CameraInfo, where: str) -> CameraInfo:
-    check_camera(info, where, DriveError)
-    return info
 
 
 def take_matrix(content: object, where: str) -> FloatArray:
@@ -157,4 +153,4 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     # k3 and those after it are zero where they are not given.
     padded = (*distortion[:count].tolist(), *(0.0,) * (count - len(distortion)))
     info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, padded)
-    return _checked(info, where)
+    return check_camera(info, where, DriveError)

@@ -42,20 +42,10 @@ def write_calibration(
     their stamps and its sigma (infinite where unknown), ``read_out_s`` the estimated time from first row to
     last and its sigma, ``verdict`` that on the run which found it, as JSON.
     """
-    info = calibration.info
-    content: dict[str, Any] = {
-        "camera_name": info.name,
-        "image_width": info.width,
-        "image_height": info.height,
-        "camera_matrix": info.intrinsic.tolist(),
-        "distortion_model": info.distortion_model,
-        "distortion_coefficients": list(info.distortion),
-        "cam_from_vehicle": calibration.cam_from_vehicle.tolist(),
-        "vehicle_from_pinhole_px": ipm_from_extrinsic(info, calibration.cam_from_vehicle).tolist(),
-        **_sigmas(calibration),
-    }
-    if calibration.covariance is not None:
-        content["covariance"] = calibration.covariance.tolist()
+    entries = _entries(calibration).items()
+    content = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in entries}
+    content["distortion_coefficients"] = list(calibration.info.distortion)
+    content |= _sigmas(calibration)
     if clock_s is not None:
         content["clock_offset_s"] = float(clock_s[0])
         if np.isfinite(clock_s[1]):
@@ -68,6 +58,22 @@ def write_calibration(
     if verdict is not None:
         content["verdict"] = dict(verdict)
     replace_text(path, dump_yaml(content))
+
+
+def _entries(calibration: Calibration) -> dict[str, Any]:
+    """The entries that files with all of a calibration share: numbers, words and arrays."""
+    info, covariance = calibration.info, calibration.covariance
+    return {
+        "camera_name": info.name,
+        "image_width": info.width,
+        "image_height": info.height,
+        "camera_matrix": info.intrinsic,
+        "distortion_model": info.distortion_model,
+        "distortion_coefficients": np.array([info.distortion]),
+        "cam_from_vehicle": calibration.cam_from_vehicle,
+        "vehicle_from_pinhole_px": ipm_from_extrinsic(info, calibration.cam_from_vehicle),
+        **({} if covariance is None else {"covariance": covariance}),
+    }
 
 
 def write_camera_info(info: CameraInfo, path: Path) -> None:
@@ -141,18 +147,9 @@ def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
 
 def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
     """A file for ``cv2.FileStorage``: intrinsics, extrinsic, the IPM from undistorted pixels to ground."""
-    info = calibration.info
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
-    storage.write("camera_name", info.name)
-    storage.write("image_width", info.width)
-    storage.write("image_height", info.height)
-    storage.write("camera_matrix", info.intrinsic)
-    storage.write("distortion_model", info.distortion_model)
-    storage.write("distortion_coefficients", np.array([info.distortion]))
-    storage.write("cam_from_vehicle", calibration.cam_from_vehicle)
-    storage.write("vehicle_from_pinhole_px", ipm_from_extrinsic(info, calibration.cam_from_vehicle))
-    if calibration.covariance is not None:
-        storage.write("covariance", calibration.covariance)
+    for key, value in _entries(calibration).items():
+        storage.write(key, value)
     head, body = storage.releaseAndGetString().split("---\n", 1)
     return f"{head}---\n{_comments(calibration, about)}{body}"
 

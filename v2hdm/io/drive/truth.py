@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +13,7 @@ from v2hdm.io.calibration.mounting import take_rigid
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth
-from v2hdm.store.files import check_keys, load_yaml, read_text, take_mapping, take_number
+from v2hdm.store.files import check_keys, load_yaml, read_csv, take_mapping, take_number
 
 SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
 LANE_VISIBLE = ("lane", "vertex")
@@ -135,14 +133,11 @@ def _read_lane_visible(path: Path, hd_map: HdMap) -> tuple[BoolArray, ...]:
 
 def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
     """The rows of a CSV file below its header, each with its place for messages."""
-    reader = csv.reader(io.StringIO(read_text(path, DriveError)))
-    try:
-        if next(reader, None) != list(columns):
-            raise DriveError(f"{path}: line 1: expected the header '{','.join(columns)}'; add it")
-        for row in reader:
-            where = f"{path}: line {reader.line_num}"
-            if len(row) != len(columns):
-                raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; mend that line")
-            yield where, row
-    except csv.Error as failure:
-        raise DriveError(f"{path}: line {reader.line_num}: {failure}; mend that line") from None
+    header, *rows = read_csv(path, DriveError) or [[]]
+    if header != list(columns):
+        raise DriveError(f"{path}: line 1: expected the header '{','.join(columns)}'; add it")
+    for number, row in enumerate(rows, start=2):
+        where = f"{path}: line {number}"
+        if len(row) != len(columns):
+            raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; mend that line")
+        yield where, row

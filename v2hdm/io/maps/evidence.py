@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -80,10 +78,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
 
 def read_residuals(path: Path) -> Residuals:
     """Read the file of :func:`write_residuals`; raises MapFileError where it is missing or damaged."""
-    try:
-        rows = list(csv.reader(io.StringIO(files.read_text(path, MapFileError))))
-    except csv.Error:
-        rows = []
+    rows = files.read_csv(path, MapFileError)
     if not rows or tuple(rows[0]) != COLUMNS:
         raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
     images: dict[str, tuple[int, str, float]] = {}

@@ -68,8 +68,8 @@ def take_covariance(content: object, size: int, where: str, error: type[V2hdmErr
     return matrix
 
 
-def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
-    """Refuse an impossible camera matrix and a lens that cannot be undone within the image.
+def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> CameraInfo:
+    """``info`` itself; refuses an impossible camera matrix and a lens that cannot be undone in the image.
 
     A lens that folds over itself in the image's corners only, where its target never was, is a warning.
     """
@@ -90,7 +90,7 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
         raise error(f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} turn the image over; order k1 k2 p1 p2 k3")
     reach, scale_px = lens_reach(info), (fx + fy) / 2
     if reach >= np.hypot(across, down):
-        return
+        return info
     problem = (
         f"{at}: this lens folds over itself {scale_px * reach:.0f} px from its centre, and the image reaches "
         f"{scale_px * np.hypot(across, down):.0f} px from there"
@@ -98,6 +98,7 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     if reach < max(across, down):
         raise error(f"{problem}; calibrate it again with points up to the image's corners")
     _log.warning("%s: do not trust what lies in its corners; calibrate with points up to there", problem)
+    return info
 
 
 def lens_reach(info: CameraInfo) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +24,7 @@ from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HdMap, IntArray, Truth
-from v2hdm.store.files import load_json, load_yaml, read_text, take_number
+from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
 
 BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
 
@@ -101,9 +99,9 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
     hd_map = read_geojson(folder / "map.geojson") if (folder / "map.geojson").is_file() else None
     excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
     features = features_of(hd_map) if hd_map else []
-    residuals, config = folder / RESIDUALS, folder / "config.yaml"
+    residuals, config, points = folder / RESIDUALS, folder / "config.yaml", folder / "check_points.csv"
     route = _route(folder, drive)
-    heading, *checked = _table(folder / "check_points.csv") or ((),)
+    heading, *checked = (read_csv(points, MapFileError) if points.is_file() else []) or [[]]
     return Facts(
         folder=folder,
         metrics=metrics,
@@ -114,7 +112,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         route=route,
         surface=None if route is None else read_surface(folder, route.flat),
         residuals=read_residuals(residuals) if residuals.is_file() else None,
-        check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked),
+        check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked if row),
         drive=drive,
         truth=read_truth(drive) if drive is not None and drive.truth_dir is not None else None,
     )
@@ -138,8 +136,9 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
         return None
     adjusted = read_tum(folder / "trajectory.tum")
     path = folder / "trajectory_sigma.csv"
+    rows = [row for row in read_csv(path, MapFileError)[1:] if row]
     try:
-        table = np.array(_table(path)[1:], dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
+        table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
         raise MapFileError(f"{path}: not a line of 8 numbers for each pose of trajectory.tum") from None
     stamp_s, poses = adjusted.stamp_s, adjusted.map_from_vehicle
@@ -164,15 +163,6 @@ def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
         return Surface.from_stored(load_json(path, MapFileError), map_from_vehicle)
     except ValueError as damage:
         raise MapFileError(f"{path}: {damage}; map the drive again") from None
-
-
-def _table(path: Path) -> tuple[tuple[str, ...], ...]:
-    if not path.is_file():
-        return ()
-    try:
-        return tuple(tuple(row) for row in csv.reader(io.StringIO(read_text(path, MapFileError))) if row)
-    except csv.Error as failure:
-        raise MapFileError(f"{path}: {failure}; map the drive again") from None
 
 
 @dataclass(frozen=True)

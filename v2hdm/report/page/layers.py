@@ -196,19 +196,19 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             for one in hd_map.symbols
         ],
         "excluded": [
-            {"k": one.kind, "p": _metres(one.position_map[None])[0], "n": one.sightings, "why": one.reason}
+            {"k": one.kind, "p": rounded(one.position_map[None])[0], "n": one.sightings, "why": one.reason}
             for one in facts.excluded
         ],
         "checks": _checks(facts),
         "changes": _changes(facts),
         "truth": facts.truth
         and {
-            "markings": [_metres(one.corners_map) for one in facts.truth.map.markings],
-            "lanes": [_metres(one.points_map) for one in facts.truth.map.lanes],
+            "markings": [rounded(one.corners_map) for one in facts.truth.map.markings],
+            "lanes": [rounded(one.points_map) for one in facts.truth.map.lanes],
         },
         "route": {
-            "adjusted": [] if route is None else _metres(route.map_from_vehicle[:, :2, 3]),
-            "recorded": [] if route is None or route.recorded is None else _metres(route.recorded[:, :2, 3]),
+            "adjusted": [] if route is None else rounded(route.map_from_vehicle[:, :2, 3]),
+            "recorded": [] if route is None or route.recorded is None else rounded(route.recorded[:, :2, 3]),
         },
         "mosaic": mosaic_layer(facts.folder),
         "systems": _systems(facts),
@@ -242,12 +242,13 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
 def _feature(
     one: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
 ) -> dict[str, Any]:
-    return {"id": one.id, "k": kinds.index(one.kind), key: _metres(points_map), "n": one.sightings}
+    return {"id": one.id, "k": kinds.index(one.kind), key: rounded(points_map), "n": one.sightings}
 
 
-def _metres(points: FloatArray) -> list[list[float]]:
-    rounded: list[list[float]] = np.round(points, 3).tolist()
-    return rounded
+def rounded(points: FloatArray, digits: int = 3) -> list[list[float]]:
+    """Points (N, 2) as lists: metres to a millimetre unless said otherwise."""
+    out: list[list[float]] = np.round(points, digits).tolist()
+    return out
 
 
 def _errors(facts: Facts) -> dict[int, float]:

@@ -13,7 +13,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
-from v2hdm.report.page.layers import jpeg, jpeg_of, shrunk
+from v2hdm.report.page.layers import jpeg, jpeg_of, rounded, shrunk
 
 BUDGET_BYTES = 8_000_000  # budget of all pictures together, as text in the page: a report stays below 15 MB
 PER_CAMERA = 2  # pictures of a marking: the nearest one, and one from the middle of its sightings
@@ -161,14 +161,9 @@ def _cut_out(
         "camera": image.camera,
         "t": round(float(image.stamp_s), 3),
         # The centre of a pixel is at its whole number; that of a drawing's first one at a half.
-        "map": _rounded((shape_px - first + 0.5) * factor),
-        "seen": _rounded((cut.seen_px - first + 0.5) * factor),
+        "map": rounded((shape_px - first + 0.5) * factor, 1),
+        "seen": rounded((cut.seen_px - first + 0.5) * factor, 1),
     }
-
-
-def _rounded(points: FloatArray) -> list[list[float]]:
-    rounded: list[list[float]] = np.round(points, 1).tolist()
-    return rounded
 
 
 def overlays(facts: Facts) -> Mapping[str, str]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from v2hdm.geometry.ipm import centre_sigmas
+from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
@@ -201,8 +202,7 @@ def check_heights(drive: Drive) -> Iterator[Finding]:
     road, sigma_m = drive.road, _HEIGHT_NOISE * drive.pose_noise.position_m
     if road is None or len(road.points_map) < 2:
         return
-    step_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
-    way_m = np.concatenate([[0.0], np.cumsum(step_m)])
+    way_m = length_along(road.points_map)
     one, other = KDTree(road.points_map).query_pairs(_SAME_PLACE_M, output_type="ndarray").T
     again = np.abs(way_m[other] - way_m[one]) > _ANOTHER_PASS_M
     one, other = one[again], other[again]

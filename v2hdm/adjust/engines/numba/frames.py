@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from v2hdm.adjust.engines.numba.inline import floored, solve_unit_rows, weigh
 from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
-from v2hdm.adjust.engines.numba.linearise import couple, differentiate
+from v2hdm.adjust.engines.numba.linearise import add_camera, couple, differentiate
 from v2hdm.compiled import inlined, kernel
 from v2hdm.records import FloatArray, IntArray
 
@@ -44,6 +44,36 @@ def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
     return count
 
 
+@inlined
+def _subtract_products(
+    begin: int, end: int, tiles: TileMap, marks: IntArray, count: int, rows: FloatArray, values: FloatArray
+) -> None:
+    """Take B'B of a unit's ``rows`` (2g, ...) off the columns ``begin`` to ``end`` of its ``count`` tiles."""
+    size, touched, low, high = tiles.size, marks[2], marks[3], marks[4]
+    for a in range(count):
+        column = tiles.position[touched[a]]
+        if not begin <= column < end:
+            continue
+        for b in range(a, count + 1):
+            row = len(tiles.begin) if b == count else tiles.position[touched[b]]
+            found = tiles.begin[column]
+            while tiles.row[found] != row:
+                found += 1
+            for i in range(0, len(rows), 2):
+                for r in range(low[b], high[b]):
+                    x, y = rows[i, b * size + r], rows[i + 1, b * size + r]
+                    if x == 0.0 and y == 0.0:
+                        continue
+                    # Of a tile on the diagonal the lower triangle counts.
+                    stop = r + 1 if a == b else high[a]
+                    at, right = tiles.at[found] + r * size, a * size
+                    out = values[at + low[a] : at + stop]
+                    top = rows[i, right + low[a] : right + stop]
+                    bottom = rows[i + 1, right + low[a] : right + stop]
+                    for s in range(len(out)):
+                        out[s] -= x * top[s] + y * bottom[s]
+
+
 @kernel
 def subtract_frames(
     begin: int,
@@ -65,7 +95,7 @@ def subtract_frames(
     camera, of which ``each`` is the number of unknowns. ``marks`` (5, G + 1), -1 at first, is room to work
     in; its last two rows are the columns of each touched tile, and of the tip behind them, that are not zero.
     """
-    states, size, tip_row = by_state.shape[1] // 6, tiles.size, len(tiles.begin)
+    states, size = by_state.shape[1] // 6, tiles.size
     width = len(base.table) // layout.moments * each
     place, touched, low, high = marks[1], marks[2], marks[3], marks[4]
     jacobian, w, rows = scratch.jacobian, scratch.coupling, scratch.rows
@@ -98,34 +128,7 @@ def subtract_frames(
                     for s in range(states):
                         rows[i, column + s] += w[0, p] * by_state[t, p * states + s]
                         rows[i + 1, column + s] += w[0, 6 + p] * by_state[t, p * states + s]
-                column = tip + t // layout.moments * each
-                for p in range(6):
-                    rows[i, column + p] += w[0, p]
-                    rows[i + 1, column + p] += w[0, 6 + p]
-                    for v in range(each - 6):
-                        rows[i, column + 6 + v] += w[0, p] * clock[t, p * (each - 6) + v]
-                        rows[i + 1, column + 6 + v] += w[0, 6 + p] * clock[t, p * (each - 6) + v]
+                add_camera(w, 0, clock, t, each, rows, i, tip + t // layout.moments * each)
         for a in range(count + 1):
             solve_unit_rows(layout, base, u, rows, a * size + low[a], a * size + high[a])
-        for a in range(count):
-            column = tiles.position[touched[a]]
-            if not begin <= column < end:
-                continue
-            for b in range(a, count + 1):
-                row = tip_row if b == count else tiles.position[touched[b]]
-                found = tiles.begin[column]
-                while tiles.row[found] != row:
-                    found += 1
-                for i in range(0, 2 * joined, 2):
-                    for r in range(low[b], high[b]):
-                        x, y = rows[i, b * size + r], rows[i + 1, b * size + r]
-                        if x == 0.0 and y == 0.0:
-                            continue
-                        # Of a tile on the diagonal the lower triangle counts.
-                        stop = r + 1 if a == b else high[a]
-                        at, right = tiles.at[found] + r * size, a * size
-                        out = values[at + low[a] : at + stop]
-                        top = rows[i, right + low[a] : right + stop]
-                        bottom = rows[i + 1, right + low[a] : right + stop]
-                        for s in range(len(out)):
-                            out[s] -= x * top[s] + y * bottom[s]
+        _subtract_products(begin, end, tiles, marks, count, rows[: 2 * joined], values)

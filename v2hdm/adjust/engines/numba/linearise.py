@@ -73,6 +73,30 @@ def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None
         out[i, 6 + p] = jacobian[13] * top + jacobian[15] * low
 
 
+@inlined
+def add_camera(
+    coupling: FloatArray,
+    j: int,
+    clock: FloatArray,
+    t: int,
+    each: int,
+    rows: FloatArray,
+    i: int,
+    column: int,
+) -> None:
+    """Add W' in row j of ``coupling``, by pair t, to the ``each`` unknowns of its camera, from ``column`` on.
+
+    ``rows`` i and i + 1 are those of the corner's two coordinates.
+    """
+    for p in range(6):
+        rows[i, column + p] += coupling[j, p]
+        rows[i + 1, column + p] += coupling[j, 6 + p]
+        for v in range(each - 6):
+            by_clock = clock[t, p * (each - 6) + v]
+            rows[i, column + 6 + v] += coupling[j, p] * by_clock
+            rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
+
+
 @kernel
 def linearise(
     begin: int,
@@ -131,14 +155,7 @@ def linearise(
                             m += 1
                     j, column = k - seen if states else 0, camera * each
                     couple(jacobian, weight, coupling, j)
-                    for p in range(6):
-                        rows[i, column + p] += coupling[j, p]
-                        rows[i + 1, column + p] += coupling[j, 6 + p]
-                    for v in range(each - 6):
-                        for p in range(6):
-                            by_clock = clock[layout.pair[k], p * (each - 6) + v]
-                            rows[i, column + 6 + v] += coupling[j, p] * by_clock
-                            rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
+                    add_camera(coupling, j, clock, layout.pair[k], each, rows, i, column)
                 a, b, d = layout.control_root[c, 0], layout.control_root[c, 1], layout.control_root[c, 2]
                 block[i, i] = xx + a * a + b * b
                 block[i + 1, i], block[i + 1, i + 1] = yx + b * d, yy + d * d
