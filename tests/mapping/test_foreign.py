@@ -22,13 +22,18 @@ def stretch(monkeypatch, found, first_seen):
     group, frame = group[inside], frame[inside]
     kept = np.array([found(g, f) for g, f in zip(group.tolist(), frame.tolist(), strict=True)])
     monkeypatch.setattr(foreign, "easy_views", lambda *_: (group, frame))
+    poses, corners = np.tile(np.eye(4), (FRAMES, 1, 1)), np.zeros((len(first_seen), 4, 2))
+    poses[:, 0, 3], corners[..., 0] = np.arange(FRAMES), (first_seen + IN_VIEW)[:, None]
+    rig = SimpleNamespace(map_from_vehicle=poses)
     bundle = SimpleNamespace(
-        rig=None, corners_map=None, inliers=np.ones(kept.sum(), dtype=bool), group=group[kept],
+        rig=rig, corners_map=corners, inliers=np.ones(kept.sum(), dtype=bool), group=group[kept],
         row=np.arange(kept.sum()),
     )  # fmt: skip
     stamps = 0.1 * np.arange(FRAMES)
     sightings = SimpleNamespace(image=frame[kept], visit=np.zeros(FRAMES, dtype=int), stamp_s=stamps)
-    views = SimpleNamespace(image=np.arange(FRAMES), frame=np.arange(FRAMES))
+    views = SimpleNamespace(
+        image=np.arange(FRAMES), frame=np.arange(FRAMES), camera=np.zeros(FRAMES, dtype=int)
+    )
     return foreign_stretch(bundle, sightings, views, ())
 
 
@@ -55,6 +60,13 @@ def test_worn_markings_and_missed_ones_are_no_other_drive(monkeypatch):
     rng = np.random.default_rng(0)
     worn = rng.random(len(OWN)) < 0.2
     assert stretch(monkeypatch, lambda g, f: rng.random() < (0.3 if worn[g] else 0.85), OWN)[2] < 0
+
+
+def test_far_views_that_find_little_are_no_other_drive(monkeypatch):
+    monkeypatch.setattr(__name__ + ".IN_VIEW", 50)
+    early, late = np.arange(-45, 0, 3), np.arange(40, 60, 2)
+    first_seen = np.concatenate([early, late])
+    assert stretch(monkeypatch, lambda g, f: f - first_seen[g] > 38, first_seen)[2] < 0
 
 
 def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):

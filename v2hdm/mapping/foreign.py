@@ -11,7 +11,9 @@ from scipy.special import betaln
 from v2hdm.association.ground import Views, easy_views
 from v2hdm.association.sightings import Sightings
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.records import Camera, FloatArray
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
+
+_DISTANCES = 10  # parts of a camera's views, by distance, each with its own rate of found markings
 
 _ENDS = 60  # places along a session where a stretch may begin or end
 
@@ -38,7 +40,11 @@ def foreign_stretch(
     group, image = easy_views(views, bundle.rig, cameras, bundle.corners_map)
     accepted, size = bundle.inliers, int(views.image.max()) + 1
     known = bundle.group[accepted] * size + sightings.image[bundle.row[accepted]]
-    found, frame = np.isin(group * size + image, known), views.frame[np.searchsorted(views.image, image)]
+    found, view = np.isin(group * size + image, known), np.searchsorted(views.image, image)
+    frame = views.frame[view]
+    apart = bundle.corners_map[group].mean(axis=1) - bundle.rig.map_from_vehicle[frame, :2, 3]
+    # A miss says the less, the less often others are found from as far.
+    counted = np.where(found, 1.0, _ease(found, views.camera[view], np.linalg.norm(apart, axis=1)))
     best = 0.0, 0.0, -np.inf
     for visit in np.unique(sightings.visit):
         frames, own = np.flatnonzero(sightings.visit == visit), sightings.visit[frame] == visit
@@ -49,9 +55,9 @@ def foreign_stretch(
         groups, number = np.unique(group[own], return_inverse=True)
         counts = np.zeros((2, len(ends), len(groups)))  # of views until then: that found it, and all
         step = np.searchsorted(ends, frame[own] - frames[0], side="right")
-        for count, views_of_kind in zip(counts, (found[own], np.ones(own.sum())), strict=True):
+        for count, views_of_kind in zip(counts, (found[own], counted[own]), strict=True):
             np.add.at(count, (step, number), views_of_kind)
-        counts, share = counts.cumsum(axis=1), (found[own].sum() + 1.0) / (own.sum() + 2.0)
+        counts, share = counts.cumsum(axis=1), (found[own].sum() + 1.0) / (counted[own].sum() + 2.0)
         for first in range(len(ends) - 1):
             gains = _gains(counts[:, first + 1 :] - counts[:, first, None], counts[:, -1, None], share)
             last = first + 1 + int(gains.argmax())
@@ -60,6 +66,18 @@ def foreign_stretch(
                 begin_s, end_s = sightings.stamp_s[frames[[ends[first], ends[last] - 1]]]
                 best = float(begin_s), float(end_s), gain
     return best
+
+
+def _ease(found: BoolArray, camera: IntArray, distance_m: FloatArray) -> FloatArray:
+    """The rate at which markings are found (P,) at their distance from a camera, relative to its best one."""
+    ease = np.ones(len(found))
+    for one in np.unique(camera):
+        own = np.flatnonzero(camera == one)
+        parts = np.array_split(own[np.argsort(distance_m[own])], _DISTANCES)
+        rates = np.array([(found[part].sum() + 1.0) / (len(part) + 2.0) for part in parts])
+        for part, rate in zip(parts, rates / rates.max(), strict=True):
+            ease[part] = rate
+    return ease
 
 
 def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray:
