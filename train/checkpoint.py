@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +124,11 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     Raises:
         ConfigError: It cannot be written there.
     """
+    content = BytesIO()  # torch turns an error of the disk into one of its own
+    torch.save(vars(checkpoint), content)
     try:
-        with whole_file(path) as partial, partial.open("wb") as file:
-            torch.save(vars(checkpoint), file)
+        with whole_file(path) as partial:
+            partial.write_bytes(content.getbuffer())
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be written ({error.strerror}); free space or set another output="
