@@ -153,9 +153,9 @@ class Optimiser:
         progress("coarse solve")
         located = self._locate(self.initial_rig)
         height_m = located.height_m[:, None]
-        sine = np.where(located.valid, height_m / np.hypot(located.range_m, height_m), np.nan)
-        with np.errstate(invalid="ignore"):
-            steep = located.valid & (sine >= min(_STEEP_SINE, float(np.nanmedian(sine))))
+        sine = np.where(located.valid, height_m / np.hypot(located.range_m, height_m), -np.inf)
+        known = sine[located.valid]
+        steep = sine >= (min(_STEEP_SINE, float(np.median(known))) if len(known) else _STEEP_SINE)
         bundle = self._solve(tracks, steep, self.initial_rig, coarse=True)
         for number in range(1, self._options.rounds + 1):
             progress(f"joint solve {number}")
