@@ -156,6 +156,7 @@ def sizes() -> Iterator[Part]:
     yield "foreign: views that share counts for", partial(patch.object, foreign, "_PSEUDO_VIEWS", 100.0)
     yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
     yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)
+    yield "foreign: misses weighed by distance", partial(patch.object, foreign, "_DISTANCES", 1)
     yield "jitter that does not matter", partial(patch.object, solution, "_LEAST_JITTER_S", 0.0)
 
 

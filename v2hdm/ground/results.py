@@ -41,11 +41,11 @@ class GroundStatus(Enum):
 
     FOUND = "found"
     NO_MATCH = "no match"
-    """Patches find their partners elsewhere than the poses as given put them."""
+    """The ground moves between images otherwise than the poses as given say."""
     TOO_LITTLE = "too little"
     """Too little motion or ground in view."""
     NO_TEXTURE = "no texture"
-    """Hardly a patch is found again in the next image, wherever it is looked for: that tells nothing."""
+    """Too few patches are found again to estimate a mounting, and none contradicts the poses."""
 
 
 class Reading(Enum):

@@ -78,24 +78,25 @@ def start_pairs(stated: Stated) -> IntArray:
 def contradicts(matcher: Matcher, stated: Stated) -> bool:
     """Whether ground that does not match in the pairs of a start says that something stated is wrong.
 
-    It does where enough patches are found again, by no pose and no clock, and the vehicle moved between most
-    images by less than half or more than twice as far as stated, or turned otherwise: no error of the guess
-    does that. Where they are found nowhere it is the texture that lacks, which says nothing.
+    It does where patches are found again wherever they are, and show the vehicle to have moved between most
+    images by less than half or more than twice the stated way, or to have turned otherwise: no error of the
+    guess does that. Patches that are found nowhere lack texture, which says nothing.
     """
     pairs = start_pairs(stated)
     pairs = pairs[:: -(-len(pairs) // _PAIRS)]
     found = matcher.match_anywhere(stated.guess, pairs, _GRID_M)
-    if sum(map(len, found)) < _LEAST_MATCHES:
-        return False
-    far, turns_rad = [], []
+    share, turn_rad = [], []
     for matches, (first, second) in zip(found, stated.poses()[pairs], strict=True):
-        seen = _motion(matches, stated.guess) if len(matches) else None
+        seen = _motion(matches, stated.guess)
         if seen is not None:
             moved = np.linalg.inv(first) @ second
-            ahead = moved[:2, 3]
-            far.append(seen[:, 2] @ ahead / (ahead @ ahead))
-            turns_rad.append(heading_rad(seen[:, :2].T @ moved[:2, :2]))
-    return bool(not 1 / _STRETCHED < np.median(far) < _STRETCHED or np.median(np.abs(turns_rad)) > _TURN_RAD)
+            way = moved[:2, 3]
+            share.append(seen[:, 2] @ way / (way @ way))
+            turn_rad.append(heading_rad(seen[:, :2].T @ moved[:2, :2]))
+    if sum(map(len, found)) < _LEAST_MATCHES or not share:
+        return False
+    as_far = 1 / _STRETCHED < np.median(share) < _STRETCHED
+    return not as_far or bool(np.median(np.abs(turn_rad)) > _TURN_RAD)
 
 
 def _motion(matches: Matches, mount: Mount) -> FloatArray | None:
@@ -103,6 +104,8 @@ def _motion(matches: Matches, mount: Mount) -> FloatArray | None:
     here = np.broadcast_to(np.eye(4), (len(matches), 4, 4))
     first, second = (hit_ground(mount, px, here).points_map for px in (matches.first_px, matches.second_px))
     known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    if np.count_nonzero(known) < 2:
+        return None
     found, _ = cv2.estimateAffinePartial2D(second[known], first[known])
     return None if found is None else found.astype(np.float64)
 
