@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 from v2hdm.cli.main import Command, answer_signals
@@ -30,7 +31,14 @@ def _train() -> int:
 def _run(job: Job) -> None:
     from train.console import train
 
+    threading.excepthook = _leave_to_main
     train(job.settings)
+
+
+def _leave_to_main(failed: threading.ExceptHookArgs) -> None:
+    """Print no error of the disk from TensorBoard's thread: the next figure raises it in the main one."""
+    if not isinstance(failed.exc_value, OSError):
+        threading.__excepthook__(failed)
 
 
 if __name__ == "__main__":
