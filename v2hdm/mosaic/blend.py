@@ -180,6 +180,7 @@ def adjusted_shots(
 
 TILE_PX = 64  # side of a tile, px of the canvas
 _NODE_PX = 4  # distance of the points of a tile at which the lens is evaluated, px of the canvas
+_FAR_OUT = 99.0  # a place outside of any image, in halves of its size from its middle
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
@@ -351,9 +352,8 @@ class _Sums:
         """
         points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
         if shot.on_plane is not None:
-            points = points + self._from_corners @ self._moved_px(tiles, shot.on_plane, map_from_sheet).to(
-                points
-            )
+            moved_px = self._moved_px(tiles, shot.on_plane, map_from_sheet)
+            points = points + self._from_corners @ moved_px.to(points)
         pinhole_px_from_sheet = shot.pinhole_px_from_map @ map_from_sheet
         homography = torch.from_numpy(pinhole_px_from_sheet).to(points)
         third = points @ homography[2, :2] + homography[2, 2]
@@ -361,16 +361,16 @@ class _Sums:
         px = tensors.distort_points(source.lens.info, pinhole_px.reshape(-1, 2)).reshape(points.shape)
         height, width = source.values.shape[1:]
         placed = 2 * (px - px.new_tensor(source.corner_px)) / px.new_tensor([width - 1, height - 1]) - 1
+        # In the camera's plane a lens has no end; what lies there must not spoil the rest of its tile.
+        placed = placed.nan_to_num(_FAR_OUT).clamp(-_FAR_OUT, _FAR_OUT)
         nodes = torch.stack([*(placed * third[..., None]).unbind(-1), third])
         side = len(self._from_nodes.T)
         x, y, third = self._from_nodes @ nodes.reshape(3, len(tiles), side, side) @ self._from_nodes.T
         seen = third > 0  # a tile may reach beyond the horizon, where no image shows the ground
-        depth = torch.where(seen, third, torch.ones_like(third))
+        depth = third.where(seen, third.new_tensor(1.0))
         density = float(np.linalg.det(pinhole_px_from_sheet)) / depth**3
-        out = x.new_tensor(-9.0)
-        return torch.stack(
-            [torch.where(seen, x / depth, out), torch.where(seen, y / depth, out), density * seen]
-        )
+        placed = torch.stack([x, y]) / depth
+        return torch.cat([placed.where(seen, x.new_tensor(_FAR_OUT)), (density * seen)[None]])
 
     @staticmethod
     def _moved_px(

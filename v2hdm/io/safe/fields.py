@@ -69,7 +69,7 @@ def take_covariance(content: object, size: int, where: str, error: type[V2hdmErr
 
 
 def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> CameraInfo:
-    """``info`` itself; refuses an impossible camera matrix and a lens that cannot be undone in the image.
+    """Return ``info``; refuse an impossible camera matrix and a lens that cannot be undone in the image.
 
     A lens that folds over itself in the image's corners only, where its target never was, is a warning.
     """
