@@ -448,3 +448,16 @@ def test_dashes_of_a_bend_are_as_much_longer_as_they_stand_farther_apart():
     found = of_one_class(solved(true, np.random.default_rng(23), 0.005))
     assert found.probability[:, WRONG_END].max() < 0.02
     assert np.sqrt(np.diagonal(found.candidates.covariance_m2, axis1=1, axis2=2)).max() < 0.05
+
+
+@pytest.mark.parametrize("uneven_m", [0.0, 1.0])
+def test_which_end_runs_on_follows_from_the_neighbours_of_a_line_that_is_evenly_spaced_alone(uneven_m):
+    rng = np.random.default_rng(24)
+    along = 6.0 * np.arange(30) + uneven_m * rng.uniform(-1, 1, 30)
+    true = DASH + np.stack([along, 0 * along], axis=1)[:, None]
+    candidates = solved(true, rng, 0.005)
+    moved_end(candidates, 12, 0.4)
+    found = of_one_class(candidates)
+    error = np.linalg.norm(found.candidates.corners_map - true, axis=2)
+    assert (error < 3 * found.candidates.sigma_m).all()
+    assert (found.candidates.sigma_m[12].max() < 0.1) == (uneven_m == 0)

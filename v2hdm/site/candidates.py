@@ -59,6 +59,10 @@ class Candidates:
         variance = np.diagonal(self.covariance_m2, axis1=1, axis2=2).reshape(-1, 4, 2)
         return np.asarray(np.sqrt(variance.sum(axis=2)))
 
+    def along(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Covariances (G,) of what moves along two directions (G, 8) each."""
+        return np.asarray(np.einsum("ni,nij,nj->n", first, self.covariance_m2, second))
+
     @property
     def known(self) -> BoolArray:
         """Which corners (G, 4) were seen as points."""

@@ -16,14 +16,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import betaln, logsumexp
 from scipy.stats import f, norm, t
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
+from v2hdm.site.series import Series, in_series
 from v2hdm.site.shapes import (
-    MEMBER_M,
     SHAPE_SIGMA_M,
     Laid,
     PaintError,
@@ -56,15 +55,6 @@ sound end agree, a worn one ends elsewhere in each (229 sound ends and 10 worn o
 _UNCLEAR_SHARE, _CLEAR_SHARE = 0.05, 0.1
 """Share of the sound ends that are as uncertain as worn ones, being far off, and of the worn ones that all
 images show alike (5 of 229 and 1 of 11 ends there)."""
-
-_SERIES_TURN_RAD, _SERIES_BESIDE_M = 1.0, 0.5
-"""Most that a line turns by from one dash to the next, a bend of 6 m radius where they are 6 m apart, and how
-far at most they lie beside an arc between them: lines are farther apart."""
-
-_SERIES_UNEVEN = 0.2  # share by which the ways to the dash before and to the next differ where none lacks
-_SERIES_STRETCH = 1.5  # most by which a bend stretches or shrinks a line: 4 m beside a middle of 12 m radius
-_SERIES_NEAR = 32  # dashes nearest to one, among which those of its line are looked for
-_SERIES_LEAST = 3  # dashes of their class's length that others follow: enough for a median
 
 _MISPLACED_M = 0.3  # sigma, m, of a worn end or a corner from another edge (17 worn ends: .08 to .74 m)
 
@@ -152,28 +142,34 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     # Before anything is known of the class, what agreeing images show whole is taken for a marking.
     taken = candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations)
     weight, probability = np.asarray(taken, dtype=np.float64), np.zeros((len(candidates), _KINDS))
+    believed = candidates
     for _ in range(_PASSES):
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         of_drive = share, paint, weight, probability[:, OTHER_LENGTH], _vague_evidence(counts, weight)
-        hypotheses = _hypotheses(candidates, shapes, *of_drive)
+        space = _hypotheses(candidates, believed, shapes, *of_drive)
+        hypotheses = space.found
         by_kind, sources = np.array([one.kind for one in hypotheses]), _counted(counts, weight)
         shaped = np.stack([one.log_likelihood for one in hypotheses])
         joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
         joint += sources.sum(axis=0)[:, np.maximum(by_kind - OWN_SHAPE, 0)].T
+        marking = by_kind < PART_OF_SYMBOL
+        if space.series is not None:
+            placed = [hypotheses[k].corners(_paint_m2(hypotheses[k], paint)) for k in np.flatnonzero(marking)]
+            joint[marking] += np.stack([space.series.evidence(one) for one in placed])
         each = np.exp(joint - logsumexp(joint, axis=0))
         probability = np.stack([each[by_kind == one].sum(axis=0) for one in range(_KINDS)], axis=1)
         weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
         paint = _paint_error(hypotheses, each, np.asarray(candidates.known.all(axis=1)))
-    marking = by_kind < PART_OF_SYMBOL
+        believed = _mixture(hypotheses, joint, paint)
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
     like_others = [one.fit[2] for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
     # A paint error has the tails of Student's t distribution, its square those of Fisher's.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
-    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
+    return Posterior(probability, log_odds, believed, evidence, misfit)
 
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
@@ -295,14 +291,19 @@ def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(directions @ covariance @ np.swapaxes(directions, 1, 2))
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Space:
-    """The hypotheses on N ``candidates`` so far; ``share`` (8,) of the kinds, and what is known of paint."""
+    """The hypotheses on N ``candidates`` so far, ``believed`` to be where they are.
+
+    ``share`` (8,) is that of the kinds, ``paint`` how far edges err, ``series`` what the line of each says.
+    """
 
     candidates: Candidates
+    believed: Candidates
     share: FloatArray
     paint: PaintError
     found: list[_Hypothesis] = field(default_factory=list)
+    series: Series | None = None
 
     def add(
         self,
@@ -324,19 +325,20 @@ class _Space:
 
 def _hypotheses(
     candidates: Candidates,
+    believed: Candidates,
     shapes: Sequence[Shape],
     share: FloatArray,
     paint: PaintError,
     weight: FloatArray,
     other_length: FloatArray,
     vague: FloatArray,
-) -> list[_Hypothesis]:
-    """All that N candidates may be, given the shapes of their class.
+) -> _Space:
+    """All that N candidates, ``believed`` to be where they are, may be, given the shapes of their class.
 
     ``weight`` and ``other_length`` (N,) are probabilities of being a marking, and of another length;
     ``vague`` (N, 4) the log likelihood ratio of views that disagree on a corner.
     """
-    space = _Space(candidates, share, paint)
+    space = _Space(candidates, believed, share, paint)
     total, ragged = sum(shape.share for shape in shapes), np.zeros(len(candidates))
     for shape in shapes:
         ragged = _add_shape(space, shape, shape.share / total, weight, other_length, vague)
@@ -348,7 +350,7 @@ def _hypotheses(
     space.add(OWN_SHAPE, 1.0, own, any_size)
     space.add(PART_OF_SYMBOL, 1.0, own, any_size, beside=ragged)
     space.add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8), beside=ragged)
-    return space.found
+    return space
 
 
 def _add_shape(
@@ -360,10 +362,14 @@ def _add_shape(
     scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
     ends = _inwards(laid.corners_map, shape.is_elongated)
     shorter, ways = (ends[0][0] + ends[1][0]) / 2, [(part, laid, scatter)]
-    if shape.is_elongated and (series := _in_series(candidates, laid, shorter, shape.sigma_m, weight)):
-        longer_m, sigma_m, often = series
-        stretched = laid.corners_map - (longer_m[:, None] * shorter).reshape(-1, 4, 2)
-        about = scatter + sigma_m[:, None, None] ** 2 * _outer(shorter)
+    series = None
+    if shape.is_elongated:
+        series = in_series(candidates, space.believed, laid, shorter, shape.sigma_m, weight)
+    if series is not None:
+        space.series = space.series or series
+        stretched = laid.corners_map - (series.longer_m[:, None] * shorter).reshape(-1, 4, 2)
+        about = scatter + series.longer_sigma_m[:, None, None] ** 2 * _outer(shorter)
+        often = series.longer_often
         ways = [
             (part * (1 - often), laid, scatter),
             (part * often, replace(laid, corners_map=stretched), about),
@@ -436,9 +442,7 @@ def _worn_evidence(
     count.
     """
     whole = candidates.known.all(axis=1)
-    variance = [
-        _along(candidates.covariance_m2, end / 2, (end + ends[k ^ 1]) / 2) for k, end in enumerate(ends)
-    ]
+    variance = [candidates.along(end / 2, (end + ends[k ^ 1]) / 2) for k, end in enumerate(ends)]
     sigma = 0.5 * np.log(np.maximum(variance, 0.0) + SHAPE_SIGMA_M**2)
     off = sigma - np.median(sigma[:, weight * whole > 0.5])
     worn, sound = norm.pdf(off, *_WORN_SPREAD), norm.pdf(off, *_SOUND_SPREAD)
@@ -456,56 +460,6 @@ def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
     return np.asarray(np.logaddexp(_rates(vague, found, 1.0, 1.0) - sound, 0.0) - np.log(2))
 
 
-def _in_series(
-    candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """How much longer (N,), m, dashes are for standing farther apart than others; its sigma (N,); how often.
-
-    The outer side of a bend is longer than its inner one, paint and gaps alike. 0 where no other follows in a
-    dash's line; None where too few do. Arguments are those of :func:`_other_lengths`.
-    """
-    sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
-    length_m, rows = np.linalg.norm(sides, axis=2).max(axis=1), np.arange(len(sides))
-    axis = sides[rows, np.linalg.norm(sides, axis=2).argmax(axis=1)] / length_m[:, None]
-    centre = candidates.corners_map.mean(axis=1)
-    near = cKDTree(centre).query(centre, min(_SERIES_NEAR, len(centre)))[1].reshape(len(centre), -1)
-    to, others = centre[near] - centre[:, None], axis[near]
-    along, alike = np.einsum("nki,ni->nk", to, axis), np.einsum("nki,ni->nk", others, axis)
-    across = to[..., 1] * axis[:, None, 0] - to[..., 0] * axis[:, None, 1]
-    across_other = to[..., 0] * others[..., 1] - to[..., 1] * others[..., 0]
-    turn = np.arccos(np.clip(np.abs(alike), 0.0, 1.0))
-    # The chord between two points of a circle makes equal angles with the tangents there.
-    beside_m = np.abs(across - np.sign(alike) * across_other) / 2
-    follows = (weight[near] > 0.5) & (np.abs(along) > length_m[:, None])
-    follows &= (turn < _SERIES_TURN_RAD) & (beside_m < _SERIES_BESIDE_M)
-    arc_m = np.linalg.norm(to, axis=2) / np.sinc(turn / 2 / np.pi)
-    ahead, behind = (np.where(follows & (sign * along > 0), arc_m, np.inf).min(axis=1) for sign in (1, -1))
-    apart_m = np.minimum(ahead, behind)  # where one lacks, there is a longer way on its side
-    with np.errstate(invalid="ignore"):
-        apart_m += np.where(
-            np.abs(ahead - behind) < _SERIES_UNEVEN * apart_m, np.abs(ahead - behind) / 2, 0.0
-        )
-    own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
-    variance = _along(candidates.covariance_m2, shorter, shorter) + sigma_m**2
-    usual = np.isfinite(apart_m) & (weight > 0.5) & (own_m**2 < 9 * variance)
-    if usual.sum() < _SERIES_LEAST:
-        return None
-    stretch = apart_m / np.median(apart_m[usual])
-    in_line = np.abs(np.log(stretch)) < np.log(_SERIES_STRETCH)
-    longer_m, known = length_m * np.where(in_line, stretch - 1, 0.0), in_line & (weight > 0.5)
-    if known.sum() < _SERIES_LEAST:
-        return None
-    own_m, variance, stretched_m = own_m[known], variance[known], longer_m[known]
-    spread_m, often = float(np.median(np.abs(own_m - stretched_m)) / norm.ppf(0.75)), 0.5
-    spread_m = min(spread_m, MEMBER_M)  # what scatters more is in no series
-    fixed = norm.pdf(own_m, 0.0, np.sqrt(variance))
-    series = norm.pdf(own_m, stretched_m, np.sqrt(variance + spread_m**2))
-    for _ in range(_PASSES):
-        both = often * series + (1 - often) * fixed
-        often = float((1 + np.sum(often * series / np.maximum(both, 1e-300))) / (2 + len(own_m)))
-    return longer_m, np.where(in_line, spread_m, 0.0), often
-
-
 def _other_lengths(
     candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
 ) -> tuple[float, FloatArray]:
@@ -515,7 +469,7 @@ def _other_lengths(
     shortens it by 1 m.
     """
     off_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
-    own_m2 = _along(candidates.covariance_m2, shorter, shorter)
+    own_m2 = candidates.along(shorter, shorter)
     squared = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + weight @ np.maximum(off_m**2 - own_m2, 0.0)
     spread_m = float(np.sqrt(squared / (_REPEATED_COUNT + weight.sum())))
     alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + spread_m**2))
@@ -523,11 +477,6 @@ def _other_lengths(
     alike = weight * (1 - np.eye(len(weight))) * norm.pdf(off_m, off_m[:, None], apart)
     drawn = (_REPEATED_COUNT * alone + alike.sum(axis=1)) / (_REPEATED_COUNT + weight.sum() - weight)
     return spread_m, np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
-
-
-def _along(covariance: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Covariances (N,) of what moves along two directions (N, 8) each."""
-    return np.asarray(np.einsum("ni,nij,nj->n", first, covariance, second))
 
 
 def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:

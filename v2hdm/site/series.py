@@ -1,0 +1,157 @@
+"""Dashes of a line: how far apart they stand says how long each is, and where its middle lies.
+
+The outer side of a bend is longer than its inner one, paint and gaps alike. Between two others of its line a
+dash lies midway. How often both hold, and how exactly, is learned from the drive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+from v2hdm.records import BoolArray, FloatArray
+from v2hdm.site.candidates import Candidates
+from v2hdm.site.shapes import MEMBER_M, Laid
+
+_TURN_RAD, _BESIDE_M = 1.0, 0.5
+"""Most that a line turns by from one dash to the next, a bend of 6 m radius where they are 6 m apart, and how
+far at most they lie beside an arc between them: lines are farther apart."""
+
+_UNEVEN = 1 / 6
+"""Of the way between two neighbours, the most by which its parts differ: none, or a third where one lacks."""
+
+_STRETCH = 1.5  # most by which a bend stretches or shrinks a line: 4 m beside a middle of 12 m radius
+_ASIDE_M = 2.0  # sigma of how far a line lies beside the middle of its bend, along which dashes were laid out
+_NEAR = 32  # dashes nearest to one, among which those of its line are looked for
+_LEAST = 3  # dashes of their class's length that others follow: enough for a median
+_PASSES = 2  # rounds of expectation maximisation
+
+
+@dataclass(frozen=True)
+class Series:
+    """What the neighbours in its line say of each of N dashes."""
+
+    longer_m: FloatArray  # (N,) than one of the class, 0 where no other follows
+    longer_sigma_m: FloatArray  # (N,)
+    longer_often: float  # share of the dashes whose length follows from the way to the next ones
+    apart_m: FloatArray  # (N,) from the next one
+    middle: FloatArray  # (N, 8) takes corners to the place of their mean along the dash
+    middle_m: FloatArray  # (N,) where that is expected, nan where not two others enclose it
+    middle_sigma_m: FloatArray  # (N,)
+    middle_often: float  # share of the dashes that lie so
+
+    def evidence(self, corners: Candidates) -> FloatArray:
+        """Log likelihood ratio (N,) of a marking's ``corners`` to one anywhere along its line."""
+        off_m = _times(self.middle, corners) - self.middle_m
+        sigma_m = np.sqrt(self.middle_sigma_m**2 + corners.along(self.middle, self.middle))
+        ratio = norm.pdf(np.nan_to_num(off_m), 0.0, sigma_m) * np.where(np.isnan(off_m), 1.0, self.apart_m)
+        found = np.log(self.middle_often * ratio + 1 - self.middle_often)
+        return np.asarray(np.where(np.isnan(off_m), 0.0, found))
+
+
+def in_series(
+    candidates: Candidates,
+    believed: Candidates,
+    laid: Laid,
+    shorter: FloatArray,
+    sigma_m: float,
+    weight: FloatArray,
+) -> Series | None:
+    """What N solved dashes say of each other, ``believed`` to be where they are; None where too few follow.
+
+    ``laid`` is a shape of sigma ``sigma_m`` laid on each, ``shorter`` (N, 8) shortens it by 1 m, ``weight``
+    (N,) is the probability of being a marking.
+    """
+    sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
+    lengths, rows = np.linalg.norm(sides, axis=2), np.arange(len(sides))
+    longest = lengths.argmax(axis=1)
+    length_m = lengths[rows, longest]
+    axis = sides[rows, longest] / length_m[:, None]
+    marking = weight > 0.5
+    apart_m, apart_m2, off_m, off_m2 = _ways(believed, axis, length_m, marking)
+    own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
+    variance = candidates.along(shorter, shorter) + sigma_m**2
+    usual = np.isfinite(apart_m) & marking & (own_m**2 < 9 * variance)
+    if usual.sum() < _LEAST:
+        return None
+    stretch, step_m = apart_m / np.median(apart_m[usual]), np.median(apart_m[usual])
+    in_line = np.abs(np.log(stretch)) < np.log(_STRETCH)
+    known = in_line & marking
+    if known.sum() < _LEAST:
+        return None
+    longer_m = length_m * np.where(in_line, stretch - 1, 0.0)
+    longer_m2 = np.where(in_line, (length_m / step_m) ** 2 * apart_m2, 0.0)
+    fixed = norm.pdf(own_m[known], 0.0, np.sqrt(variance[known]))
+    spread_m, often = _regularity((own_m - longer_m)[known], (variance + longer_m2)[known], fixed)
+    longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
+    middle = np.tile(axis, 4) / 4
+    enclosed = known & np.isfinite(off_m)
+    scatter_m, midway = MEMBER_M, 0.0
+    if enclosed.sum() >= _LEAST:
+        own_m2 = believed.along(middle, middle) + off_m2
+        scatter_m, midway = _regularity(off_m[enclosed], own_m2[enclosed], 1 / apart_m[enclosed])
+    middle_m = _times(middle, believed) + off_m
+    return Series(
+        longer_m, longer_sigma_m, often, apart_m, middle, middle_m, np.sqrt(off_m2 + scatter_m**2), midway
+    )
+
+
+def _ways(
+    believed: Candidates, axis: FloatArray, length_m: FloatArray, marking: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """How far apart N dashes and their neighbours are, m, and how far they lie behind the middle; variances.
+
+    inf where a dash has no neighbour, nan where it has no two that enclose it alone.
+    """
+    centre = believed.corners_map.mean(axis=1)
+    near = cKDTree(centre).query(centre, min(_NEAR, len(centre)))[1].reshape(len(centre), -1)
+    to, others = centre[near] - centre[:, None], axis[near]
+    along, alike = np.einsum("nki,ni->nk", to, axis), np.einsum("nki,ni->nk", others, axis)
+    others *= np.where(alike < 0, -1.0, 1.0)[..., None]
+    across, across_other = _cross(axis[:, None], to), _cross(to, others)
+    turn = np.arctan2(_cross(axis[:, None], others), np.abs(alike))
+    # The chord between two points of a circle makes equal angles with the tangents there.
+    beside_m = np.abs(across - across_other) / 2
+    follows = marking[near] & (np.abs(along) > length_m[:, None])
+    follows &= (np.abs(turn) < _TURN_RAD) & (beside_m < _BESIDE_M)
+    arc_m = np.linalg.norm(to, axis=2) / np.sinc(turn / 2 / np.pi)
+    middle = np.tile(axis, 4) / 4
+    own_m2 = believed.along(middle, middle)
+    ways = [np.where(follows & (sign * along > 0), arc_m, np.inf) for sign in (1, -1)]
+    (ahead, ahead_m2, ahead_rad), (behind, behind_m2, behind_rad) = (
+        (way.min(axis=1), *(each[np.arange(len(near)), way.argmin(axis=1)] for each in (own_m2[near], turn)))
+        for way in ways
+    )
+    with np.errstate(invalid="ignore"):
+        enclosed = np.abs(ahead - behind) < _UNEVEN * (ahead + behind)
+        apart_m = np.where(enclosed, (ahead + behind) / 2, np.minimum(ahead, behind))
+        off_m = np.where(enclosed, (ahead - behind) / 2, np.nan)
+    # Where a bend begins the ways differ by what the line is aside of its middle times the turns' difference.
+    off_m2 = (ahead_m2 + behind_m2 + (_ASIDE_M * (ahead_rad + behind_rad)) ** 2) / 4
+    apart_m2 = np.where(enclosed, off_m2, own_m2 + np.where(ahead < behind, ahead_m2, behind_m2))
+    return apart_m, apart_m2, off_m, off_m2
+
+
+def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) -> tuple[float, float]:
+    """How much dashes scatter about what their line says, m, and how often they follow it.
+
+    From how far off they are (N,), the variance of that, and its density (N,) ``otherwise``.
+    """
+    # What scatters more than a class's markings do is in no series.
+    spread_m, often = min(float(np.median(np.abs(off_m)) / norm.ppf(0.75)), MEMBER_M), 0.5
+    series = norm.pdf(off_m, 0.0, np.sqrt(variance + spread_m**2))
+    for _ in range(_PASSES):
+        both = often * series + (1 - often) * otherwise
+        often = float((1 + np.sum(often * series / np.maximum(both, 1e-300))) / (2 + len(off_m)))
+    return spread_m, often
+
+
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
+def _times(middle: FloatArray, corners: Candidates) -> FloatArray:
+    return np.asarray(np.sum(middle * corners.corners_map.reshape(-1, 8), axis=1))
