@@ -77,6 +77,7 @@ class Order:
         source, here = self.source.resolve(), Path.cwd()
         shown = source.relative_to(here) if source.is_relative_to(here) else source.name
         kept = f" --keep {' '.join(self.keep)}" if self.keep else ""
+        kept += f" --labels {self.labels.name}" if self.labels else ""
         images = f"--judge-images {self.judge_images} --lane-images {self.lane_images}"
         return f"python -m train.ship {shown} --precision {self.precision} {images}{kept}"
 
