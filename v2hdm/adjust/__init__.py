@@ -19,9 +19,8 @@ from v2hdm.adjust.problem import (
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
 from v2hdm.adjust.sensitivity import height_information, moves_with_heights
-from v2hdm.adjust.solution import Solution, Status
+from v2hdm.adjust.solution import Solution, Status, Verdict, line_variance_factor
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.validation import Verdict, line_variance_factor
 
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
