@@ -42,7 +42,7 @@ from v2hdm.errors import V2hdmError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
 from v2hdm.mapping.recovery import doubt, log_odds, matters
-from v2hdm.pipeline.camera_sets import BEST, camera_sets
+from v2hdm.pipeline.stages import BEST, camera_sets
 from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.engine import Engine
-from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
+from v2hdm.adjust.engines.numba.layout import one_thread_in_torch
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.reduced import Plan
 from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient

@@ -187,7 +187,7 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
     """Observations (K,) by corner, then camera, then frame; corner, pair and what was measured of each."""
-    from v2hdm.adjust.engines.numba.prepare import Seen, lay_out  # loads numba
+    from v2hdm.adjust.engines.numba.layout import Seen, lay_out  # loads numba
 
     seen, count = Seen.of(problem.observations.columns, problem.intrinsic), len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)

@@ -17,7 +17,7 @@ from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
 from v2hdm.adjust.engine import Engine
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
+from v2hdm.adjust.engines.numba.layout import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, depression_sine, frame_tangent
 from v2hdm.adjust.problem import Problem, SolveOptions

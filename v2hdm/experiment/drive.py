@@ -19,11 +19,10 @@ from v2hdm.experiment.plan import OURS, RECIPES, Job
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.camera_sets import camera_sets, map_camera_sets
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
+from v2hdm.pipeline.stages import camera_sets, detect_in_pieces, map_camera_sets
 from v2hdm.pipeline.survey import take_survey
 from v2hdm.progress import Progress
 from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, IntArray, Marking, Truth

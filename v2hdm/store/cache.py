@@ -29,8 +29,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, need
 from v2hdm.store.files import file_digest
-from v2hdm.store.folders import LIST, is_stale, remove_ours, size_of
-from v2hdm.store.lock import HOST, STAGES, in_use, unused_before
+from v2hdm.store.folders import HOST, LIST, STAGES, in_use, is_stale, remove_ours, size_of, unused_before
 
 _log = logging.getLogger(__name__)
 _Value = TypeVar("_Value")

@@ -18,7 +18,7 @@ from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
-from v2hdm.io.importers.bag.tf import TF_TOPIC
+from v2hdm.io.importers.bag.messages import TF_TOPIC
 from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
 from v2hdm.io.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list

@@ -17,8 +17,7 @@ from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
 from v2hdm.adjust.engine import Engine, Evaluated, Linearised
 from v2hdm.adjust.engines.numba import evaluate, frames, linearise, observe
 from v2hdm.adjust.engines.numba.evaluate import Evaluation
-from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
-from v2hdm.adjust.engines.numba.pool import share
+from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout, share
 from v2hdm.adjust.engines.numba.tables import cam_from_map, move, prior_blocks_of, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
