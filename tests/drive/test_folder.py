@@ -27,8 +27,7 @@ from tests.drive.example import (
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.io.calibration.mounting import ipm_from_guess, take_ipm, take_roi
-from v2hdm.io.calibration.reading import read_camera_info
+from v2hdm.io.calibration.reading import ipm_from_guess, read_camera_info, take_ipm, take_roi
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES

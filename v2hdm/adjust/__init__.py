@@ -6,7 +6,6 @@ residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them
 """
 
 from v2hdm.adjust.noise import estimate_noise
-from v2hdm.adjust.observability import observability, pose_innovations
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -19,7 +18,14 @@ from v2hdm.adjust.problem import (
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
 from v2hdm.adjust.sensitivity import height_information, moves_with_heights
-from v2hdm.adjust.solution import Solution, Status, Verdict, line_variance_factor
+from v2hdm.adjust.solution import (
+    Solution,
+    Status,
+    Verdict,
+    line_variance_factor,
+    observability,
+    pose_innovations,
+)
 from v2hdm.adjust.solve import solve
 
 __all__ = [

@@ -32,9 +32,8 @@ from v2hdm.site.changes import Base
 from v2hdm.site.wear import with_wear
 from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.goal import check_goal
+from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes
 from v2hdm.verdict.results.solution import check_result, over_ground
-from v2hdm.verdict.results.survey import check_corrections, check_known_sizes
 
 _log = logging.getLogger(__name__)
 

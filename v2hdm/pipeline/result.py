@@ -18,8 +18,7 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import ConfigError, DriveError, MapFileError, MappingError
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.planar import length_along
-from v2hdm.geometry.rigid import inverse
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration, write_calibration_as
 from v2hdm.io.drive import ReadOptions, told_of

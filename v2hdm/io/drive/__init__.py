@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import DriveError, MapFileError
-from v2hdm.geometry.trajectory import with_clock_offsets
+from v2hdm.geometry.rigid import with_clock_offsets
 from v2hdm.io.drive.folder import folder_drive_name, is_folder_drive, read_description, read_folder_drive
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives

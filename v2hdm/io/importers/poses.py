@@ -17,8 +17,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
-from v2hdm.geometry.rigid import make_transform, rotation_from_euler
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
 from v2hdm.io.importers import nmea, tables
 from v2hdm.io.importers.tables import Readings
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose

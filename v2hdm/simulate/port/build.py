@@ -26,8 +26,7 @@ from v2hdm.simulate.port.config import (
     YardConfig,
 )
 from v2hdm.simulate.port.paint import build_layout
-from v2hdm.simulate.port.relief import build_relief, stands
-from v2hdm.simulate.port.route import DrivenPoses, Route, build_route, drive_along
+from v2hdm.simulate.port.route import DrivenPoses, Route, build_relief, build_route, drive_along, stands
 from v2hdm.simulate.render import scene as parts
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
