@@ -16,10 +16,7 @@ _MAX_SLOPE = 573.0
 
 
 def check_problem(problem: Problem) -> None:
-    """Raise :class:`AdjustError` for the first thing in ``problem`` that cannot be solved with.
-
-    Except observations that are there twice: :func:`v2hdm.adjust.layout.make_arrays` finds them as it sorts.
-    """
+    """Raise :class:`AdjustError` for what cannot be solved with, observations that are there twice apart."""
     _check_arrays(problem)
     wrong = (problem.intrinsic[:, :2] <= 0).any(1)
     _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")

@@ -97,11 +97,7 @@ def make_arrays(
     clock_offset: bool = False,
     read_out: bool = False,
 ) -> Arrays:
-    """Lay a checked problem out for the solver.
-
-    Raises AdjustError where an image has two observations of a corner, or known lengths join too many
-    corners.
-    """
+    """Lay a checked problem out; AdjustError where an image has a corner twice or lengths join too many."""
 
     def real(values: FloatArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)

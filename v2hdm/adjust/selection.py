@@ -140,10 +140,7 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
 
 
 def predicts_better(problem: Problem, rival: Problem, options: SolveOptions) -> bool:
-    """Whether ``problem`` surely predicts held-out observations better than ``rival``, which moves them.
-
-    Surely means by more than three standard errors of the paired difference, as in :func:`select_model`.
-    """
+    """Whether ``problem`` predicts held-out observations better than ``rival``, by three standard errors."""
     chosen = _stretch(problem)
     held_out = _held_out(restrict(problem, chosen)[0].observations)
     if np.count_nonzero(held_out) < _MIN_HELD_OUT:

@@ -44,10 +44,7 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
 
 
 def line_variance_factor(squared: FloatArray, taken: float) -> float:
-    """How many times as large as stated the variance of lines is, by the median of ``squared`` (K,).
-
-    ``taken`` is the share of their degrees of freedom that unknowns take.
-    """
+    """How much larger than stated lines' variance is, by the median; unknowns take the share ``taken``."""
     if not len(squared):
         return 1.0
     of_line = float(chi2.isf(np.exp(-np.median(squared) / 2), 1))

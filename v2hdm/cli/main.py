@@ -116,7 +116,7 @@ COMMANDS = {
     name: Command(f"v2hdm {name}", says, _EXTRAS.get(name, "map"), _INTERRUPTED.get(name, _NOTHING))
     for name, says in _SAYS.items()
 }
-_HOMES = {
+HOMES = {
     **{name: ("results", name) for name in ("report", "view", "labels", "mosaic")},
     **{"map": ("runs", "map_drive"), "experiment": ("runs", "experiment"), "fleet": ("runs", "fleet")},
     "calibrate points": ("calibrate", "from_points"),
@@ -171,7 +171,7 @@ def run(arguments: Sequence[str]) -> int:
     given = words[len(name.split()) :]
     below = [one for one in COMMANDS if words and one.startswith(f"{words[0]} ")]
     if name and "--version" not in given:
-        module, function = _HOMES.get(name, (name, "run"))
+        module, function = HOMES.get(name, (name, "run"))
         home = f"v2hdm.cli.{module}"
         return COMMANDS[name].guard(lambda: getattr(importlib.import_module(home), function)(given))
     if "--version" in (given if name else words[:1]):

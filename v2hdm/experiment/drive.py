@@ -33,10 +33,7 @@ from v2hdm.store.cache import StageCache
 
 
 def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:
-    """The record of a drive and of its maps by every recipe, as :func:`measure` takes it.
-
-    Raises V2hdmError where the drive cannot be read or has no truth.
-    """
+    """The record of a drive and its maps by recipe, for :func:`measure`. V2hdmError without a truth."""
     folder = Path(job.site.drive.path or "")
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))

@@ -93,10 +93,7 @@ def log(dst_from_src: FloatArray) -> FloatArray:
 
 
 def adjoint(dst_from_src: FloatArray) -> FloatArray:
-    """The matrices (..., 6, 6) that take tangents of ``src`` to ``dst``.
-
-    ``dst_from_src @ exp(x) == exp(adjoint(dst_from_src) @ x) @ dst_from_src``.
-    """
+    """Matrices (..., 6, 6) that take tangents of ``src`` to ``dst``: ``A exp(x) = exp(adjoint(A) x) A``."""
     rotation = dst_from_src[..., :3, :3]
     out = np.zeros((*dst_from_src.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = rotation

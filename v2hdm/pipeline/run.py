@@ -51,10 +51,7 @@ _RECORD = ".v2hdm-finished"  # object beside a result at a store, which says wha
 
 @dataclass(frozen=True)
 class RunResult:
-    """The folder of a run, ``metrics.json``'s content, sentences for a reader, and the verdict.
-
-    Where the results are at an object store, ``url`` says where, and the folder is gone.
-    """
+    """A run's folder, or ``url`` if sent away, ``metrics.json``'s content, sentences, and the verdict."""
 
     folder: Path
     metrics: Mapping[str, Any]

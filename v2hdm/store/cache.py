@@ -282,10 +282,7 @@ def items_of(cache: Path) -> list[Item]:
 
 
 def prune(cache: Path, limit: float) -> list[Item]:
-    """Remove what was unused for longest until the rest has ``limit`` bytes, and all that killed runs left.
-
-    Returns what was removed. More than the limit stays where runs in progress use it.
-    """
+    """Remove what was unused longest until ``limit`` bytes are left, and killed runs' rests; returns it."""
     before_s, items, removed = unused_before(cache), items_of(cache), []
     size = sum(item.size for item in items)
     for item in items:

@@ -72,10 +72,7 @@ class Route:
 
 
 def build_route(config: RouteConfig) -> Route:
-    """Integrate the pieces of a route from the map's origin, heading along x.
-
-    Curvature ramps over 4 m between pieces, as a steered vehicle's does.
-    """
+    """Integrate a route's pieces from the origin, heading along x; between them curvature ramps over 4 m."""
     steps = [(max(round(length / _STEP_M), 1), np.deg2rad(turn) / length) for length, turn in config.pieces]
     curvature = np.concatenate([np.full(count, bend) for count, bend in steps])
     window = int(_TRANSITION_M / _STEP_M)
@@ -229,10 +226,7 @@ _WHEELS_M = np.array([[2.8, 0.8], [2.8, -0.8], [0.0, 0.8], [0.0, -0.8]])
 
 
 def build_relief(config: ReliefConfig, route: Route) -> Relief | None:
-    """The heights around a route, None where they make a plane z = 0.
-
-    Raises ConfigError when the ramp is not part of the route.
-    """
+    """The heights around a route, None if a plane z = 0; ConfigError where it does not have the ramp."""
     if not any((config.grade, config.crown, config.ramp, config.bank, config.gully_m, config.kerb_m)):
         return None
     if config.ramp_at_m + config.ramp_length_m > route.length_m:

@@ -59,10 +59,7 @@ def _rays(width: int, height: int, intrinsic: bytes, model: str, distortion: tup
 
 
 def camera_rays(info: CameraInfo) -> Rays:
-    """The rays of a camera, remembered for the last few cameras.
-
-    The lens is inverted on a grid of 8 px and interpolated: at most 0.01 px off for usual lenses.
-    """
+    """The rays of a camera, remembered for the last few; inverted on a grid of 8 px: at most 0.01 px off."""
     intrinsic = np.ascontiguousarray(info.intrinsic, dtype=np.float64).tobytes()
     return _rays(info.width, info.height, intrinsic, info.distortion_model, tuple(info.distortion))
 

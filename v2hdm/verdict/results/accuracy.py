@@ -32,10 +32,7 @@ _CIRCLE_95 = 2.4477  # radius, in sigmas of a coordinate, where both have the sa
 
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
-    """The map against the largest 95 % radius ``goal_m``, then each mounting.
-
-    ``frame`` is what the map's frame rests on, ``poses`` or ``survey``.
-    """
+    """The map, in a ``frame`` of poses or survey, against the 95 % radius ``goal_m``, then each mounting."""
     markings, goal = best.hd_map.markings, f"; goal {100 * goal_m:g} cm"
     if markings:
         radius_m = np.array([_corner_radii_m(one) for one in markings])

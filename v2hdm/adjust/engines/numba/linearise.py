@@ -43,10 +43,7 @@ class Linearisation(NamedTuple):
 def differentiate(
     layout: Layout, table: FloatArray, k: int, x: float, y: float, jacobian: FloatArray
 ) -> tuple[float, float, float, float, float]:
-    """Write the derivatives (16,) of observation k's residual: by pair (2, 6), then by corner (2, 2).
-
-    Returns its residual and its point.
-    """
+    """Write the derivatives (16,) of observation k's residual, by pair and corner; it and its point."""
     px, py, pz, inverse, slope, u, v = see(layout, table, k, x, y)
     a, b, c = layout.root[0, k], layout.root[1, k], layout.root[2, k]
     ad, bd, cd = a * inverse, b * inverse, c * inverse
