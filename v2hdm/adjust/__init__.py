@@ -5,7 +5,6 @@ inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hd
 residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
 """
 
-from v2hdm.adjust.noise import estimate_noise
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -16,7 +15,7 @@ from v2hdm.adjust.problem import (
     SolveOptions,
 )  # fmt: skip
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
-from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
+from v2hdm.adjust.selection import MODELS, estimate_noise, predicts_better, select_model, with_model
 from v2hdm.adjust.sensitivity import height_information, moves_with_heights
 from v2hdm.adjust.solution import (
     Solution,
