@@ -46,8 +46,7 @@ from v2hdm.pipeline.stages import BEST, camera_sets
 from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
-from v2hdm.verdict.inputs.cameras import check_camera
-from v2hdm.verdict.inputs.drive import causes, check_road
+from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks

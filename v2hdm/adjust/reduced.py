@@ -3,8 +3,8 @@
 S = U - B' B (:mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the tiles in
 elimination order, padded to whole tiles, then the cameras' unknowns. Tiles are of frames along the route or
 of *kept* corners: where several drives pass the same corners, eliminating these first would couple the frames
-of all drives with one another, and it takes less to eliminate each drive's frames before them. The corners' own block
-V is factorised by blocks of 2 x 2, or as many as known lengths join.
+of all drives with one another, and it takes less to eliminate each drive's frames before them. The corners'
+own block V is factorised by blocks of 2 x 2, or as many as known lengths join.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""``v2hdm detect SOURCE``: one JSON object per image, percentiles of the latency at the end on stderr.
-
-It needs the base install only (numpy, opencv, onnxruntime, PyYAML). docs/detect.md describes it.
-"""
+"""``v2hdm detect SOURCE`` (docs/detect.md), for which the base install is enough."""
 
 from __future__ import annotations
 

@@ -117,6 +117,7 @@ COMMANDS = {
     for name, says in _SAYS.items()
 }
 HOMES = {
+    **{"check": ("drives", "check"), "localize": ("drives", "localize_drive")},
     **{name: ("results", name) for name in ("report", "view", "labels", "mosaic")},
     **{"map": ("runs", "map_drive"), "experiment": ("runs", "experiment"), "fleet": ("runs", "fleet")},
     "calibrate points": ("calibrate", "from_points"),

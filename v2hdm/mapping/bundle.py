@@ -1,7 +1,4 @@
-"""One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
-
-Sizes that a user states for classes, and corners that a survey has measured, are constraints on corners.
-"""
+"""One joint solve over groups of sightings; known sizes and surveyed corners constrain it."""
 
 from __future__ import annotations
 

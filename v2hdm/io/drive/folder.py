@@ -1,7 +1,4 @@
-"""The project's own drive folder: TUM poses, ROS camera_info, image lists, one ``drive.yaml``.
-
-docs/drive-format.md describes it for those who want to make one.
-"""
+"""The project's own drive folder (docs/drive-format.md): TUM poses, ROS camera_info, image lists."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Sources of a drive's images, intrinsics and poses: files, an image folder, a video, topics of a bag.
-
-All that a drive wants of its bag is gathered first and then imported in one pass.
-"""
+"""Sources of images, intrinsics and poses: files, a folder, a video, topics of a bag read in one pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cost, gradient and Gauss-Newton blocks in one pass, corners eliminated unit by unit, then frames."""
+"""Cost, gradient and Gauss-Newton blocks in one pass, corners eliminated unit by unit, and the frames."""
 
 from __future__ import annotations
 

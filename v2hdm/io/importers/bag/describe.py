@@ -1,7 +1,4 @@
-"""A bag without a ``drive.yaml``: its description from its topics and frames, as far as they suffice.
-
-The mounting of the cameras comes from ``/tf_static``.
-"""
+"""A bag without a ``drive.yaml``: its description from topics and frames, as far as they suffice."""
 
 from __future__ import annotations
 

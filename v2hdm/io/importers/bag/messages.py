@@ -1,7 +1,4 @@
-"""Messages of bags: images and video as bytes of image files, poses and headings as readings, and frames.
-
-Frames are fixed (``/tf_static``) or move (``/tf``); transforms lead between any two.
-"""
+"""Messages of bags: images and video as image files, poses and headings as readings, and moving frames."""
 
 from __future__ import annotations
 
