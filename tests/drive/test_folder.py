@@ -34,7 +34,7 @@ from v2hdm.io.drive.sources import IMAGE_SOURCES
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
-from v2hdm.io.importers.tables import NAMES
+from v2hdm.io.importers.readings import NAMES
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import read_image_list, read_tum, write_tum
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise

@@ -173,11 +173,7 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
 def _start(
     problem: Problem, engine: Engine, robust: Loss, options: SolveOptions
 ) -> tuple[Estimate, Whitening | None, int]:
-    """Where the descent starts, its first whitening if that is known, and the evaluations spent.
-
-    A coarse stage comes first where the start is far off, or the problem large. Raises AdjustError where none
-    of a corner's rays fixes it.
-    """
+    """Where the descent starts, its first whitening if known, evaluations spent. Raises AdjustError."""
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
     if options.coarse and not is_worth_a_look(engine.arrays):
         estimate, corner = _estimate(problem, engine, cam_from_vehicle)

@@ -217,11 +217,7 @@ class Alignment(NamedTuple):
 
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
-    """The quadrilateral (4, 2) that encloses a convex hull (N, 1, 2) most tightly; None where there is none.
-
-    Sides of the hull are merged until four are left (Low and Ilie, Computer Vision and Graphics, 2003, in
-    OpenCV's approxPolyN).
-    """
+    """The tightest quadrilateral (4, 2) about a hull (N, 1, 2), or None (Low and Ilie 2003, approxPolyN)."""
     if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
         return None
     quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)

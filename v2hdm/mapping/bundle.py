@@ -38,10 +38,7 @@ from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, Pose
 def vehicle_twists(
     map_from_vehicle: FloatArray, stamp_s: FloatArray, visit: IntArray | None = None
 ) -> FloatArray:
-    """Twists (F, 6) of the vehicle in its own frame, m/s then rad/s, at poses (F, 4, 4) at times (F,).
-
-    Central differences, one-sided at the ends of each ``visit`` (F,); a single pose has no motion.
-    """
+    """Twists (F, 6) of the vehicle in its frame, m/s, rad/s, by central differences within each ``visit``."""
     own = np.arange(len(stamp_s))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(own) - 1)
     if visit is not None:

@@ -83,10 +83,7 @@ def assemble_drive(
     where: str,
     mount_rad: FloatArray | None = None,
 ) -> Drive:
-    """The drive of its ``recorded`` poses: the road laid flat, every image of ``files`` posed and checked.
-
-    ``mount_rad`` is the sensor's turn where the poses have lost it.
-    """
+    """The drive of ``recorded`` poses, the road laid flat, images posed; ``mount_rad`` is a lost turn."""
     assert drive.recorded is not None
     check_trajectory(drive.recorded, drive.origin, where)
     laid = lay_flat(drive.recorded, drive.pose_noise.position_m)

@@ -72,19 +72,9 @@ def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None
 
 @inlined
 def add_camera(
-    coupling: FloatArray,
-    j: int,
-    clock: FloatArray,
-    t: int,
-    each: int,
-    rows: FloatArray,
-    i: int,
-    column: int,
+    coupling: FloatArray, j: int, clock: FloatArray, t: int, each: int, rows: FloatArray, i: int, column: int
 ) -> None:
-    """Add W' in row j of ``coupling``, by pair t, to the ``each`` unknowns of its camera, from ``column`` on.
-
-    ``rows`` i and i + 1 are those of the corner's two coordinates.
-    """
+    """Add W' in row j of ``coupling``, by pair t, to rows i, i + 1 at its camera's ``each`` unknowns."""
     for p in range(6):
         rows[i, column + p] += coupling[j, p]
         rows[i + 1, column + p] += coupling[j, 6 + p]

@@ -35,8 +35,7 @@ from v2hdm.io.importers.bag.messages import (
     transform_rows,
 )
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
-from v2hdm.io.importers.nmea import nmea_readings
-from v2hdm.io.importers.tables import Readings
+from v2hdm.io.importers.readings import Readings, nmea_readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
