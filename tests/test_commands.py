@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from v2hdm import __version__
-from v2hdm.cli.main import COMMANDS, run, version_line
+from v2hdm.cli.main import COMMANDS, HOMES, run, version_line
 from v2hdm.progress import patient
 
 ROOT = Path(__file__).parents[1]
@@ -169,7 +169,7 @@ def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(capsys):
     assert run(["calibrate"]) == 0
     assert capsys.readouterr().out.count("\n  calibrate ") == 3
     for name in COMMANDS:
-        assert (ROOT / "v2hdm" / "cli" / f"{name.replace(' ', '_')}.py").is_file(), name
+        assert (ROOT / "v2hdm" / "cli" / f"{HOMES.get(name, (name,))[0]}.py").is_file(), name
     assert run(["calibrate", "pints"]) == 2
     assert (
         capsys.readouterr().err == "error: v2hdm calibrate pints: no such command; v2hdm --help lists them\n"

@@ -49,7 +49,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
-from v2hdm.geometry.quadrilateral import Quad, following
+from v2hdm.geometry.planar import Quad, following
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text, whole_file
 

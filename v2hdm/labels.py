@@ -27,8 +27,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, has_distortion
 from v2hdm.geometry.planar import clip_convex, clip_half, densified, rectangle_size, signed_area
-from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts

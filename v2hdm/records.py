@@ -314,11 +314,7 @@ class Marking:
 
 @dataclass(frozen=True)
 class Symbol:
-    """One mapped symbol; heights and id as of a :class:`Marking`.
-
-    The vertices of its outline have the joint covariance ``covariance_m2`` (2N, 2N); None in maps that state
-    none.
-    """
+    """One mapped symbol, as a :class:`Marking`; ``covariance_m2`` (2N, 2N), if known, is of its vertices."""
 
     kind: str
     outline_map: FloatArray  # (N, 2) m, counter-clockwise from above, in one order for all of a template

@@ -25,6 +25,10 @@ from v2hdm.progress import Progress
 
 _TIDY_S = 30.0  # a worker without its parent may take this long to end, whatever it is in
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_TWICE_DEAD = (
+    "a worker process died twice over the same work (exit code {}), perhaps for want of memory; set fewer "
+    "workers= (--workers)"
+)
 
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
@@ -38,11 +42,7 @@ def share_out(
     arguments: tuple[object, ...],
     take: Callable[[_Result], None],
 ) -> None:
-    """Do short jobs in several processes and take their results in the order of the jobs.
-
-    Each process calls ``start`` first; an exception of either is raised here, WorkerError where one died,
-    twice.
-    """
+    """Do short jobs in processes that call ``start`` first; results in order, their errors or WorkerError."""
     found: dict[int, _Result] = {}
     taken, ready = 0, _Prepared(work, start, arguments)
     for number, result in side_by_side(ready, jobs, min(processes, len(jobs)), lambda *_: None):
@@ -101,7 +101,7 @@ def side_by_side(
                     del doing[pipe]
                     worker.process.join()
                     if number in died:
-                        yield number, _twice_dead(worker.process.exitcode)
+                        yield number, WorkerError(_TWICE_DEAD.format(worker.process.exitcode))
                     else:
                         died.add(number)
                         left.append(number)
@@ -150,13 +150,6 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection) -> None:
             except Exception as failure:
                 outcome = "failed", failure, traceback.format_exc()
             pipe.send(outcome)
-
-
-def _twice_dead(code: int | None) -> WorkerError:
-    return WorkerError(
-        f"a worker process died twice over the same work (exit code {code}), perhaps for want of memory; set "
-        "fewer workers= (--workers)"
-    )
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.adjust.start import coarse_extrinsics
+from v2hdm.adjust.solve import coarse_extrinsics
 from v2hdm.errors import AdjustError
 
 PAPER = SolveOptions(pose_states=(), loss="none")

@@ -35,7 +35,7 @@ from tests.benchmarks.adjust_native import NativeOptions, build, solve_native
 from v2hdm.adjust import Problem, SolveOptions, solve
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.start import coarse_extrinsics
+from v2hdm.adjust.solve import coarse_extrinsics
 from v2hdm.errors import AdjustError
 
 # Ends are the same if their costs and their corners are: relative, and root mean square in m.

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from v2hdm.detection.frames import read_bgr
-from v2hdm.io.drive.of_result import drive_of
+from v2hdm.io.drive import drive_of
 from v2hdm.mosaic.blend import Canvas, Lens, Shot, whole
 from v2hdm.mosaic.result import MULTIPLE_PX, RESOLUTION_M, ground_of
 

@@ -42,12 +42,11 @@ from v2hdm.errors import V2hdmError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
 from v2hdm.mapping.recovery import doubt, log_odds, matters
-from v2hdm.pipeline.camera_sets import BEST, camera_sets
+from v2hdm.pipeline.stages import BEST, camera_sets
 from v2hdm.records import Drive, FloatArray, HdMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
-from v2hdm.verdict.inputs.cameras import check_camera
-from v2hdm.verdict.inputs.drive import causes, check_road
+from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks

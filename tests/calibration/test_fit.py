@@ -8,8 +8,7 @@ import pytest
 
 from tests.calibration.site import INFO, PLACES, clicked, mounting, project
 from v2hdm.calibration.fit import Noise, Seen, fit_mountings
-from v2hdm.calibration.points import SurveyedPoints
-from v2hdm.calibration.residuals import known_ground, lens, residuals
+from v2hdm.calibration.points import SurveyedPoints, known_ground, lens, residuals
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse, log

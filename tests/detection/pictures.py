@@ -24,7 +24,7 @@ from v2hdm.detection.network import AnchorRow, NetworkOutput
 from v2hdm.detection.patch import ImageQuads, Patches
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.quadrilateral import Quad, order_corners
+from v2hdm.geometry.planar import Quad, order_corners
 from v2hdm.records import DIAMOND, LANE_DASH, Camera, CameraInfo, LaneDetection
 
 HEIGHT, WIDTH = 360, 640

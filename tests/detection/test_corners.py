@@ -22,8 +22,7 @@ from v2hdm.detection.fit import fit_quadrilaterals
 from v2hdm.detection.lattice import variance_inflation
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.propose import open_sides
-from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import order_corners, side_frames
+from v2hdm.geometry.planar import order_corners, side_frames, signed_area
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Paint, Scene
 

@@ -20,7 +20,7 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.geometry.quadrilateral import order_corners
+from v2hdm.geometry.planar import order_corners
 from v2hdm.records import Drive, Image
 
 

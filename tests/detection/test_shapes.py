@@ -12,8 +12,7 @@ from v2hdm.detection.lattice import blurred_coverage
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.patch import ImageQuads, LensFrames
 from v2hdm.detection.propose import Blob, Proposal, find_blobs, on_edges, outline_polygon
-from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import Quad, order_corners, side_frames
+from v2hdm.geometry.planar import Quad, order_corners, side_frames, signed_area
 from v2hdm.records import DIAMOND, LANE_DASH
 
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))

@@ -18,7 +18,7 @@ from tests.docs.blocks import ROOT, blocks, document, documents
 from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
-from v2hdm.cli.main import COMMANDS
+from v2hdm.cli.main import COMMANDS, HOMES
 from v2hdm.io.maps.reading import read_geojson
 
 RUN_BY = {
@@ -155,23 +155,20 @@ def test_what_is_not_run_names_commands_and_settings_that_are_there(block, shell
             continue
         module, *arguments = shlex.split(called.group(1))
         if module == "v2hdm":
-            words = next(name.split() for name in COMMANDS if " ".join(arguments).startswith(name))
-            module, arguments = f"v2hdm.cli.{'_'.join(words)}", arguments[len(words) :]
+            name = next(one for one in COMMANDS if " ".join(arguments).startswith(one))
+            program, arguments = ["v2hdm", *name.split()], arguments[len(name.split()) :]
+            module = f"v2hdm.cli.{HOMES.get(name, (name,))[0]}"
+        else:
+            name, program = module.removeprefix("v2hdm."), ["python", "-m", module]
         assert importlib.util.find_spec(module) is not None, line
-        name = module.removeprefix("v2hdm.").removeprefix("cli.")
         if name in COMPOSED:
             own = ROOT / "docs" / "own-class"
             arguments = [one.replace("docs/own-class", str(own)) for one in arguments]
-            assert shell(shlex.join([*program_of(module), *arguments, "--cfg=job"]), tmp_path)
+            assert shell(shlex.join([*program, *arguments, "--cfg=job"]), tmp_path)
         else:
             source = "".join(path.read_text() for path in _sources(module))
             options = [one for one in arguments if one.startswith("--")]
             assert all(f'"{one}"' in source for one in options), line
-
-
-def program_of(module):
-    own = module.startswith("v2hdm.")
-    return ["v2hdm", module.rpartition(".")[2]] if own else ["python", "-m", module]
 
 
 def _sources(module):

@@ -27,15 +27,14 @@ from tests.drive.example import (
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.io.calibration.mounting import ipm_from_guess, take_ipm, take_roi
-from v2hdm.io.calibration.reading import read_camera_info
+from v2hdm.io.calibration.reading import ipm_from_guess, read_camera_info, take_ipm, take_roi
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
-from v2hdm.io.importers.tables import NAMES
+from v2hdm.io.importers.readings import NAMES
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import read_image_list, read_tum, write_tum
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise

@@ -14,11 +14,11 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.rigid import (
     heading_rad,
+    interpolate,
     quaternion_from_rotation,
     rotation_from_euler,
     rotation_from_quaternion,
 )
-from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.drive import join_drives, read_drive, with_clock_offsets
 from v2hdm.records import FloatArray, GeodeticOrigin, PoseNoise, Trajectory
 

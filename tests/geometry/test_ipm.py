@@ -18,16 +18,18 @@ from v2hdm.geometry.ipm import (
     ipm_from_extrinsic,
     project_ground,
 )
-from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
-from v2hdm.geometry.quadrilateral import (
+from v2hdm.geometry.planar import (
     Quad,
     align,
+    clip_convex,
     diameters,
+    inside_convex,
     is_convex,
     is_convex_px,
     order_corners,
     quad_from_hull,
     side_frames,
+    signed_area,
 )
 from v2hdm.geometry.rigid import camera_centre, exp, ground_in_vehicle
 from v2hdm.records import CameraInfo

@@ -124,9 +124,8 @@ def test_ground_points_and_their_derivatives_agree_below_the_horizon_and_are_nan
 def test_the_lenses_agree_to_a_thousandth_of_a_pixel_over_the_whole_image(name):
     info = CameraInfo("camera", 1280, 720, K, *LENSES[name])
     pinhole = lens.undistort_points(info, GRID_PX)
-    agree(
-        lens.distort_points(info, pinhole), tensors.distort_points(info, torch.as_tensor(pinhole)), atol=1e-4
-    )
+    twin = tensors.distort_points(info, torch.as_tensor(pinhole)).numpy()
+    assert np.abs(lens.distort_points(info, pinhole) - twin).max() < 1e-4
 
 
 @pytest.mark.parametrize("depth", [5.0, 0.2, 0.05, -0.001, -3.0])

@@ -9,7 +9,7 @@ import numpy as np
 from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate
 from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray, Image, PoseNoise, Trajectory
 
 INFO = CameraInfo(

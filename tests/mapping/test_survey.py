@@ -14,7 +14,7 @@ from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate
 from v2hdm.mapping.bundle import control_points, known_lengths, without_corner
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser

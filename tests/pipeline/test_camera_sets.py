@@ -9,9 +9,9 @@ import pytest
 
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline import camera_sets
-from v2hdm.pipeline.camera_sets import MappedSet, map_camera_sets
+from v2hdm.pipeline import stages
 from v2hdm.pipeline.context import Context
+from v2hdm.pipeline.stages import MappedSet, map_camera_sets
 from v2hdm.pipeline.survey import Survey
 from v2hdm.records import HdMap
 from v2hdm.store.cache import StageCache
@@ -46,8 +46,8 @@ def elsewhere(monkeypatch):
             there, job = pickle.loads(pickle.dumps((work, job)))
             yield number, pickle.loads(pickle.dumps(there(job, progress)))
 
-    monkeypatch.setattr(camera_sets._Work, "_map", mapped)
-    monkeypatch.setattr(camera_sets, "side_by_side", share)
+    monkeypatch.setattr(stages._Work, "_map", mapped)
+    monkeypatch.setattr(stages, "side_by_side", share)
     return jobs
 
 

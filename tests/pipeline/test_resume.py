@@ -14,9 +14,9 @@ from v2hdm.detection import batch
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import detections
 from v2hdm.pipeline import inspect as inspection
 from v2hdm.pipeline import run as running
+from v2hdm.pipeline import stages
 from v2hdm.pipeline.run import RunResult, run
 from v2hdm.store.cache import items_of
 from v2hdm.store.files import replace_text
@@ -69,7 +69,7 @@ def seen_images(monkeypatch):
 def test_another_mapping_setting_needs_no_image_again(site, monkeypatch):
     monkeypatch.setattr(inspection, "inspect", refused)
     monkeypatch.setattr(batch, "detect_image", refused)
-    monkeypatch.setattr(detections, "own_vehicles", refused)
+    monkeypatch.setattr(stages, "own_vehicles", refused)
     nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=6.0)))
     before, after = ((one / "map.geojson").read_bytes() for one in (site / "first" / "short", nearer.folder))
     assert before != after
@@ -139,7 +139,7 @@ def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(site, monke
     finally:
         image.write_bytes(before)
     total = len(read_drive(site / "drive").images)
-    assert looked == list(range(total - total % detections.PIECE, total))
+    assert looked == list(range(total - total % stages.PIECE, total))
 
 
 KILLED = """
@@ -169,7 +169,7 @@ def test_a_killed_run_goes_on_in_the_middle_of_detection(site, monkeypatch):
     looked = seen_images(monkeypatch)
     resumed = run(config(site, "killed", cache=str(cache)))
     assert looked
-    assert looked[0] == detections.PIECE
+    assert looked[0] == stages.PIECE
     assert_same(resumed.folder, site / "first" / "short")
 
 

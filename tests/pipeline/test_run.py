@@ -24,10 +24,10 @@ from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses
-from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import ReportConfig, run_name
 from v2hdm.pipeline.result import _along_route, write_trajectories
 from v2hdm.pipeline.run import run
+from v2hdm.pipeline.stages import camera_sets
 from v2hdm.records import Drive, HdMap, Image, Lane, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.verdict import Status

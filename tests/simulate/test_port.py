@@ -11,7 +11,7 @@ from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate
 from v2hdm.library import simulate_port
 from v2hdm.records import DIAMOND, LANE_DASH
 from v2hdm.simulate.port import drive

@@ -15,7 +15,7 @@ from v2hdm.report.metrics import driven_past
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import ReliefConfig
 from v2hdm.simulate.port.drive import inside_image, points_seen, render_drive
-from v2hdm.simulate.port.relief import stands
+from v2hdm.simulate.port.route import stands
 from v2hdm.simulate.render.ground import intersect_ground
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import Renderer

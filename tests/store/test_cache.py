@@ -30,12 +30,11 @@ from v2hdm.ground import GroundStatus, Reading
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.results import AdjustedPoses
-from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
+from v2hdm.pipeline.stages import MappedSet
 from v2hdm.records import FloatArray, ImageDetections
 from v2hdm.store.cache import DRIVES, CodecError, StageCache, decode, encode, items_of, prune
-from v2hdm.store.folders import LIST, is_whole, new_entry, note_use
-from v2hdm.store.lock import IN_USE, in_use, take_lock
+from v2hdm.store.folders import IN_USE, LIST, in_use, is_whole, new_entry, note_use, take_lock
 from v2hdm.store.results import result_folder
 
 KEY = "ab" * 32

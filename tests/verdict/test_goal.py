@@ -11,7 +11,7 @@ import pytest
 from tests.cameras import mounted
 from tests.verdict.drives import INFO, square_at
 from v2hdm.cli.compose import Job
-from v2hdm.cli.map import _map
+from v2hdm.cli.runs import _map
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions
@@ -22,7 +22,7 @@ from v2hdm.pipeline.run import RunResult
 from v2hdm.records import Calibration, Exclusion, HdMap
 from v2hdm.site.candidates import TOO_UNCERTAIN
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.goal import _corner_radii_m, check_goal, ground_ahead
+from v2hdm.verdict.results.accuracy import _corner_radii_m, check_goal, ground_ahead
 
 SURE = np.diag([0.003**2] * 3 + [1e-4**2] * 3)
 

@@ -10,7 +10,7 @@ from tests.verdict.drives import CENTRE, camera, drive, motion, noisy, pictured,
 from v2hdm.io.trajectory import why_no_pose
 from v2hdm.records import Camera, CentrePrior, Trajectory
 from v2hdm.verdict import Status
-from v2hdm.verdict.inputs.cameras import check_camera
+from v2hdm.verdict.inputs.drive import check_camera
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 
 

@@ -16,9 +16,8 @@ from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveE
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HdMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.goal import check_goal
+from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
 from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground
-from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
 

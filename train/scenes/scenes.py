@@ -29,7 +29,16 @@ from train.scenes.hardships import (
     with_seams,
     with_side_seams,
 )
-from train.scenes.paint import Bend, Facing, RoadPaint, port_paint, random_brush, rectangle, street_paint
+from train.scenes.paint import (
+    Bend,
+    Brush,
+    Facing,
+    RoadPaint,
+    port_paint,
+    random_brush,
+    rectangle,
+    street_paint,
+)
 from train.scenes.remains import litter, with_erased
 from train.scenes.symbols import with_crossing, with_hollow, with_words
 from train.scenes.traffic import traffic
@@ -50,7 +59,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import SEEN_ACROSS, FloatArray
 from v2hdm.simulate.render.renderer import Rendered, Renderer
-from v2hdm.simulate.render.scene import Backdrop, Bgr, Ground, Light, Scene, Shadow
+from v2hdm.simulate.render.scene import Backdrop, Bgr, Ground, GroundMarks, Light, Scene, Shadow
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
@@ -216,16 +225,10 @@ def random_scene(
     boxes = clear_of(boxes, junction.paints) if tight or junction is not road else boxes
     road = junction
     if place != "bare":
-        road = with_hollow(for_symbols, road, brush, bend, hardships.hollow)
-        road = with_words(for_symbols, road, brush, bend, hardships.words)
-        road = with_crossing(for_symbols, road, brush, bend, hardships.crossings)
+        road = _with_symbols(for_symbols, road, brush, bend, hardships)
     ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
-    marks = with_pavements(for_ground, ground.marks, road.lanes, hardships.pavements)
-    marks = with_seams(for_ground, marks, road.lanes, hardships.seams)
-    marks = with_side_seams(for_ground, marks, road.paints, hardships.side_seams)
-    marks = with_erased(for_remains, marks, hardships.erased)
-    ground = bleached(for_ground, ground, hardships.bleached)
-    ground = photographed(for_grounds, ground, hardships.grounds)
+    marks = _marked(for_ground, for_remains, ground.marks, road, hardships)
+    ground = photographed(for_grounds, bleached(for_ground, ground, hardships.bleached), hardships.grounds)
     dapples = _dapples(rng, difficulty)
     light = blue_shade(for_light, _light(rng), hardships.blue_shade)
     light = low_sun(for_weather, light, hardships.low_sun)
@@ -247,6 +250,28 @@ def random_scene(
         backdrop=_backdrop(rng),
     )
     return scene, road.lanes
+
+
+def _with_symbols(
+    rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Bend, hardships: Hardships
+) -> RoadPaint:
+    road = with_hollow(rng, road, brush, bend, hardships.hollow)
+    road = with_words(rng, road, brush, bend, hardships.words)
+    return with_crossing(rng, road, brush, bend, hardships.crossings)
+
+
+def _marked(
+    rng: np.random.Generator,
+    for_remains: np.random.Generator,
+    marks: GroundMarks | None,
+    road: RoadPaint,
+    hardships: Hardships,
+) -> GroundMarks | None:
+    """The marks of a ground with pavements, seams and remains of paint."""
+    marks = with_pavements(rng, marks, road.lanes, hardships.pavements)
+    marks = with_seams(rng, marks, road.lanes, hardships.seams)
+    marks = with_side_seams(rng, marks, road.paints, hardships.side_seams)
+    return with_erased(for_remains, marks, hardships.erased)
 
 
 def _without_hidden_boxes(scene: Scene, view: TrainingView) -> Scene:

@@ -5,8 +5,6 @@ inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hd
 residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
 """
 
-from v2hdm.adjust.noise import estimate_noise
-from v2hdm.adjust.observability import observability, pose_innovations
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -17,11 +15,17 @@ from v2hdm.adjust.problem import (
     SolveOptions,
 )  # fmt: skip
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
-from v2hdm.adjust.selection import MODELS, predicts_better, select_model, with_model
+from v2hdm.adjust.selection import MODELS, estimate_noise, predicts_better, select_model, with_model
 from v2hdm.adjust.sensitivity import height_information, moves_with_heights
-from v2hdm.adjust.solution import Solution, Status
+from v2hdm.adjust.solution import (
+    Solution,
+    Status,
+    Verdict,
+    line_variance_factor,
+    observability,
+    pose_innovations,
+)
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.validation import Verdict, line_variance_factor
 
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",

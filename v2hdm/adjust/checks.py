@@ -16,10 +16,7 @@ _MAX_SLOPE = 573.0
 
 
 def check_problem(problem: Problem) -> None:
-    """Raise :class:`AdjustError` for the first thing in ``problem`` that cannot be solved with.
-
-    Except observations that are there twice: :func:`v2hdm.adjust.layout.make_arrays` finds them as it sorts.
-    """
+    """Raise :class:`AdjustError` for what cannot be solved with, observations that are there twice apart."""
     _check_arrays(problem)
     wrong = (problem.intrinsic[:, :2] <= 0).any(1)
     _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")
@@ -150,7 +147,7 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
 
 def check_observations(problem: Problem) -> None:
     """Raise :class:`AdjustError` for the first observation that cannot be solved with."""
-    from v2hdm.adjust.engines.numba.prepare import Seen, first_unsound  # loads numba
+    from v2hdm.adjust.engines.numba.layout import Seen, first_unsound  # loads numba
 
     by_corner = np.zeros(problem.corner_count, dtype=np.int64)
     by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)

@@ -53,10 +53,7 @@ class Covariance:
         return own if self.held is None else own + self.held.extrinsic @ self.held.extrinsic.swapaxes(1, 2)
 
     def clock_s2(self) -> FloatArray:
-        """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is.
-
-        Where the read-out time is estimated, its variance is in one more column, the last.
-        """
+        """Variance (C, Q), s^2, of clock offsets by visit and, where estimated, last of the read-out time."""
         return np.stack([block.diagonal()[6:] for block in self._cameras()])
 
     def _cameras(self) -> list[FloatArray]:

@@ -9,22 +9,23 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from v2hdm.adjust.engine import Engine
-from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
+from v2hdm.adjust.engines.numba.layout import one_thread_in_torch
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.reduced import Plan
 from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient
 
 Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
 
-_HISTORY = 20
-_LINE_SEARCH_EVALUATIONS = 25
+_LINE_SEARCH: dict[str, Any] = {"history_size": 20, "max_eval": 25}
+# One iteration a step: stopping is the affair of the loop around it.
+_STEPWISE: dict[str, Any] = {"max_iter": 1, "tolerance_grad": 0.0, "tolerance_change": 0.0}
 _STEPS_FROM_NEARBY = 2  # steps that a whitening near the optimum takes to the end
 _NO_PROGRESS = 1e-15  # a relative decrease below this is rounding
 
@@ -75,16 +76,7 @@ def minimise(
         return (new_cost - cost) / scale**2
 
     _leave_compiler_out()
-    # One iteration a step: stopping is this loop's affair.
-    optimizer = torch.optim.LBFGS(
-        [u],
-        max_iter=1,
-        max_eval=_LINE_SEARCH_EVALUATIONS,
-        tolerance_grad=0.0,
-        tolerance_change=0.0,
-        history_size=_HISTORY,
-        line_search_fn="strong_wolfe",
-    )
+    optimizer = torch.optim.LBFGS([u], line_search_fn="strong_wolfe", **_STEPWISE, **_LINE_SEARCH)
     # Without the hooks of profilers around it, which take as long.
     step = inspect.unwrap(torch.optim.LBFGS.step)
     best, best_gradient = cost, gradient

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
-from v2hdm.adjust.corner_factor import CornerFactor
 from v2hdm.adjust.model import Estimate, Gradient, Loss
-from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread
+from v2hdm.adjust.reduced import CornerFactor, Coupled, Plan, PriorBlocks, ReducedSystem, Spread
 from v2hdm.records import BoolArray, FloatArray
 
 WEIGHT_FLOOR = 1e-6  # least weight of an observation in the Hessian: a corner of outliers stays factorable

@@ -97,11 +97,7 @@ def make_arrays(
     clock_offset: bool = False,
     read_out: bool = False,
 ) -> Arrays:
-    """Lay a checked problem out for the solver.
-
-    Raises AdjustError where an image has two observations of a corner, or known lengths join too many
-    corners.
-    """
+    """Lay a checked problem out; AdjustError where an image has a corner twice or lengths join too many."""
 
     def real(values: FloatArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
@@ -187,7 +183,7 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
     """Observations (K,) by corner, then camera, then frame; corner, pair and what was measured of each."""
-    from v2hdm.adjust.engines.numba.prepare import Seen, lay_out  # loads numba
+    from v2hdm.adjust.engines.numba.layout import Seen, lay_out  # loads numba
 
     seen, count = Seen.of(problem.observations.columns, problem.intrinsic), len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)

@@ -119,11 +119,7 @@ def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
 
 
 def before_camera(points_cam: Tensor) -> Tensor:
-    """Points (k, 3) for projection: behind the depth ``NEAR_M`` 1 / z goes on along its tangent.
-
-    An optimiser that throws a point behind the camera so meets a large, finite cost whose gradient leads back
-    to the front, instead of a pole and a mirror image.
-    """
+    """Points (k, 3) for projection: behind the depth ``NEAR_M`` 1 / z goes on as in ``inverse_depth``."""
     depth = points_cam[:, 2:]
     beyond = 1 + (NEAR_M - depth).clamp(min=0) / NEAR_M
     return torch.cat([points_cam[:, :2] * beyond, depth.clamp(min=NEAR_M)], dim=1)

@@ -177,10 +177,7 @@ class Sensitivity:
         return order, np.searchsorted(stretch[order], np.arange(count + 2))
 
     def by_stretch(self, one: FloatArray, others: FloatArray) -> FloatArray:
-        """The products (G + 1, ...) of a column (R,) and others (R, ...).
-
-        They are summed by stretch, and last over the priors that belong to none.
-        """
+        """Products (G + 1, ...) of a column (R,) and others (R, ...) by stretch, last of priors of none."""
         order, begin = self._stretch_of
         shape = len(begin) - 1, len(one)
         return np.asarray(csr_array((one[order], order, begin), shape=shape) @ others)

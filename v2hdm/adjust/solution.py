@@ -1,16 +1,113 @@
-"""The result of a solve: the estimate, how it went, and how sure it is."""
+"""The result of a solve: the estimate, how it went, how sure it is, verdicts, what the drive determines."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.validation import Verdict, VerdictArray
+from v2hdm.adjust.model import state_residual
+from v2hdm.adjust.problem import Observations, Problem
 from v2hdm.records import BoolArray, FloatArray, IntArray
+
+VerdictArray = NDArray[np.int8]
+
+# The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
+_MEDIAN_SQUARED = 2 * float(np.log(2))
+_ROWS = 1 << 18  # observations that are judged at once
+
+
+class Verdict(IntEnum):
+    """The verdict on an observation; unconfirmed: all others of its corner contradict it and one another."""
+
+    ACCEPTED = 0
+    CONTRADICTS = 1
+    UNCONFIRMED = 2
+    BEHIND_CAMERA = 3
+
+
+def noise_scale(mahalanobis2: FloatArray) -> float:
+    """How many times as large as stated the noise's variance is, by the median; at least 1."""
+    median = float(np.median(mahalanobis2.astype(np.float32), overwrite_input=True))
+    return max(1.0, median / _MEDIAN_SQUARED)
+
+
+def as_of_point(squared_of_line: FloatArray) -> FloatArray:
+    """Squared residuals of lines, chi-square of one degree of freedom, as equally likely ones of points."""
+    return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
+
+
+def line_variance_factor(squared: FloatArray, taken: float) -> float:
+    """How much larger than stated lines' variance is, by the median; unknowns take the share ``taken``."""
+    if not len(squared):
+        return 1.0
+    of_line = float(chi2.isf(np.exp(-np.median(squared) / 2), 1))
+    return of_line / float(chi2.median(1)) / max(1 - taken, 0.1)
+
+
+def classify(
+    observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float, scale: float
+) -> VerdictArray:
+    """A :class:`Verdict` (K,) for every observation, by its squared residual in sigmas ``mahalanobis2`` (K,).
+
+    The gate is the squared distance that a sound observation exceeds with ``probability`` (chi-square, two
+    degrees of freedom: -2 ln p), widened by the noise's ``scale`` so that covariances that are too small do
+    not empty the map. An observation is unconfirmed when the gate leaves it alone with a corner that had
+    others.
+    """
+    gate = -2 * np.log(probability) * scale
+    verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
+    verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
+    verdict[behind] = Verdict.BEHIND_CAMERA
+    count = int(observations.corner.max()) + 1
+    seen = np.bincount(observations.corner, minlength=count)
+    left = np.bincount(observations.corner[verdict == Verdict.ACCEPTED], minlength=count)
+    alone = (left == 1) & (seen > 1)
+    for begin in range(0, len(verdict) if alone.any() else 0, _ROWS):
+        part = slice(begin, begin + _ROWS)
+        verdict[part][alone[observations.corner[part]] & (verdict[part] == Verdict.ACCEPTED)] = (
+            Verdict.UNCONFIRMED
+        )
+    return verdict
+
+
+# Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
+_OUTLIER_SQUARED = 13.8
+# Mean of half such a variable below that limit: leaving the tail out takes a little off the chi-square.
+_TRIMMED_MEAN = 1 - _OUTLIER_SQUARED / 2 / math.expm1(_OUTLIER_SQUARED / 2)
+
+
+@dataclass(frozen=True)
+class VarianceFactors:
+    """Variances as multiples of the stated ones: of everything, and of the observations alone."""
+
+    all: float
+    observations: float
+
+
+def variance_factors(
+    squared: FloatArray, of_priors: float, free: int, scale: float | None = None
+) -> VarianceFactors:
+    """Chi-square per degree of freedom, of good observations and priors together and of the former.
+
+    What the priors have left of their own degrees of freedom is what the observations have taken of them: the
+    expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric Computer
+    Vision, section 4.2.4, on variance components). ``free`` are the unknowns less those that priors other
+    than the poses' hold.
+    """
+    good = squared <= _OUTLIER_SQUARED * (noise_scale(squared) if scale is None else scale)
+    of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN
+    redundancy = 2 * int(good.sum()) - free
+    return VarianceFactors(
+        all=(of_observations + of_priors) / max(redundancy, 1),
+        observations=of_observations / max(redundancy - of_priors, 1),
+    )
 
 
 class Status(Enum):
@@ -89,3 +186,76 @@ class Solution:
         groups = np.atleast_2d(indices)
         covariance = self.covariance.corners(groups)
         return covariance if np.ndim(indices) == 2 else covariance[0]
+
+
+AXES: tuple[str, ...] = ("forward", "left", "up", "roll", "pitch", "heading")
+
+# Share of the information from which a direction is said to rest on the survey. Two cameras that
+# share an unobservable direction halve it between them, hence below one half.
+_RESTS_ON_PRIOR = 0.25
+
+
+@dataclass(frozen=True)
+class Observability:
+    """How well a drive knows one camera's extrinsic, along and about the vehicle's axes :data:`AXES`."""
+
+    sigma: FloatArray  # (6,) m and rad, after the adjustment
+    # (3,) of the variance of the centre after and before: 0, the drive alone determines it; 1, only the prior
+    prior_share: FloatArray
+
+    @property
+    def unobserved(self) -> tuple[str, ...]:
+        """Directions of the camera's centre that rest on its prior."""
+        return tuple(
+            axis for axis, share in zip(AXES, self.prior_share, strict=False) if share > _RESTS_ON_PRIOR
+        )
+
+    def sentence(self, camera: str) -> str:
+        """For the person who drove: what is known how well, and what would help."""
+        turns = np.rad2deg(self.sigma[3:])
+        rotation = f"rotation known to {turns.max():.3f} deg"
+        if not self.unobserved:
+            centre = f"centre known to {100 * self.sigma[:3].max():.1f} cm"
+            return f"{camera}: {centre}, {rotation}; the drive fixes both"
+        worst = 100 * max(self.sigma[AXES.index(axis)] for axis in self.unobserved)
+        level = [axis for axis in self.unobserved if axis != "up"]
+        hint = "one turn on the route would fix them" if level else "longer sightings would fix it"
+        offsets = " and ".join(self.unobserved)
+        return f"{camera}: {rotation}; the {offsets} offset ({worst:.1f} cm) rests on the survey: {hint}"
+
+
+def observability(problem: Problem, solution: Solution) -> Sequence[Observability]:
+    """How well each camera of ``problem`` is determined by the drive, one record a camera."""
+    rotation, covariance = solution.cam_from_vehicle[:, :3, :3], solution.extrinsic_covariance
+    centre_sigma_m = np.inf if problem.centre_sigma_m is None else problem.centre_sigma_m
+    # The tangent's axes are the camera's, and its translation is minus the motion of the centre.
+    centre = rotation.transpose(0, 2, 1) @ covariance[:, :3, :3] @ rotation
+    turn = rotation.transpose(0, 2, 1) @ covariance[:, 3:, 3:] @ rotation
+    variance = np.concatenate([np.diagonal(block, axis1=1, axis2=2) for block in (centre, turn)], axis=1)
+    share = np.minimum(variance[:, :3] / centre_sigma_m**2, 1.0)
+    return [Observability(np.sqrt(v), s) for v, s in zip(variance, share, strict=True)]
+
+
+@dataclass(frozen=True)
+class PoseInnovations:
+    """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift."""
+
+    # (S,) which of :data:`v2hdm.adjust.problem.POSE_STATES` each is; a state with a drift has two
+    state: IntArray
+    normalised: FloatArray  # (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
+
+    @property
+    def along_over_across(self) -> float:
+        """How many times as much positions err anew along the way as across it; 1 where none is known."""
+        ahead, left = (np.flatnonzero(self.state == axis)[:1] for axis in (0, 1))
+        if not len(ahead) or not len(left):
+            return 1.0
+        along, across = np.sqrt(np.mean(self.normalised[:, [ahead[0], left[0]]] ** 2, axis=0))
+        return float(along / max(across, 1e-9))
+
+
+def pose_innovations(solution: Solution) -> PoseInnovations:
+    """Normalised innovations of a solution's poses; none where it estimates no state of a frame."""
+    descent = solution.covariance.descent
+    normalised = state_residual(descent.engine.arrays, descent.estimate.frame_state)
+    return PoseInnovations(np.array(descent.engine.arrays.states, dtype=np.int64), normalised.cpu().numpy())

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from v2hdm.association.ground import Located
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
-from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters
+from v2hdm.geometry.planar import SHIFTS, align, diameters
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)

@@ -129,10 +129,7 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Frames:
-    """The distinct times of a drive's visits, and the recorded poses then.
-
-    ``frame_of_image`` (I,) indexes ``visit`` (F,), ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4).
-    """
+    """Distinct times of visits and the recorded poses then, (F,) each, indexed by ``frame_of_image`` (I,)."""
 
     frame_of_image: IntArray
     visit: IntArray

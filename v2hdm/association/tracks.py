@@ -16,7 +16,7 @@ from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import ray_covariance
-from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
+from v2hdm.geometry.planar import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 

@@ -17,8 +17,17 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
-from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
-from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
+from v2hdm.calibration.points import (
+    CHANCE,
+    LEAST_POINTS,
+    Residuals,
+    SurveyedPoints,
+    check_points,
+    judge_fit,
+    read_points,
+    residuals,
+    scatter,
+)
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import centre_sigmas, ipm_from_extrinsic, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre

@@ -1,17 +1,30 @@
-"""Surveyed ground points and their pixels, from a CSV file."""
+"""Surveyed ground points and their pixels, from a CSV file, and how well they agree with a mounting."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2, f
 
+from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, Seen, fit_mountings
 from v2hdm.errors import DriveError
-from v2hdm.io.importers.tables import read_rows
+from v2hdm.geometry.ipm import (
+    apply_in_front,
+    facing_ipm,
+    homography_jacobian,
+    ipm_from_extrinsic,
+    pinhole_px_from_ground,
+    project_ground,
+)
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.io.importers.readings import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 COLUMNS = ("u", "v", "x", "y")  # pixel (centre of the first at 0, 0) and place, m forward and left
 LEAST_POINTS = 4  # a homography has eight degrees of freedom, a point two coordinates
@@ -91,3 +104,248 @@ def _columns(header: list[str], path: Path) -> list[str]:
             hint = "points must lie on the ground; drop it" if name in ("z", "z_m") else "drop it"
             raise DriveError(f"{path}: column '{name}' is not one of {', '.join(COLUMNS)}, {_NAME}; {hint}")
     return columns
+
+
+CHANCE = 1e-3  # probability with which a right calibration raises a finding
+
+# Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m.
+_WELL_KNOWN_M = 0.3
+# Error of the focal length from which it is another lens or image size, rather than a poor calibration.
+_FOCAL_OFF = 0.05
+_RIVAL = float(np.log(100.0))  # log odds up to which another mounting explains the points nearly as well
+_FOCAL_ROUNDS = 3
+_AROUND = 12  # places on the circle of known_around
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """N points under a mounting."""
+
+    off_px: FloatArray  # (N, 2) recorded less predicted pixel
+    off_m: FloatArray  # (N, 2) where the IPM puts the pixel less where it was surveyed, nan above the horizon
+    sigmas: FloatArray  # (N,) distance from what all others predict
+    probability: FloatArray  # (N,) of a right point being as far off by chance
+    known_m: FloatArray  # (N,) sigma of the IPM there, in the direction known worst
+
+
+def residuals(fit: Fit) -> Residuals:
+    """The residuals of every point, wrong ones included."""
+    seen, mounting = fit.seen, fit.cam_from_vehicle
+    predicted, depth = project_ground(seen.info.intrinsic, mounting, seen.points_vehicle)
+    off_px = np.where(depth[:, None] > 0, seen.points_px - distort_points(seen.info, predicted), np.nan)
+    in_view = seen.points_vehicle[int(np.argmax(np.where(depth > 0, fit.right, -1.0)))]
+    ipm = facing_ipm(ipm_from_extrinsic(seen.info, mounting), in_view)
+    off_m = apply_in_front(ipm, undistort_points(seen.info, seen.points_px)) - seen.points_vehicle
+    sigmas, probability = _held_out(fit)
+    return Residuals(off_px, off_m, sigmas, probability, known_ground(fit, seen.points_vehicle))
+
+
+def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
+    """Standard deviation (M,) of the IPM at places (M, 2), m, the worst way; inf behind the camera."""
+    seen, mounting = fit.seen, fit.cam_from_vehicle
+    count = len(places_vehicle)
+    places = replace(
+        seen,
+        points_px=np.zeros((count, 2)),
+        pinhole_px=np.zeros((count, 2)),
+        by_pinhole=np.broadcast_to(np.eye(2), (count, 2, 2)),
+        points_vehicle=places_vehicle,
+    )
+    slopes = places.jacobian(mounting)
+    by_ground = homography_jacobian(pinhole_px_from_ground(seen.info.intrinsic, mounting), places_vehicle)
+    in_front = np.isfinite(by_ground).all(axis=(1, 2))
+    out = np.full(count, np.inf)
+    back = np.linalg.inv(by_ground[in_front]) @ slopes[in_front]
+    on_ground = back @ fit.covariance @ np.swapaxes(back, 1, 2)
+    out[in_front] = np.sqrt(np.maximum(np.linalg.eigvalsh(on_ground)[:, -1], 0.0))
+    return out
+
+
+def known_around(fit: Fit) -> float:
+    """The worst of :func:`known_ground` at the right points and on a circle around them."""
+    right = fit.seen.points_vehicle[fit.is_right]
+    radius = np.ptp(right, axis=0).max() / 2
+    angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
+    middle = (right.min(axis=0) + right.max(axis=0)) / 2
+    circle = middle + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    known = known_ground(fit, np.vstack([right, circle]))
+    in_front = known[np.isfinite(known)]
+    return float(in_front.max()) if len(in_front) else np.inf
+
+
+def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """How far each point is, r' cov^-1 r, from the others' prediction, under the noise that they show.
+
+    The covariance is q V - J C J' of a point that took part, of another q V + J C J'.
+    """
+    slopes = fit.seen.jacobian(fit.cam_from_vehicle)
+    stated = fit.seen.covariance(fit.cam_from_vehicle)
+    by_mounting = slopes @ (fit.covariance / fit.factor) @ np.swapaxes(slopes, 1, 2)
+    residual = fit.seen.residual_px(fit.cam_from_vehicle)
+    took_part = np.where(fit.is_right, -1.0, 1.0)[:, None, None]
+    inverse = np.linalg.pinv(stated + took_part * by_mounting, rcond=1e-9, hermitian=True)
+    square = np.einsum("ni,nij,nj->n", residual, inverse, residual)
+    own = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(stated), residual)
+    total = float(own[fit.is_right].sum())
+    count = 2.0 * (fit.is_right.sum() - fit.is_right)
+    free = np.maximum(count - UNKNOWNS, 0.0) + STATED_AS
+    others = (np.maximum(total - np.where(fit.is_right, square, 0.0), 0.0) + STATED_AS) / free
+    ratio = square / others
+    return np.sqrt(ratio), np.asarray(f.sf(ratio / 2, 2, free))
+
+
+class Scatter(NamedTuple):
+    """By how much the right points scatter more than stated, and the chance of that or more."""
+
+    ratio: float
+    limit: float
+    probability: float
+
+
+def scatter(fit: Fit, chance: float) -> Scatter:
+    """The chi-square of the right points against the noise as stated; ``limit`` belongs to ``chance``."""
+    residual = fit.seen.residual_px(fit.cam_from_vehicle)[fit.is_right]
+    stated = fit.seen.covariance(fit.cam_from_vehicle)[fit.is_right]
+    total = float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(stated), residual))
+    free = max(2 * len(residual) - UNKNOWNS, 1)
+    limit = float(np.sqrt(chi2.isf(chance, free) / free))
+    return Scatter(float(np.sqrt(total / free)), limit, float(chi2.sf(total, free)))
+
+
+class Lens(NamedTuple):
+    """Whether the points agree with the intrinsics."""
+
+    probability: float  # of as large a disagreement by chance, both focal lengths freed
+    focal: tuple[float, float]  # by which share the points want it longer, and its sigma
+
+
+def lens(fit: Fit) -> Lens:
+    """Test the intrinsics: a homography has two degrees of freedom more than a mounting."""
+    probability, focal, sigma = _freed(fit)
+    total = 1 + focal
+    for _ in range(_FOCAL_ROUNDS if abs(focal) > sigma else 0):
+        seen, intrinsic = fit.seen, fit.seen.info.intrinsic.copy()
+        intrinsic[:2, :2] *= total
+        info = replace(seen.info, intrinsic=intrinsic)
+        again = fit_mountings(Seen.of(seen.points_px, seen.points_vehicle, info, seen.noise), starts=1)
+        if not again:
+            break
+        _, focal, sigma = _freed(again[0])
+        total *= 1 + focal
+    return Lens(probability, (total - 1, sigma))
+
+
+def _freed(fit: Fit) -> tuple[float, float, float]:
+    """The chance of the disagreement, and the focal length's relative error with its sigma."""
+    seen = fit.seen
+    right = fit.is_right
+    stated = np.asarray(np.linalg.inv(seen.covariance(fit.cam_from_vehicle)[right]), dtype=np.float64)
+    slopes = seen.jacobian(fit.cam_from_vehicle)[right]
+    residual = seen.residual_px(fit.cam_from_vehicle)[right]
+    from_centre = seen.points_px[right] - seen.info.intrinsic[:2, 2]
+    # Longer by a share, a focal length moves the predicted pixel away from the centre by that share.
+    each = np.zeros((len(residual), 2, 2))
+    each[:, [0, 1], [0, 1]] = from_centre
+    gain, _, _ = _gain_of(each, stated, slopes, residual)
+    total = float(np.einsum("ni,nij,nj->", residual, stated, residual))
+    free = max(2 * len(residual) - UNKNOWNS - 2, 0) + STATED_AS
+    noise = (max(total - gain, 0.0) + STATED_AS) / free
+    _, step, left = _gain_of(from_centre[..., None], stated, slopes, residual)
+    return float(f.sf(gain / 2 / noise, 2, free)), float(step[0]), float(np.sqrt(noise / left[0, 0]))
+
+
+def _gain_of(
+    more: FloatArray, stated: FloatArray, slopes: FloatArray, residual: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Decrease of the cost by unknowns with derivatives (N, 2, K), their values, their information."""
+    own = np.einsum("nij,nik,njl->kl", stated, more, more)
+    shared = np.einsum("nij,nik,njl->kl", stated, more, slopes)
+    mounting = np.einsum("nij,nik,njl->kl", stated, slopes, slopes)
+    wanted = np.einsum("nij,nik,nj->k", stated, more, residual)
+    pull = np.einsum("nij,nik,nj->k", stated, slopes, residual)
+    through = shared @ np.linalg.pinv(mounting)
+    left, force = own - through @ shared.T, wanted - through @ pull
+    step = -np.linalg.pinv(left, hermitian=True) @ force
+    return float(-step @ force), step, left
+
+
+def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals) -> Iterator[Finding]:
+    """The findings on the most likely of ``fits``."""
+    fit, about = fits[0], fits[0].seen.info.name
+    yield from _wrong_points(points, fits, residuals, about)
+    spread = scatter(fit, CHANCE)
+    says = f"the points scatter {spread.ratio:.2g} times as much as --pixel-sigma and --survey-sigma say"
+    yield judge(
+        "scatter", about, spread.ratio, spread.limit, "",
+        fine=says,
+        wrong=f"{says}, and the sigmas have grown by that: measure again, or state the errors as they are",
+        status=Status.WARN,
+    )  # fmt: skip
+    yield _intrinsics(fit, about)
+    worst = known_around(fit)
+    yield judge(
+        "known ground", about, min(worst, 1e6), _WELL_KNOWN_M, "m",
+        fine=f"the IPM is known to {100 * worst:.1f} cm or better around the points",
+        wrong=f"the IPM is known to {worst:.2g} m only around the points: survey more of them, near and far, "
+        "left and right; points along one line fix no camera",
+    )  # fmt: skip
+
+
+def _wrong_points(
+    points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals, about: str
+) -> Iterator[Finding]:
+    fit, total = fits[0], len(points.names)
+    named = np.flatnonzero(~fit.is_right | (residuals.probability < CHANCE / total)).tolist()
+    for k in named:
+        how_far = _how_far(residuals.off_px[k], residuals.off_m[k])
+        share = "counts for nothing" if not fit.is_right[k] else "still counts"
+        says = (
+            f"{points.names[k]} contradicts the others by {residuals.sigmas[k]:.0f} sigmas "
+            f"({how_far}) and {share}: check its pixel and its place"
+        )
+        yield Finding("point", Status.WARN, float(residuals.sigmas[k]), None, "sigma", says, about)
+    if not named:
+        yield passed("point", about, "no point contradicts the others", 0.0, "points")
+    count = int(fit.is_right.sum())
+    if count < max(LEAST_POINTS, (total + 1) // 2):
+        says = (
+            f"of {total} points only {count} agree on a mounting: check the columns, which pixel belongs to "
+            "which place, and the intrinsics"
+        )
+        yield Finding("agreement", Status.FAIL, float(count), None, "points", says, about)
+    rivals = [one for one in fits[1:] if fit.log_posterior - one.log_posterior < _RIVAL]
+    if rivals and named:
+        other = [points.names[k] for k in np.flatnonzero(~rivals[0].is_right)]
+        says = (
+            "which point is wrong cannot be told: another mounting explains the points as well, without "
+            f"{' and '.join(other) or 'leaving one out'}; survey more points"
+        )
+        yield Finding("rival", Status.FAIL, None, None, "", says, about)
+
+
+def _intrinsics(fit: Fit, about: str) -> Finding:
+    tested = lens(fit)
+    focal, sigma = tested.focal
+    far = abs(focal) > _FOCAL_OFF
+    recovery = (
+        "were the points clicked in an image of another size, or is this another camera's file?"
+        if far
+        else "calibrate the lens again, or check that the images were not resized"
+    )
+    size = f"{100 * focal:+.1f} +- {100 * sigma:.1f} %"
+    return judge(
+        "intrinsics", about, -np.log10(max(tested.probability, 1e-99)), -np.log10(CHANCE), "",
+        fine=f"the points agree with the intrinsics (focal length {size})",
+        wrong=f"the points contradict the intrinsics: they want the focal length {size} longer; {recovery}",
+        status=Status.FAIL if far else Status.WARN,
+    )  # fmt: skip
+
+
+def _how_far(off_px: FloatArray, off_m: FloatArray) -> str:
+    """How far a point (2,) is off in the image and on the ground."""
+    pixels, metres = float(np.hypot(*off_px)), float(np.hypot(*off_m))
+    if not np.isfinite(pixels):
+        return "its place is behind the camera"
+    if not np.isfinite(metres):
+        return f"{pixels:.1f} px, and its pixel is above the horizon"
+    return f"{pixels:.1f} px, {f'{metres:.2f} m' if metres >= 1 else f'{100 * metres:.1f} cm'} on the ground"

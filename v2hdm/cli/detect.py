@@ -1,7 +1,4 @@
-"""``v2hdm detect SOURCE``: one JSON object per image, percentiles of the latency at the end on stderr.
-
-It needs the base install only (numpy, opencv, onnxruntime, PyYAML). docs/detect.md describes it.
-"""
+"""``v2hdm detect SOURCE`` (docs/detect.md), for which the base install is enough."""
 
 from __future__ import annotations
 
@@ -21,6 +18,8 @@ from v2hdm.cli.main import parser_of
 from v2hdm.errors import ConfigError, DriveError
 
 if TYPE_CHECKING:
+    from v2hdm.detection.frames import Frame
+    from v2hdm.detection.road import Road
     from v2hdm.detection.stopwatch import Stopwatch
 
 _FIRST = b'{"source": '  # the beginning of every line of detections
@@ -66,7 +65,7 @@ def _detect(parsed: argparse.Namespace) -> None:
     import cv2
 
     from v2hdm.detection.options import DetectorOptions
-    from v2hdm.detection.road import as_record, draw_detections
+    from v2hdm.detection.road import as_record
     from v2hdm.detection.stopwatch import KEPT, Stopwatch
     from v2hdm.detection.weights import unknown_network
     from v2hdm.pipeline.detect_images import detect_images
@@ -100,14 +99,11 @@ def _detect(parsed: argparse.Namespace) -> None:
                     dropped += frame.dropped
                     age_s.append(time.time() - (frame.stamp_s or 0.0))
                 if write_drawing is not None:
-                    markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
-                    drawn = draw_detections(frame.pixels, markings, lanes)
-                    _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
                     name = frame.name  # images of several folders or endings may share it
                     while name.casefold() in drawn_as:
                         name += "_"
                     drawn_as.add(name.casefold())
-                    write_drawing(f"{name}.jpg", packed.tobytes())
+                    write_drawing(f"{name}.jpg", _drawing(frame, road))
         except KeyboardInterrupt:
             if not live:
                 raise
@@ -123,6 +119,16 @@ def _detect(parsed: argparse.Namespace) -> None:
         print(unknown, file=sys.stderr)
     if failure:
         raise failure
+
+
+def _drawing(frame: Frame, road: Road) -> bytes:
+    import cv2
+
+    from v2hdm.detection.road import draw_detections
+
+    markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
+    drawn = draw_detections(frame.pixels, markings, lanes)
+    return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
 
 
 @contextmanager

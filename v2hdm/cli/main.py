@@ -116,7 +116,15 @@ COMMANDS = {
     name: Command(f"v2hdm {name}", says, _EXTRAS.get(name, "map"), _INTERRUPTED.get(name, _NOTHING))
     for name, says in _SAYS.items()
 }
-"""``v2hdm/cli/<name>.py`` has ``run(arguments)`` of each."""
+HOMES = {
+    **{"check": ("drives", "check"), "localize": ("drives", "localize_drive")},
+    **{name: ("results", name) for name in ("report", "view", "labels", "mosaic")},
+    **{"map": ("runs", "map_drive"), "experiment": ("runs", "experiment"), "fleet": ("runs", "fleet")},
+    "calibrate points": ("calibrate", "from_points"),
+    "calibrate ground": ("calibrate", "from_ground"),
+    "calibrate compare": ("calibrate", "compare"),
+}
+"""Modules of ``v2hdm.cli`` with several commands, and their functions; others have ``run(arguments)``."""
 
 _OLD = {"calibrate": "calibrate points", "extrinsic": "calibrate ground", "calibration": "calibrate compare"}
 """Names of console scripts, ``v2hdm-NAME``, of commands that are called otherwise now."""
@@ -164,8 +172,9 @@ def run(arguments: Sequence[str]) -> int:
     given = words[len(name.split()) :]
     below = [one for one in COMMANDS if words and one.startswith(f"{words[0]} ")]
     if name and "--version" not in given:
-        module = f"v2hdm.cli.{name.replace(' ', '_')}"
-        return COMMANDS[name].guard(lambda: importlib.import_module(module).run(given))
+        module, function = HOMES.get(name, (name, "run"))
+        home = f"v2hdm.cli.{module}"
+        return COMMANDS[name].guard(lambda: getattr(importlib.import_module(home), function)(given))
     if "--version" in (given if name else words[:1]):
         return _LIST.guard(lambda: print(version_line()))
     if not words or words[0] in ("-h", "--help") or (below and words[1:2] in ([], ["-h"], ["--help"])):

@@ -30,7 +30,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.patch import ImageQuads, Patches, grey_of, log_light
 from v2hdm.detection.propose import Proposal, Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
-from v2hdm.geometry.quadrilateral import Quad
+from v2hdm.geometry.planar import Quad
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, BoolArray, FloatArray, MarkingDetection
 
 CLAIMED = (

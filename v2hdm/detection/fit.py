@@ -31,7 +31,7 @@ from v2hdm.detection.lattice import (
     pixel_weights,
 )
 from v2hdm.detection.patch import LensFrames, Patches
-from v2hdm.geometry.quadrilateral import Quad, following, is_convex_px
+from v2hdm.geometry.planar import Quad, following, is_convex_px
 from v2hdm.records import BoolArray, FloatArray
 
 TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture included

@@ -27,7 +27,7 @@ import numpy as np
 
 from v2hdm.detection.network import as_probability
 from v2hdm.detection.patch import LensFrames, Patches
-from v2hdm.geometry.quadrilateral import Quad
+from v2hdm.geometry.planar import Quad
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 KNOTS = 6  # knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs

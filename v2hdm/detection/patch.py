@@ -10,7 +10,7 @@ import numpy as np
 
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput
-from v2hdm.geometry.quadrilateral import Quad, block_diagonal, following
+from v2hdm.geometry.planar import Quad, block_diagonal, following
 from v2hdm.records import BoolArray, FloatArray
 
 _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)  # weights of ITU-R BT.601

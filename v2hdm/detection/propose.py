@@ -17,8 +17,7 @@ import numpy as np
 from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput, as_probability
-from v2hdm.geometry.planar import rectangle_size, signed_area
-from v2hdm.geometry.quadrilateral import following, is_convex_px, quad_from_hull
+from v2hdm.geometry.planar import following, is_convex_px, quad_from_hull, rectangle_size, signed_area
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners

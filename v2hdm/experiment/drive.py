@@ -19,11 +19,10 @@ from v2hdm.experiment.plan import OURS, RECIPES, Job
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.camera_sets import camera_sets, map_camera_sets
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
+from v2hdm.pipeline.stages import camera_sets, detect_in_pieces, map_camera_sets
 from v2hdm.pipeline.survey import take_survey
 from v2hdm.progress import Progress
 from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, IntArray, Marking, Truth
@@ -34,10 +33,7 @@ from v2hdm.store.cache import StageCache
 
 
 def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:
-    """The record of a drive and of its maps by every recipe, as :func:`measure` takes it.
-
-    Raises V2hdmError where the drive cannot be read or has no truth.
-    """
+    """The record of a drive and its maps by recipe, for :func:`measure`. V2hdmError without a truth."""
     folder = Path(job.site.drive.path or "")
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))

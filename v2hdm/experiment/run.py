@@ -13,9 +13,8 @@ from rich.console import Console
 
 from v2hdm.errors import ConfigError, WorkerError
 from v2hdm.experiment.drive import Measured, drive_record, measure
-from v2hdm.experiment.figures import save_figures
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
-from v2hdm.experiment.summary import claims, write_tables, write_words
+from v2hdm.experiment.summary import claims, save_figures, write_tables, write_words
 from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.files import replace_text

@@ -183,10 +183,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 
 
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
-    """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
-
-    Raises ``error`` as :func:`geodetic_from_grid`, and when the projection is not conformal.
-    """
+    """Angles (N,), clockwise, from true to grid north at points; ``error`` also if it is not conformal."""
     here = geodetic_from_grid(crs, points, where, error)
     pyproj = need("pyproj", "map", f"{where}: crs", error)
     factors = pyproj.Proj(_horizontal(crs)).get_factors(here[:, 1], here[:, 0])

@@ -31,10 +31,7 @@ def pinhole_px_from_ground(intrinsic: FloatArray, cam_from_ground: FloatArray) -
 
 
 def ground_from_pinhole_px(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
-    """The inverse (..., 3, 3) of :func:`pinhole_px_from_ground`.
-
-    Raises numpy.linalg.LinAlgError when the camera's centre lies on the ground plane.
-    """
+    """The inverse (..., 3, 3) of :func:`pinhole_px_from_ground`; LinAlgError of a centre on the ground."""
     return np.asarray(np.linalg.inv(pinhole_px_from_ground(intrinsic, cam_from_ground)), dtype=np.float64)
 
 
@@ -66,10 +63,7 @@ def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
 
 
 def facing_ipm(ipm: FloatArray, seen_vehicle: FloatArray) -> FloatArray:
-    """The IPM (3 x 3), of that sign whose third coordinate is positive for ground in front of the camera.
-
-    ``ipm`` is of any sign, ``seen_vehicle`` (2,) m a ground point that lies in front of the camera.
-    """
+    """The IPM (3 x 3) of the sign that puts the ground point ``seen_vehicle`` (2,) m before the camera."""
     # With ipm @ (u, v, 1) = w * ground, the solution is (u, v, 1) / w.
     in_front = np.linalg.solve(ipm, np.append(seen_vehicle, 1.0))[2] > 0
     return np.asarray(ipm if in_front else -ipm)

@@ -1,11 +1,21 @@
-"""Polygons in a plane (their area, points inside, the part that two of them share), polylines, angles."""
+"""Polygons in a plane, their area, points inside, and overlap, polylines, angles, and quadrilaterals.
+
+Quadrilaterals (..., 4, 2) have corners that run counter-clockwise as seen from above the ground, in the map
+as on the screen; the first is arbitrary. In the map, where y points up, their shoelace area is positive. In
+an image, where v points down, it is negative: there :func:`order_corners` and :func:`is_convex_px` apply, in
+the map :func:`is_convex`. Other functions hold for both. Side ``e`` runs from corner ``e`` to ``e + 1``.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
@@ -108,3 +118,184 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
         return float("nan"), float("nan")
     _, size, _ = cv2.minAreaRect(seen.astype(np.float32))
     return float(max(size)), float(min(size))
+
+
+# Faster than np.roll by far, and there are many of them in the fit of a few markings.
+_NEXT, _LAST = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
+_TURN = np.array([-1.0, 1.0])
+
+_CORNER = np.arange(4)
+SHIFTS = (_CORNER[:, None] + _CORNER[None, :]) % 4
+"""Row s lists, for corner c of one quadrilateral, corner (c + s) mod 4 of the other."""
+
+_LEAST_SINE = 1e-3  # of the angle of two sides that meet; parallel ones meet nowhere
+# Each corner is the start of its own side and the end of the one before, in this place among the moves.
+_END = 4 + (_CORNER - 1) % 4
+
+
+@dataclass(frozen=True)
+class Quad:
+    """Quadrilaterals (..., 4, 2) with all that follows, each once; normals point outwards in an image."""
+
+    corners: FloatArray
+
+    @cached_property
+    def _sides(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return side_frames(self.corners)
+
+    @property
+    def tangent(self) -> FloatArray:
+        """Unit direction (..., 4, 2) of each side."""
+        return self._sides[0]
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal (..., 4, 2) of each side."""
+        return self._sides[1]
+
+    @property
+    def length(self) -> FloatArray:
+        """Length (..., 4) of each side."""
+        return self._sides[2]
+
+    @cached_property
+    def area(self) -> FloatArray:
+        """Area (...)."""
+        return np.asarray(np.abs(signed_area(self.corners)))
+
+    @cached_property
+    def width(self) -> FloatArray:
+        """Mean extent (...) across the longest side."""
+        return np.asarray(self.area / self.length.max(axis=-1))
+
+    @cached_property
+    def lengthwise(self) -> BoolArray:
+        """Whether (...) the first and third side are the longer ones."""
+        length = self.length
+        return np.asarray(length[..., 0] + length[..., 2] >= length[..., 1] + length[..., 3])
+
+    @cached_property
+    def outward(self) -> FloatArray:
+        """Rows (..., 4, 3) that take (x, y, 1) of an image to the distance outside each side."""
+        offset = -(self.normal * self.corners).sum(axis=-1)
+        return np.concatenate([self.normal, offset[..., None]], axis=-1)
+
+    @cached_property
+    def corner_from_side(self) -> FloatArray:
+        """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
+        tangent = self.tangent
+        before = tangent.take(_LAST, axis=-2)
+        determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
+        determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
+        jacobian = np.zeros((len(tangent), 4, 2, 8))
+        # Each lies along the other's line.
+        jacobian[:, _CORNER, :, _CORNER] = (-before / determinant).swapaxes(0, 1)
+        jacobian[:, _CORNER, :, _END] = (tangent / determinant).swapaxes(0, 1)
+        return jacobian.reshape(-1, 8, 8)
+
+    def moved(self, by_side: FloatArray) -> Quad:
+        """The quadrilaterals whose sides' starts and ends have moved by (M, 8) along the normals."""
+        return Quad(self.corners + (self.corner_from_side @ by_side[..., None]).reshape(-1, 4, 2))
+
+    def long_first(self, lengthwise: BoolArray | None = None) -> Quad:
+        """The corners from a longer side on, or from the second where not ``lengthwise`` (M,)."""
+        along = self.lengthwise if lengthwise is None else lengthwise
+        return Quad(np.where(along[..., None, None], self.corners, following(self.corners)))
+
+    def at(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Points (..., N, 2) at shares ``a`` (N,) along the first side and ``b`` (N,) along the fourth."""
+        weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
+        return np.asarray(weight @ self.corners)
+
+
+class Alignment(NamedTuple):
+    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift."""
+
+    shift: IntArray  # corner c of a matches (c + shift) mod 4 of b
+    offset: FloatArray  # (..., 2) mean displacement of b's corners
+    deformation_m: FloatArray  # largest deviation from that, infinite for fewer than two common corners
+
+
+def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
+    """The tightest quadrilateral (4, 2) about a hull (N, 1, 2), or None (Low and Ilie 2003, approxPolyN)."""
+    if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
+        return None
+    quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)
+    if len(quad) != 4 or not np.isfinite(quad).all():
+        return None
+    return order_corners(quad)
+
+
+def order_corners(corners: FloatArray) -> FloatArray:
+    """Corners (4, 2) of a convex quadrilateral of an image, counter-clockwise on the screen."""
+    outward = corners - corners.mean(axis=0)
+    return np.asarray(corners[np.argsort(np.arctan2(-outward[:, 1], outward[:, 0]))])
+
+
+def following(values: np.ndarray, axis: int = -2) -> np.ndarray:
+    """Values of four corners or sides, each replaced by that of the next one round the quadrilateral."""
+    return np.asarray(values.take(_NEXT, axis=axis))
+
+
+def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Tangent t (..., 4, 2), normal (-t_y, t_x) (..., 4, 2) and length (..., 4) of each side."""
+    along = following(corners) - corners
+    length = np.hypot(along[..., 0], along[..., 1])
+    tangent = along / np.maximum(length, 1e-9)[..., None]
+    normal = tangent[..., ::-1] * _TURN
+    return tangent, normal, length
+
+
+def is_convex(corners_map: FloatArray) -> BoolArray:
+    """Whether quadrilaterals (..., 4, 2) of the map are convex and counter-clockwise."""
+    return np.asarray((_turns(corners_map) > 0).all(axis=-1))
+
+
+def is_convex_px(corners_px: FloatArray) -> BoolArray:
+    """Whether quadrilaterals (..., 4, 2) of an image are convex and counter-clockwise on the screen."""
+    return np.asarray((_turns(corners_px) < 0).all(axis=-1))
+
+
+def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) -> Alignment:
+    """Align ``b`` (..., 4, 2) to ``a`` by that shift which brings the common valid corners nearest."""
+    both = valid_a[..., None, :] & valid_b[..., SHIFTS]
+    difference = np.where(both[..., None], b[..., SHIFTS, :] - a[..., None, :, :], 0.0)
+    common = both.sum(axis=-1)
+    count = np.maximum(common, 1)
+    squared = np.sum(difference**2, axis=(-1, -2)) / count
+    shift = np.argmin(np.where(common >= 2, squared, np.inf), axis=-1)
+    chosen = shift[..., None]
+    mean = difference.sum(axis=-2) / count[..., None]
+    offset = np.take_along_axis(mean, chosen[..., None], axis=-2)[..., 0, :]
+    deviation = np.linalg.norm(difference - mean[..., None, :], axis=-1)
+    worst = np.max(np.where(both, deviation, 0.0), axis=-1)
+    common, worst = (np.take_along_axis(each, chosen, axis=-1)[..., 0] for each in (common, worst))
+    return Alignment(shift, offset, np.where(common >= 2, worst, np.inf))
+
+
+def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:
+    """Largest distance (...) between two valid corners of quadrilaterals (..., 4, 2)."""
+    difference = corners[..., :, None, :] - corners[..., None, :, :]
+    distance = np.linalg.norm(difference, axis=-1)
+    both = valid[..., :, None] & valid[..., None, :]
+    return np.asarray(np.max(np.where(both, distance, 0.0), axis=(-1, -2)))
+
+
+def mean_corners(corners: FloatArray, valid: BoolArray) -> FloatArray:
+    """Mean (..., 2) of the valid corners of quadrilaterals (..., 4, 2), 0 where none is."""
+    weight = valid / np.maximum(valid.sum(axis=-1, keepdims=True), 1)
+    return np.asarray(np.sum(np.where(valid[..., None], corners, 0.0) * weight[..., None], axis=-2))
+
+
+def _turns(corners: FloatArray) -> FloatArray:
+    """Cross product (..., 4) of each side with the next: positive where they turn from x towards y."""
+    side = following(corners) - corners
+    ahead = following(side)
+    return np.asarray(side[..., 0] * ahead[..., 1] - side[..., 1] * ahead[..., 0])
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """(M, 4, 2, 2) blocks, one a corner, to (M, 8, 8)."""
+    full = np.zeros((len(blocks), 4, 2, 4, 2))
+    full[:, _CORNER, :, _CORNER] = blocks.swapaxes(0, 1)
+    return full.reshape(-1, 8, 8)

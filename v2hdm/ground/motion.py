@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.geometry.planar import length_along
-from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import heading_rad, interpolate, rotation_from_euler
 from v2hdm.ground.results import Reading
 from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 

@@ -17,7 +17,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.least_squares import Normal, gauss_newton
-from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
+from v2hdm.geometry.planar import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse, rotation_from_euler
 from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray
 

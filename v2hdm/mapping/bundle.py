@@ -1,7 +1,4 @@
-"""One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
-
-Sizes that a user states for classes, and corners that a survey has measured, are constraints on corners.
-"""
+"""One joint solve over groups of sightings; known sizes and surveyed corners constrain it."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ from v2hdm.association.groups import Association, fuse_groups, group_kinds, know
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
-from v2hdm.io.maps.surveyed import match
+from v2hdm.io.drive.survey import match
 from v2hdm.mapping.lanes import OPEN_END_PX, Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, PoseNoise
@@ -41,10 +38,7 @@ from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, Pose
 def vehicle_twists(
     map_from_vehicle: FloatArray, stamp_s: FloatArray, visit: IntArray | None = None
 ) -> FloatArray:
-    """Twists (F, 6) of the vehicle in its own frame, m/s then rad/s, at poses (F, 4, 4) at times (F,).
-
-    Central differences, one-sided at the ends of each ``visit`` (F,); a single pose has no motion.
-    """
+    """Twists (F, 6) of the vehicle in its frame, m/s, rad/s, by central differences within each ``visit``."""
     own = np.arange(len(stamp_s))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(own) - 1)
     if visit is not None:

@@ -1,7 +1,4 @@
-"""Whether the images of a stretch are those of another drive.
-
-Their markings are nowhere else, and the others' are not in them, although both should have been in view.
-"""
+"""Whether a stretch is of another drive: neither has the markings that both should have in view."""
 
 from __future__ import annotations
 

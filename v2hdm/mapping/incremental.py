@@ -25,7 +25,7 @@ from v2hdm.association.tracks import (
     SHAPE_TOLERANCE,
 )
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.quadrilateral import align, diameters
+from v2hdm.geometry.planar import align, diameters
 from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths, observations_at
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray

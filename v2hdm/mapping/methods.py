@@ -22,8 +22,7 @@ from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.association.tracks import LEAST_SIGHTINGS, SHAPE_TOLERANCE
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
-from v2hdm.geometry.planar import inside_convex
-from v2hdm.geometry.quadrilateral import is_convex
+from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.bundle import without_corner

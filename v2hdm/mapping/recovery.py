@@ -22,8 +22,7 @@ from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.association.surface import Surface
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.rigid import camera_centre
-from v2hdm.geometry.trajectory import with_clock_offsets
+from v2hdm.geometry.rigid import camera_centre, with_clock_offsets
 from v2hdm.mapping.bundle import Bundle, name_of
 from v2hdm.mapping.foreign import foreign_stretch
 from v2hdm.mapping.lanes import Knots, find_knots

@@ -35,8 +35,7 @@ from v2hdm.geometry.ipm import (
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import densified
-from v2hdm.geometry.rigid import inverse
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
 

@@ -19,10 +19,7 @@ CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both
 
 
 def evaluate(drive: Drive, methods: CameraSets) -> tuple[dict[str, Any], list[str]]:
-    """Compare every method on every camera set with the truth, where the drive has one.
-
-    Returns the figures for ``metrics.json``, and sentences for a reader.
-    """
+    """Compare methods by camera set with the truth, if any: figures for ``metrics.json``, and sentences."""
     truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
     for name, by_method in methods.items():

@@ -19,13 +19,12 @@ from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions
 from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
-from v2hdm.pipeline.camera_sets import BEST, MappedSet, map_camera_sets
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, Contents, check_choice
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.result import Result, describe_run
+from v2hdm.pipeline.stages import BEST, MappedSet, detect_in_pieces, map_camera_sets
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
@@ -33,9 +32,8 @@ from v2hdm.site.changes import Base
 from v2hdm.site.wear import with_wear
 from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.goal import check_goal
+from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes
 from v2hdm.verdict.results.solution import check_result, over_ground
-from v2hdm.verdict.results.survey import check_corrections, check_known_sizes
 
 _log = logging.getLogger(__name__)
 

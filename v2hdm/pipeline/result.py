@@ -18,25 +18,23 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import ConfigError, DriveError, MapFileError, MappingError
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.planar import length_along
-from v2hdm.geometry.rigid import inverse
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration, write_calibration_as
-from v2hdm.io.drive import ReadOptions
-from v2hdm.io.drive.of_result import told_of
+from v2hdm.io.drive import ReadOptions, told_of
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import write_exclusions, write_residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.io.maps.formats import check_crs, with_data, write_map
 from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.io.maps.qgis import write_qgis
+from v2hdm.io.maps.geopackage import write_qgis
 from v2hdm.io.trajectory import write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.base import write_changes
-from v2hdm.pipeline.camera_sets import BEST
 from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets
+from v2hdm.pipeline.stages import BEST
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
 from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.photos import save_overlay

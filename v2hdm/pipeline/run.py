@@ -36,9 +36,8 @@ from v2hdm.records import Drive
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of, prune_to_limit
-from v2hdm.store.folders import note_use
+from v2hdm.store.folders import HOST, note_use
 from v2hdm.store.inputs import note_input
-from v2hdm.store.lock import HOST
 from v2hdm.store.remote import RemoteFolder, is_url, place_of
 from v2hdm.store.results import drop_result, files_of_result, is_whole, locked_folder, result_folder
 from v2hdm.verdict.verdict import Verdict
@@ -52,10 +51,7 @@ _RECORD = ".v2hdm-finished"  # object beside a result at a store, which says wha
 
 @dataclass(frozen=True)
 class RunResult:
-    """The folder of a run, ``metrics.json``'s content, sentences for a reader, and the verdict.
-
-    Where the results are at an object store, ``url`` says where, and the folder is gone.
-    """
+    """A run's folder, or ``url`` if sent away, ``metrics.json``'s content, sentences, and the verdict."""
 
     folder: Path
     metrics: Mapping[str, Any]

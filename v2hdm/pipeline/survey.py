@@ -18,7 +18,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, FloatArray
 from v2hdm.report.check_points import CheckTable, compare
 from v2hdm.verdict import Finding
-from v2hdm.verdict.results.survey import check_frame, check_points
+from v2hdm.verdict.results.accuracy import check_frame, check_points
 
 _log = logging.getLogger(__name__)
 

@@ -20,9 +20,8 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from v2hdm.io.drive.survey import SurveyedPoint
+from v2hdm.io.drive.survey import SurveyedPoint, match
 from v2hdm.io.maps.features import features_of
-from v2hdm.io.maps.surveyed import match
 from v2hdm.records import FloatArray, HdMap, JointCovariance
 from v2hdm.store.files import replace_csv
 

@@ -103,10 +103,7 @@ def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatAr
 
 
 def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[str, float]:
-    """RMSE, m, of the heights of paired markings' corners, and the share within 1.96 of their sigmas.
-
-    Empty where no pair has heights; the share is left out where they have no sigmas.
-    """
+    """RMSE, m, of paired corners' heights and the share within 1.96 sigmas; nothing that is not known."""
     off, inside = [], []
     for one, other, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
         if one.heights_m is None or other.heights_m is None:

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import polygamma, psi
 
 from v2hdm.association.groups import FusedGroups, line_only
-from v2hdm.geometry.quadrilateral import block_diagonal
+from v2hdm.geometry.planar import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _UNSEEN_M2 = 1e4  # variance of a corner that was not seen, m^2: infinite beside the size of a site

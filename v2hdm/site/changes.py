@@ -17,7 +17,7 @@ import numpy as np
 from v2hdm.association.ground import Views
 from v2hdm.association.sightings import Rig
 from v2hdm.errors import MappingError
-from v2hdm.geometry.quadrilateral import SHIFTS
+from v2hdm.geometry.planar import SHIFTS
 from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, IntArray, Marking
 from v2hdm.site.fates import Decision, Watched, decide
 from v2hdm.site.looks import Looks, Observer, find_rates, with_paint

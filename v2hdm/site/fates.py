@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
-from v2hdm.geometry.quadrilateral import SHIFTS, align
+from v2hdm.geometry.planar import SHIFTS, align
 from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions

@@ -22,7 +22,7 @@ from v2hdm.association.groups import near_pairs, squared_distances
 from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.quadrilateral import Quad
+from v2hdm.geometry.planar import Quad
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is

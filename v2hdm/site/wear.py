@@ -22,7 +22,7 @@ from scipy.stats import norm
 from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.quadrilateral import Quad
+from v2hdm.geometry.planar import Quad
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, FloatArray, HdMap, Image, PaintLeft
 

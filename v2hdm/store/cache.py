@@ -29,8 +29,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, need
 from v2hdm.store.files import file_digest
-from v2hdm.store.folders import LIST, is_stale, remove_ours, size_of
-from v2hdm.store.lock import HOST, STAGES, in_use, unused_before
+from v2hdm.store.folders import HOST, LIST, STAGES, in_use, is_stale, remove_ours, size_of, unused_before
 
 _log = logging.getLogger(__name__)
 _Value = TypeVar("_Value")
@@ -283,10 +282,7 @@ def items_of(cache: Path) -> list[Item]:
 
 
 def prune(cache: Path, limit: float) -> list[Item]:
-    """Remove what was unused for longest until the rest has ``limit`` bytes, and all that killed runs left.
-
-    Returns what was removed. More than the limit stays where runs in progress use it.
-    """
+    """Remove what was unused longest until ``limit`` bytes are left, and killed runs' rests; returns it."""
     before_s, items, removed = unused_before(cache), items_of(cache), []
     size = sum(item.size for item in items)
     for item in items:

@@ -20,9 +20,8 @@ from pathlib import Path
 
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import file_digest, observed_writes, refuse_url, whole_file
-from v2hdm.store.folders import bring_over, remove_empty
+from v2hdm.store.folders import HOST, bring_over, remove_empty, take_lock
 from v2hdm.store.inputs import LIST, refuse_input
-from v2hdm.store.lock import HOST, take_lock
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from v2hdm.io.trajectory import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
 from v2hdm.store.cache import DRIVES, LEFT, checked, code_key, items_of
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text
-from v2hdm.store.lock import IN_USE, STAGES
+from v2hdm.store.folders import IN_USE, STAGES
 
 IMAGES = 16
 """Of the drive's one camera: enough for a map, few enough for a second or two a run."""

@@ -12,8 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from tests.benchmarks.made.draw import Recipe
-from v2hdm.geometry.rigid import exp, rotation_from_euler
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import exp, interpolate, rotation_from_euler
 from v2hdm.io.drive.road import lay_flat
 from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, Image, PoseNoise, Trajectory, Truth

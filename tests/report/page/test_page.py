@@ -22,8 +22,7 @@ from tests.report.page.folder import (
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
-from v2hdm.io.drive import read_drive
-from v2hdm.io.drive.of_result import drive_of
+from v2hdm.io.drive import drive_of, read_drive
 from v2hdm.io.maps.evidence import COLUMNS
 from v2hdm.records import DIAMOND, GeodeticOrigin, Marking
 from v2hdm.report.page import document as document_module

@@ -18,10 +18,19 @@ from torch import Tensor
 
 from v2hdm.adjust import model
 from v2hdm.adjust.arrays import Arrays, Run
-from v2hdm.adjust.corner_factor import CornerFactor, cholesky_2x2, factorise_corners
 from v2hdm.adjust.engine import WEIGHT_FLOOR, Engine, Evaluated, Linearised
 from v2hdm.adjust.model import Estimate, Gradient, Loss
-from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
+from v2hdm.adjust.reduced import (
+    CornerFactor,
+    Coupled,
+    Plan,
+    PriorBlocks,
+    ReducedSystem,
+    Spread,
+    cholesky_2x2,
+    factorise_corners,
+    frames_per_tile,
+)
 from v2hdm.adjust.tiles import TIP, find_pattern
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray

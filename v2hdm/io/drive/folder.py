@@ -1,7 +1,4 @@
-"""The project's own drive folder: TUM poses, ROS camera_info, image lists, one ``drive.yaml``.
-
-docs/drive-format.md describes it for those who want to make one.
-"""
+"""The project's own drive folder (docs/drive-format.md): TUM poses, ROS camera_info, image lists."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration import mounting
+from v2hdm.io.calibration import reading
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
@@ -119,30 +116,30 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         raise DriveError(f"{where}: give one of 'mounting', 'cam_from_vehicle' and 'ipm'; got {len(guesses)}")
     if "ipm" in entry:
         matrices = take_mapping(entry["ipm"], f"{where}, ipm", DriveError)
-        check_keys(matrices, (), mounting.IPM_NAMES, f"{where}, ipm", DriveError)
-        ipm = {name: mounting.take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
+        check_keys(matrices, (), reading.IPM_NAMES, f"{where}, ipm", DriveError)
+        ipm = {name: reading.take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
         if not ipm:
-            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(mounting.IPM_NAMES)}")
+            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(reading.IPM_NAMES)}")
     else:
         (key,), guess = guesses, entry[guesses[0]]
-        guess = mounting.take_mounting(guess, f"{where}, mounting") if key == "mounting" else guess
-        ipm = {"estimated": mounting.ipm_from_guess(info, guess, f"{where}, {key}")}
+        guess = reading.take_mounting(guess, f"{where}, mounting") if key == "mounting" else guess
+        ipm = {"estimated": reading.ipm_from_guess(info, guess, f"{where}, {key}")}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
-    initial_ipm = mounting.choose_initial(entry.get("initial_ipm"), ipm, where)
+    initial_ipm = reading.choose_initial(entry.get("initial_ipm"), ipm, where)
     if "roi_vehicle" in entry:
-        roi_vehicle = mounting.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+        roi_vehicle = reading.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
     else:
-        roi_vehicle = mounting.roi_of_ipm(info, ipm[initial_ipm])
-    mounting.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
+        roi_vehicle = reading.roi_of_ipm(info, ipm[initial_ipm])
+    reading.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     return Camera(
         info=info,
         ipm=ipm,
         initial_ipm=initial_ipm,
         roi_vehicle=roi_vehicle,
-        centre_prior=None if prior is None else mounting.take_centre_prior(prior, f"{where}, centre_prior"),
+        centre_prior=None if prior is None else reading.take_centre_prior(prior, f"{where}, centre_prior"),
         linear_response=linear,
         own_vehicle=_read_mask(entry, root, info, where),
     )

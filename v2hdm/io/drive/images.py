@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.trajectory import in_order, interpolate
+from v2hdm.geometry.rigid import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
@@ -83,10 +83,7 @@ def assemble_drive(
     where: str,
     mount_rad: FloatArray | None = None,
 ) -> Drive:
-    """The drive of its ``recorded`` poses: the road laid flat, every image of ``files`` posed and checked.
-
-    ``mount_rad`` is the sensor's turn where the poses have lost it.
-    """
+    """The drive of ``recorded`` poses, the road laid flat, images posed; ``mount_rad`` is a lost turn."""
     assert drive.recorded is not None
     check_trajectory(drive.recorded, drive.origin, where)
     laid = lay_flat(drive.recorded, drive.pose_noise.position_m)

@@ -17,8 +17,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
 from v2hdm.geometry.ipm import extrinsic_from_ipm
-from v2hdm.geometry.rigid import camera_centre, log, make_transform
-from v2hdm.geometry.trajectory import in_order
+from v2hdm.geometry.rigid import camera_centre, in_order, log, make_transform
 from v2hdm.records import (
     Camera,
     CentrePrior,

@@ -1,7 +1,4 @@
-"""Sources of a drive's images, intrinsics and poses: files, an image folder, a video, topics of a bag.
-
-All that a drive wants of its bag is gathered first and then imported in one pass.
-"""
+"""Sources of images, intrinsics and poses: files, a folder, a video, topics of a bag read in one pass."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
-from v2hdm.io.importers.bag.tf import TF_TOPIC
-from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
+from v2hdm.io.importers.bag.messages import TF_TOPIC
+from v2hdm.io.importers.readings import Readings, read_stamps, readings_of_poses
 from v2hdm.io.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
@@ -36,10 +33,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 @dataclass
 class Sources:
-    """The folder that file names are relative to, the cache of imports, and the drive's bag, if any.
-
-    Transforms further apart than ``max_gap_s`` are not interpolated across.
-    """
+    """The folder of file names, the cache of imports, the bag, if any, and the longest gap in transforms."""
 
     root: Path
     cache: Path
@@ -174,10 +168,7 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
 
 
 def _import_video(path: Path, cache: Path, where: str) -> Path:
-    """The folder of the frames of a video as PNG files, decoded by PyAV now unless they were before.
-
-    Their list has the container's times, s since the first frame.
-    """
+    """The folder of a video's frames as PNG files and of their times, decoded by PyAV unless they were."""
     if not path.is_file():
         raise DriveError(f"{where}: {path}: no such video; check the path")
     folder = entry_folder(cache, [path], "video", ["frames"])

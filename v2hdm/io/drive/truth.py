@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.mounting import take_rigid
+from v2hdm.io.calibration.reading import take_rigid
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth

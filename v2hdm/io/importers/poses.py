@@ -17,10 +17,9 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
-from v2hdm.geometry.rigid import make_transform, rotation_from_euler
-from v2hdm.geometry.trajectory import interpolate
-from v2hdm.io.importers import nmea, tables
-from v2hdm.io.importers.tables import Readings
+from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
+from v2hdm.io.importers import readings as logs
+from v2hdm.io.importers.readings import Readings
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
@@ -60,9 +59,9 @@ class Recorded:
 _Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
 
 POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
-    "tum": (lambda path, entry, root, where: tables.readings_of_poses(read_tum(path)), ()),
-    "csv": (tables.read_table, tables.TABLE_KEYS),
-    "nmea": (nmea.read_nmea, nmea.KEYS),
+    "tum": (lambda path, entry, root, where: logs.readings_of_poses(read_tum(path)), ()),
+    "csv": (logs.read_table, logs.TABLE_KEYS),
+    "nmea": (logs.read_nmea, logs.NMEA_KEYS),
 }
 """Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
 

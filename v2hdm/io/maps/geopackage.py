@@ -1,15 +1,17 @@
-"""Writing an HD map as GeoPackage (OGC 12-128) through ``pyogrio``; it opens styled in QGIS.
+"""Writing an HD map as GeoPackage (OGC 12-128) through ``pyogrio``, and the QGIS project that opens it.
 
 Layers ``markings`` and ``symbols`` hold polygons, ``lanes`` lines, all with heights; the table ``v2hdm``
 describes the map. With a geodetic origin coordinates are longitude, latitude and ellipsoidal height
 (EPSG:4326), or those of the grid that was asked for. Without one, or where the local frame was asked for,
-they are local metres in an engineering CRS, which no GIS takes for degrees.
+they are local metres in an engineering CRS, which no GIS takes for degrees. The project colours by class,
+over the mosaic of the ground.
 """
 
 from __future__ import annotations
 
 import filecmp
 import json
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -23,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, MapFileError, need
-from v2hdm.geometry.geodetic import Grid
+from v2hdm.geometry.geodetic import Grid, crs_of
 from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HdMap
-from v2hdm.store.files import whole_file
+from v2hdm.store.files import replace_text, whole_file
 
 LOCAL_CRS = (
     'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",'
@@ -180,3 +182,77 @@ def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]
         "styleQML": layer_style(kinds, closed),
         "description": "colours by class",
     }
+
+
+MOSAIC = "mosaic.tif"  # beside the project, where the run has made one
+_AROUND_M = 5.0
+
+
+def write_qgis(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+    """Write the project ``path`` of the GeoPackage beside it that has its name, atomically.
+
+    The canvas is in metres: of the ``grid``, else of the map frame, about whose origin it is projected. All
+    files are named relative to the project, so that the folder may be moved.
+    """
+    pyproj = need("pyproj", "map", "the format qgis", ConfigError)
+    features, where = features_of(hd_map), grid or Grid("local", hd_map.origin)
+    placed = hd_map.origin is not None and (grid is None or not grid.is_local)
+    ground = crs_of(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
+    layers_crs = LOCAL_CRS if not placed else "EPSG:4326" if grid is None else grid.crs
+    canvas_crs = ground if grid is None else layers_crs
+    system = pyproj.CRS.from_user_input(canvas_crs)
+    root = ET.Element("qgis", {"version": "3.22.0", "projectname": path.stem})
+    ET.SubElement(root, "title").text = path.stem
+    _refer(ET.SubElement(root, "projectCrs"), system)
+    enabled = ET.SubElement(ET.SubElement(root, "properties"), "SpatialRefSys")
+    ET.SubElement(enabled, "ProjectionsEnabled", {"type": "int"}).text = "1"
+    tree = ET.SubElement(root, "layer-tree-group")
+    canvas = ET.SubElement(root, "mapcanvas", {"name": "theMapCanvas"})
+    ET.SubElement(canvas, "units").text = "degrees" if system.is_geographic else "meters"
+    places = np.concatenate([one.positions(where)[:, :2] for one in features] or [np.zeros((1, 2))])
+    around = _AROUND_M * (1e-5 if system.is_geographic else 1.0)
+    extent = ET.SubElement(canvas, "extent")
+    corners = (*(places.min(axis=0) - around), *(places.max(axis=0) + around))
+    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True):
+        ET.SubElement(extent, name).text = repr(float(value))
+    layers = ET.SubElement(root, "projectlayers")
+    for key, layer in reversed(LAYERS.items()):
+        shape = "Line" if key == POINTS else "Polygon"
+        source = f"./{path.stem}.gpkg|layername={layer}"
+        element = _layer(tree, layers, layer, source, "ogr", {"type": "vector", "geometry": shape})
+        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(layers_crs))
+        kinds = sorted({one.kind for one in features if one.key == key})
+        element.extend(ET.fromstring(layer_style(kinds, key != POINTS).split("\n", 1)[1]))
+    if (path.parent / MOSAIC).is_file():
+        element = _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
+        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground))
+    ET.indent(root, " ")
+    doctype = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
+    replace_text(path, f"{doctype}\n{ET.tostring(root, encoding='unicode')}\n")
+
+
+def _refer(parent: ET.Element, system: Any) -> None:
+    """State a coordinate system, without which QGIS takes a layer as it lies."""
+    reference = ET.SubElement(parent, "spatialrefsys", {"nativeFormat": "Wkt"})
+    ET.SubElement(reference, "wkt").text = system.to_wkt()
+    if (code := system.to_authority()) is not None:
+        ET.SubElement(reference, "authid").text = ":".join(code)
+
+
+def _layer(
+    tree: ET.Element, layers: ET.Element, name: str, source: str, provider: str, kind: Mapping[str, str]
+) -> ET.Element:
+    """Add a layer below those that are there."""
+    identity = f"v2hdm_layer_{name}"  # QGIS gives those of ten letters and fewer another
+    entry = {
+        "id": identity,
+        "name": name,
+        "source": source,
+        "providerKey": provider,
+        "checked": "Qt::Checked",
+    }
+    ET.SubElement(tree, "layer-tree-layer", entry | {"expanded": "1"})
+    element = ET.SubElement(layers, "maplayer", dict(kind))
+    for tag, text in (("id", identity), ("datasource", source), ("layername", name), ("provider", provider)):
+        ET.SubElement(element, tag).text = text
+    return element

@@ -18,10 +18,7 @@ _NOTHING = -9999.0
 
 
 def write_ground_geotiff(hd_map: HdMap, path: Path) -> None:
-    """Write the ground as a GeoTIFF of two bands, heights above the map's origin and their sigmas, m.
-
-    Cells that no strip covers hold no data; of two strips, the surer one counts.
-    """
+    """Write the ground as GeoTIFF, heights above the origin and sigmas, m; the surer of two strips counts."""
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
     edges = np.concatenate(
         [one.points(side) for one in hd_map.ground for side in one.left_m[[0, -1]].tolist()]
@@ -72,10 +69,7 @@ def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
 
 
 def write_opencrg(hd_map: HdMap, path: Path) -> None:
-    """Write the ground as OpenCRG, a file for each session: heights (m) on a grid along the driven path.
-
-    OpenCRG has no place for sigmas. Raises ConfigError when ``pyopencrg`` is not installed.
-    """
+    """Write the ground as OpenCRG, by session: heights (m) on a grid along the path; sigmas have no place."""
     crg = need("pyopencrg", "gis", "the format opencrg", ConfigError)
     for number, strip in enumerate(hd_map.ground, start=1):
         base_m = float(strip.heights_m.mean())

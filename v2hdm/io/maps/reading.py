@@ -55,11 +55,7 @@ GEOMETRY = "geom"  # the column of a GeoPackage's layer
 
 
 def read_map(path: Path) -> tuple[HdMap, Verdict]:
-    """A map and the verdict on it, from a GeoJSON file or GeoPackage.
-
-    Raises MapFileError when the file is missing, damaged or in another format, ConfigError when a package
-    that reads it is not installed.
-    """
+    """A map and its verdict, from GeoJSON or GeoPackage; MapFileError, or ConfigError without a package."""
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         endings = " or ".join(_READERS)

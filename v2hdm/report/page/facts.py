@@ -14,8 +14,7 @@ from v2hdm.association.surface import Surface
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.planar import length_along
-from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.geometry.trajectory import interpolate
+from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.evidence import FILE as RESIDUALS

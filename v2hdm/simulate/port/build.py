@@ -26,8 +26,7 @@ from v2hdm.simulate.port.config import (
     YardConfig,
 )
 from v2hdm.simulate.port.paint import build_layout
-from v2hdm.simulate.port.relief import build_relief, stands
-from v2hdm.simulate.port.route import DrivenPoses, Route, build_route, drive_along
+from v2hdm.simulate.port.route import DrivenPoses, Route, build_relief, build_route, drive_along, stands
 from v2hdm.simulate.render import scene as parts
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
@@ -358,10 +357,7 @@ def _visit_seed(config: PortConfig, part: int) -> list[int]:
 
 
 def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
-    """The cameras of a port as the mapper gets to know them: two IPMs, a region and a surveyed centre.
-
-    Raises ConfigError when the points of the manual calibration cannot be used.
-    """
+    """A port's cameras as the mapper knows them: IPMs, a region, a surveyed centre. Raises ConfigError."""
     rng = np.random.default_rng([config.seed, _CALIBRATION])
     sigma, surveyed = np.full(3, config.calibration.centre_sigma_m), {}
     for name, camera in sorted(config.cameras.items()):
@@ -376,10 +372,7 @@ def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
 
 
 def build_port(config: PortConfig) -> Port:
-    """Build a port; equal configurations give equal ports.
-
-    Raises ConfigError when values are out of range or contradict each other.
-    """
+    """Build a port; equal configurations give equal ports, values that contradict each other ConfigError."""
     _check(config)
     streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD)}
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}

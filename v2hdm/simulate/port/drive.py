@@ -89,10 +89,7 @@ def inside_image(
 
 
 def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
-    """Which sight lines from ``centre_map`` (3,) to ground points (N, 2 or 3) pass through a box.
-
-    The slab test (Kay and Kajiya 1986) in the frame of every box, in which its faces are level.
-    """
+    """Which sight lines from ``centre_map`` (3,) to points (N, 2 or 3) pass a box (Kay and Kajiya 1986)."""
     hidden = np.zeros(len(points_map), dtype=np.bool_)
     points = points_map if points_map.shape[1] == 3 else _on_ground(points_map, None)
     for box in boxes:

@@ -82,10 +82,7 @@ def _coverage(edges: NDArray[np.float32], u: Any, v: Any) -> Any:
 
 @exact_kernel
 def bands(boundary: FloatArray, first_row: int, height: int, width: int, limits: Any, out: IntArray) -> int:
-    """Write the windows of an outline's ``boundary`` (M, 2) px into ``out``; returns their number.
-
-    ``limits`` are the rows of a band, and the area from which on there are several.
-    """
+    """Write the windows of an outline px into ``out``, several from an area on; returns their number."""
     count = len(boundary)
     top, bottom, left, right = boundary[0, 1], boundary[0, 1], boundary[0, 0], boundary[0, 0]
     for k in range(1, count):

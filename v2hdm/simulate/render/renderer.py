@@ -302,10 +302,7 @@ class Optics:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """The camera's motion during the exposure, in its own frame: m/s, rad/s, s.
-
-    The image's time stamp and pose belong to the middle of the exposure.
-    """
+    """The camera's motion in its own frame: m/s, rad/s, s; its pose is of the middle of the exposure."""
 
     velocity_cam: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angular_velocity_cam: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -44,10 +44,7 @@ class Tile:
 
 @cache
 def noise_tile(seed: int, side_m: float, slope: float, finest_px: float = 2.0, skew: float = 0.0) -> Tile:
-    """Noise of spectral amplitude 1 / frequency^slope, wavelengths from ``finest_px`` tile pixels upwards.
-
-    ``skew`` > 0 gives bright specks on a dark ground, as of aggregate in asphalt.
-    """
+    """Noise of amplitude 1 / frequency^slope from ``finest_px`` upwards; ``skew`` > 0: bright specks."""
     rng = np.random.default_rng([seed, 77])
     frequency = np.hypot(np.fft.fftfreq(_TILE_PX)[:, None], np.fft.rfftfreq(_TILE_PX)[None])
     frequency[0, 0] = np.inf
@@ -202,10 +199,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Backdrop:
-    """The end of the view beyond the boxes: a skyline of blocks up to ``height_rad`` high, and haze.
-
-    ``haze_m`` is the distance at which the ground has lost 63 % of its contrast.
-    """
+    """A skyline up to ``height_rad`` high behind the boxes, and haze, which leaves 37 % after ``haze_m``."""
 
     height_rad: float = 0.06
     block_rad: float = 0.08

@@ -59,10 +59,7 @@ def _rays(width: int, height: int, intrinsic: bytes, model: str, distortion: tup
 
 
 def camera_rays(info: CameraInfo) -> Rays:
-    """The rays of a camera, remembered for the last few cameras.
-
-    The lens is inverted on a grid of 8 px and interpolated: at most 0.01 px off for usual lenses.
-    """
+    """The rays of a camera, remembered for the last few; inverted on a grid of 8 px: at most 0.01 px off."""
     intrinsic = np.ascontiguousarray(info.intrinsic, dtype=np.float64).tobytes()
     return _rays(info.width, info.height, intrinsic, info.distortion_model, tuple(info.distortion))
 
@@ -123,10 +120,7 @@ class Outline:
 def outlines(
     view: View, polygons: Sequence[FloatArray], draped: Sequence[FloatArray] | None = None
 ) -> list[Outline | None]:
-    """The outlines of polygons of homogeneous pinhole pixels (N, 3); None for those out of view.
-
-    Their boundaries are those of ``draped`` (M, 3), if given: where an image shows what lies on a relief.
-    """
+    """Outlines of polygons of homogeneous pixels (N, 3), None out of view; boundaries those of ``draped``."""
     if not polygons:
         return []
     count, points = np.array([len(polygon) for polygon in polygons]), np.concatenate(polygons)
@@ -157,10 +151,7 @@ def outlines(
 
 
 def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:
-    """Which of several point sets (M, N, 3), as homogeneous pinhole pixels, may reach into the image.
-
-    A set is left out when all its points lie on the outer side of one border, or beyond ``farthest_m``.
-    """
+    """Which point sets (M, N, 3) of homogeneous pixels may reach into the image, within ``farthest_m``."""
     depth = homogeneous_px[..., 2]
     u0, v0, u1, v1 = view.rays.bounds
     outside = (depth < _NEAR_M).all(axis=1) | (depth.min(axis=1, initial=np.inf) > farthest_m)
@@ -195,10 +186,7 @@ def _visible_parts(view: View, polygons: Sequence[FloatArray]) -> list[FloatArra
 
 
 def bands_of(view: View, shape: Outline, first_row: int = 0) -> tuple[IntArray, int]:
-    """Image windows that cover an outline closely, and their number: bands of rows as wide as it is there.
-
-    Windows are rows (first row, end, first column, end) of the array; what follows the last means nothing.
-    """
+    """Image windows that cover an outline closely, bands of rows as wide as it is there, and their number."""
     height, width = view.rays.u_pinhole_px.shape
     found = np.empty((height // _BAND_ROWS + 2, 4), dtype=np.int64)
     limits = (_BAND_ROWS, _BAND_AREA_PX)

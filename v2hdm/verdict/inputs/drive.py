@@ -1,4 +1,7 @@
-"""All checks before a run: poses, clocks, noise, road, cameras, images, and bare ground."""
+"""All checks before a run: poses, clocks, noise, road, cameras, images, and bare ground.
+
+A camera's intrinsics, guess, survey and ROI are held against each other; no image is looked at.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,229 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.geometry.ipm import apply_homography, extrinsic_from_ipm
+from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
+from v2hdm.geometry.planar import inside_convex, signed_area
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
-from v2hdm.records import Drive
+from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray
 from v2hdm.verdict.inputs import ground as ground_checks
-from v2hdm.verdict.inputs.cameras import check_camera
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
+
+# Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this.
+_OFF_CENTRE = 0.15
+# A principal point in the middle of an image smaller or larger by this is that of another resolution.
+_OTHER_SIZE = 0.15
+# Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg.
+_SHORTEST, _LONGEST = 0.3, 5.0
+_SQUARE = 0.03  # pixels are square to far less than this
+_MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one percent
+_BORROWED_M = 1.0  # a guess borrowed from another vehicle of the kind, or from a drawing, is decimetres off
+_NEAR_SURVEY_M = 0.6  # survey and guess that come so close once a sign or a unit is changed show the cause
+# Units that surveys come in, in 1/m.
+_SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
+_ROI_IN_VIEW = 0.5  # at least this share of the ROI must be in the image
+_ROI_AREA_M2 = 4.0  # a smaller ROI holds no whole marking: a dash alone is 3 m long
+# Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre.
+_COARSEST_M = 0.5
+_TILTED_DEG = 30.0  # cameras for roads are mounted upright
+_LOWEST_M, _HIGHEST_M = 0.3, 12.0  # heights of cameras on vehicles, cranes' straddle carriers included
+
+
+def check_camera(name: str, camera: Camera) -> list[Finding]:
+    """All checks of one camera's description."""
+    cam_from_vehicle = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+    findings = [
+        *check_intrinsics(name, camera.info),
+        *check_roi(name, camera, cam_from_vehicle),
+        _shape(name, camera.info, camera.ipm[camera.initial_ipm]),
+        *_mounting(name, cam_from_vehicle),
+    ]
+    if camera.centre_prior is not None:
+        findings.append(check_survey(name, camera.centre_prior, camera_centre(cam_from_vehicle)))
+    return findings
+
+
+def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
+    """Camera matrix against image size."""
+    (fx, _, cx), (_, fy, cy), _ = info.intrinsic
+    off = max(abs(cx + 0.5 - info.width / 2), abs(cy + 0.5 - info.height / 2)) / info.width
+    scale_u, scale_v = (2 * cx + 1) / info.width, (2 * cy + 1) / info.height
+    other = abs(scale_u / max(scale_v, 1e-9) - 1) < _OTHER_SIZE and abs(scale_u - 1) > _OTHER_SIZE
+    size = f"{scale_u * info.width:.0f} x {scale_v * info.height:.0f}"
+    cause = (
+        f"camera_info is that of images of about {size}, these are {info.width} x {info.height}; divide fx, "
+        f"fy, cx, cy by {scale_u:.3g}"
+        if other
+        else f"the principal point is {100 * off:.0f} % of the width off the image's centre; check cx and cy"
+    )
+    yield judge(
+        "principal point", name, off, _OFF_CENTRE, "",
+        fine="the principal point is near the image's centre",
+        wrong=cause,
+        status=Status.FAIL if other else Status.WARN,
+    )  # fmt: skip
+    focal = fx / info.width
+    yield judge(
+        "focal length", name, focal, _LONGEST, "image widths", least=_SHORTEST,
+        fine="the focal length is one of a lens for roads",
+        wrong=f"fx is {focal:.2g} image widths, no lens for roads; give it in px of these images, not in mm",
+    )  # fmt: skip
+    yield judge(
+        "square pixels", name, fx / fy - 1, _SQUARE, "",
+        fine="fx and fy agree",
+        wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, but "
+        "pixels are square; check both in camera_info",
+        status=Status.WARN,
+    )  # fmt: skip
+    yield _lens(name, info)
+
+
+def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[Finding]:
+    """Whether the ROI lies before the camera, in its image, and neither too far nor too small."""
+
+    def failed(value: float, limit: float, unit: str, says: str) -> list[Finding]:
+        return [Finding("roi", Status.FAIL, value, limit, unit, says, name)]
+
+    grid = _grid(camera.roi_vehicle)
+    depth = np.column_stack([grid, np.zeros(len(grid)), np.ones(len(grid))]) @ cam_from_vehicle[2]
+    before = 1 - float((depth <= 0).mean())
+    if before < _ROI_IN_VIEW:
+        says = (
+            "roi_vehicle lies behind the camera: its x, or the guess, has the wrong sign (x is forward, a "
+            "rear camera's ROI has negative x); mend one of them"
+        )
+        return failed(before, _ROI_IN_VIEW, "", says)
+    seen = _share_in_image(camera, grid, depth)
+    if seen < _ROI_IN_VIEW:
+        says = (
+            f"only {100 * seen:.0f} % of roi_vehicle is in the image, as the guess of the mounting says: "
+            "mend roi_vehicle or the guess"
+        )
+        return failed(seen, _ROI_IN_VIEW, "", says)
+    area = abs(float(signed_area(camera.roi_vehicle)))
+    if area < _ROI_AREA_M2:
+        says = f"roi_vehicle covers {area:.2g} m2, less than a marking; enlarge it (metres, not kilometres)"
+        return failed(area, _ROI_AREA_M2, "m2", says)
+    farthest = _farthest(name, camera, cam_from_vehicle, grid[depth > 0])
+    return [passed("roi", name, "the ROI is in the image", seen), farthest]
+
+
+def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> Finding:
+    """The surveyed centre against the one that the guess implies, which may be borrowed."""
+    survey = prior.centre_vehicle
+    away = float(np.linalg.norm(survey - guess_vehicle))
+    return judge(
+        "survey against guess", name, away, _BORROWED_M + 3 * float(np.linalg.norm(prior.sigma_m)), "m",
+        fine="survey and guess put the camera at about the same place",
+        wrong=f"centre_prior puts the camera {away:.1f} m away from where its guess does: "
+        f"{_survey_cause(survey, guess_vehicle)}",
+    )  # fmt: skip
+
+
+def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
+    for axis, letter in enumerate("xyz"):
+        flipped = survey.copy()
+        flipped[axis] *= -1
+        if np.linalg.norm(flipped - guess) < _NEAR_SURVEY_M:
+            return f"its {letter} has the wrong sign; write {flipped[axis]:.2f}"
+    if np.linalg.norm(survey[[1, 0, 2]] - guess) < _NEAR_SURVEY_M:
+        return "its x and y are swapped; x is forward, y left"
+    for unit, scale in _SURVEY_UNITS.items():
+        if np.linalg.norm(survey / scale - guess) < _NEAR_SURVEY_M:
+            return f"it is in {unit}; write it in metres"
+    offset = ", ".join(f"{value:+.1f}" for value in survey - guess)
+    return f"by {offset} m in x, y, z; survey it from the vehicle's origin on the ground, or mend the guess"
+
+
+def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
+    height = float(camera_centre(cam_from_vehicle)[2])
+    yield judge(
+        "camera height", name, height, _HIGHEST_M, "m", least=_LOWEST_M,
+        fine="the guess puts the camera at the height of a vehicle",
+        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres)",
+    )  # fmt: skip
+    tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-cam_from_vehicle[0, 2], -1, 1))))
+    if cam_from_vehicle[1, 2] > 0:  # upside down
+        tilt_deg = 180.0 - tilt_deg
+    yield judge(
+        "camera tilt", name, tilt_deg, _TILTED_DEG, "deg",
+        fine="the guess holds the camera upright",
+        wrong=f"the guess tilts the camera by {tilt_deg:.0f} deg about its axis: its axes are x right, y "
+        "down, z forward, and v counts downwards; mend the guess, or turn the images",
+    )  # fmt: skip
+
+
+def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
+    """How far the IPM is from K [r1 r2 t]: its two axes on the ground must be equally long and square."""
+    columns = np.linalg.inv(info.intrinsic) @ np.linalg.inv(ipm)
+    first, second = columns[:, 0], columns[:, 1]
+    lengths = np.linalg.norm(first), np.linalg.norm(second)
+    ratio = float(lengths[0] / lengths[1] - 1)
+    cosine = float(first @ second / (lengths[0] * lengths[1]))
+    value, part = max((abs(ratio), "the focal length"), (abs(cosine), "the principal point"))
+    return judge(
+        "ipm against camera matrix", name, value, _MISSHAPEN, "",
+        fine="the IPM is a homography of this camera matrix",
+        wrong=f"the IPM and camera_info differ by {100 * value:.0f} %, most in {part}: one of the two is "
+        "wrong, of another resolution, or the IPM was made from distorted pixels; make it anew",
+        status=Status.WARN,
+    )  # fmt: skip
+
+
+def _lens(name: str, info: CameraInfo) -> Finding:
+    """How wide the lens is, and whether it has distortion; only the images tell whether that is right."""
+    corners = np.array([[0.0, info.height / 2], [info.width - 1.0, info.height / 2]])
+    pinhole = (undistort_points(info, corners) - info.intrinsic[:2, 2]) / np.diag(info.intrinsic)[:2]
+    width_deg = float(np.rad2deg(np.arctan(np.abs(pinhole[:, 0])).sum()))
+    bends = "the lens is undistorted by its coefficients" if has_distortion(info) else "it has no distortion"
+    return passed("field of view", name, f"{width_deg:.0f} deg wide; {bends}", width_deg, "deg")
+
+
+def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: FloatArray) -> Finding:
+    """Metres of ground along the view that one pixel shows at the far end: range^2 / (height focal)."""
+    centre = camera_centre(cam_from_vehicle)
+    range_m = float(np.linalg.norm(grid - centre[:2], axis=1).max())
+    focal = float(camera.info.intrinsic[1, 1])
+    coarse = (range_m**2 + centre[2] ** 2) / (max(centre[2], 0.1) * focal)
+    return judge(
+        "roi range", name, float(coarse), _COARSEST_M, "m/px",
+        fine="a pixel shows little ground at the ROI's far end",
+        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m; end it nearer",
+        status=Status.WARN,
+    )  # fmt: skip
+
+
+def _share_in_image(camera: Camera, grid: FloatArray, depth: FloatArray) -> float:
+    info = camera.info
+    ipm = np.asarray(np.linalg.inv(camera.ipm[camera.initial_ipm]))
+    pinhole = apply_homography(ipm, grid[depth > 0])
+    # Lens models fold over far outside the image: what the pinhole puts there is not in it.
+    near = inside_convex(_frame(info, 0.5), pinhole)
+    points_px = distort_points(info, pinhole[near])
+    return float(inside_convex(_frame(info, 0.0), points_px).sum() / len(grid))
+
+
+def _frame(info: CameraInfo, margin: float) -> FloatArray:
+    """The image's border, wider by ``margin`` of its size on each side."""
+    left, top = -margin * info.width, -margin * info.height
+    right, bottom = info.width - 1 - left, info.height - 1 - top
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+
+
+def _grid(polygon: FloatArray) -> FloatArray:
+    """Points (N, 2) all over a convex polygon, its corners among them."""
+    axes = [np.linspace(*bounds, 15) for bounds in zip(polygon.min(axis=0), polygon.max(axis=0), strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return np.vstack([polygon, grid[inside_convex(polygon, grid)]])
+
 
 # Sigmas of roll and pitch that the mapping takes for noise, ground that leans more is bent; and sigmas
 # beyond which markings on it are wrong by many times what the map states.

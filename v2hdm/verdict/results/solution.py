@@ -230,10 +230,7 @@ def _corrected(one: Contradiction) -> Finding:
 
 
 def _is_left(one: Contradiction, corrected: Sequence[Contradiction]) -> bool:
-    """Whether the correction of a clock leaves a drift, or a heading, that is likelier than none.
-
-    Once a clock is known to be off, the odds are even that one of these is the cause.
-    """
+    """Whether, a clock corrected, a drift or heading is likelier than none: even odds, once it is off."""
     off = {camera for each in corrected if each.fault is Fault.CLOCK for camera in each.cameras}
     return one.fault in _LIKE_CLOCK and off >= set(one.cameras) and matters(one) and log_odds(one) > 0
 

@@ -13,15 +13,23 @@ from scipy.sparse import csr_array, triu
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
-from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
 from v2hdm.adjust.engine import Engine, Evaluated, Linearised
-from v2hdm.adjust.engines.numba import evaluate, frames, linearise, observe
+from v2hdm.adjust.engines.numba import evaluate, linearise
 from v2hdm.adjust.engines.numba.evaluate import Evaluation
-from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
-from v2hdm.adjust.engines.numba.pool import share
+from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout, share
 from v2hdm.adjust.engines.numba.tables import cam_from_map, move, prior_blocks_of, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
-from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread, frames_per_tile
+from v2hdm.adjust.reduced import (
+    INSEPARABLE,
+    CornerFactor,
+    Coupled,
+    Joint,
+    Plan,
+    PriorBlocks,
+    ReducedSystem,
+    Spread,
+    frames_per_tile,
+)
 from v2hdm.adjust.tiles import find_pattern
 from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
@@ -117,23 +125,23 @@ class NumbaEngine(Engine):
         corners, fixed = np.empty((count, 2)), np.empty(count, dtype=np.bool_)
         state = torch.zeros_like(arrays.state_information_root)
         table = _table(self.poses(Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())))
-        self.share(lambda b, e: observe.back_project(b, e, self._whole, table, corners, fixed))
+        self.share(lambda b, e: evaluate.back_project(b, e, self._whole, table, corners, fixed))
         return torch.from_numpy(corners), torch.from_numpy(fixed)
 
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
         """Whitened residuals (2, K) of the observations."""
         table, corners = _table(cam_from_map), _rows(corners_map)
         out = np.empty((2, len(self._whole.pair)))
-        self.share(lambda b, e: observe.residuals(b, e, self._whole, table, corners, out))
+        self.share(lambda b, e: evaluate.residuals(b, e, self._whole, table, corners, out))
         return torch.from_numpy(out)
 
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         count = len(self._whole.pair)
-        out = observe.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
+        out = evaluate.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
         order, focal = self.arrays.order.numpy(), np.ascontiguousarray(focal_px)
-        self.share(lambda b, e: observe.report(b, e, self._whole, table, corners, order, focal, out))
+        self.share(lambda b, e: evaluate.report(b, e, self._whole, table, corners, order, focal, out))
         return out
 
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
@@ -146,7 +154,7 @@ class NumbaEngine(Engine):
         """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         wrench, by_corner = np.zeros((len(table), 6)), np.zeros_like(corners)
-        observe.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
+        evaluate.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
         gathered = spread.gather(torch.from_numpy(wrench).view(self.arrays.camera_count, -1, 6))
         camera = gathered.camera
         return Gradient(camera[:, :6], gathered.frame_state, torch.from_numpy(by_corner), camera[:, 6:])
@@ -247,13 +255,13 @@ class NumbaEngine(Engine):
             root=_rows(run.root_information),
         )
         out = np.empty((len(run.pair), 12))
-        observe.couplings(layout, base, run.corner.numpy(), np.empty(16), out)
+        evaluate.couplings(layout, base, run.corner.numpy(), np.empty(16), out)
         return torch.from_numpy(out).view(-1, 2, 6)
 
     def _subtract_frames(self, base: Base, system: ReducedSystem) -> None:
         plan, matrix, spread, layout = system.plan, system.matrix, system.spread, self.layout
         column, row = np.divmod(matrix.keys, plan.tile_count + 1)
-        tiles = frames.TileMap(
+        tiles = linearise.TileMap(
             per_tile=plan.frames_per_tile,
             size=plan.size,
             position=plan.position.numpy(),
@@ -268,7 +276,7 @@ class NumbaEngine(Engine):
         def work(begin: int, end: int) -> None:
             marks = np.full((5, plan.tile_count + 1), -1)
             room = Scratch.of(layout, 0, plan.most_tiles * plan.size + system.tip)
-            frames.subtract_frames(
+            linearise.subtract_frames(
                 cuts[begin], cuts[end], layout, base, tiles, by_state, clock, each, marks, room, values
             )
 

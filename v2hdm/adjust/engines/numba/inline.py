@@ -1,6 +1,6 @@
 """Common parts of the kernels: an observation, a loss, the factor of a unit's corners.
 
-The formulas are the closed forms of :mod:`~v2hdm.adjust.model` and :mod:`~v2hdm.adjust.corner_factor`, which
+The formulas are the closed forms of :mod:`~v2hdm.adjust.model` and :mod:`~v2hdm.adjust.reduced`, which
 tests hold these to. A pair's table is its ``cam_from_map``, row by row (16,).
 """
 
@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-from v2hdm.adjust.corner_factor import CORNER_FLOOR, PIVOT_FLOOR
 from v2hdm.adjust.engine import WEIGHT_FLOOR
 from v2hdm.adjust.engines.numba.layout import Base, Layout
+from v2hdm.adjust.reduced import CORNER_FLOOR, PIVOT_FLOOR
 from v2hdm.compiled import inlined
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray

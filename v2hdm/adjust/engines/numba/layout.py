@@ -3,16 +3,25 @@
 A *unit* is corners that known lengths join, mostly one. A *chunk* is neighbouring units with some thousand
 observations. Sums over all observations are added up chunk by chunk and then over the chunks in their order,
 so that they do not depend on the number of threads; those by pair only over the pairs that a chunk touches.
+Threads take chunk after chunk.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from v2hdm.adjust.arrays import Arrays
+from v2hdm.compiled import kernel
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
@@ -137,3 +146,121 @@ class Scratch(NamedTuple):
         n = 2 * layout.most_joined
         sizes = (16,), (layout.most_seen, 12), (layout.most_seen, 8), (n, n), (n,), (n,), (n, width)
         return cls(np.empty(pairs, dtype=np.int32), *(np.empty(size) for size in sizes))
+
+
+_WORTH_THREADS = 50_000  # below this many observations starting threads costs more than they save
+
+_granted: int | None = None
+
+
+@contextmanager
+def one_thread_in_torch(observations: int, alone: bool) -> Iterator[None]:
+    """Within, torch computes on one thread, and kernels on as many as torch had.
+
+    Its products are small here, and threads that wait for each other cost more than they save. ``alone`` says
+    that torch has nothing large to do, whatever the number of ``observations``.
+    """
+    global _granted
+    before, granted = torch.get_num_threads(), _granted
+    if before == 1 or not (alone or observations < _WORTH_THREADS):
+        yield
+        return
+    _granted = before
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _granted = granted
+        torch.set_num_threads(before)
+
+
+def share(work: Callable[[int, int], None], chunks: int, observations: int) -> None:
+    """Call ``work(begin, end)`` for ranges that together are all ``chunks``."""
+    threads = min(_granted or torch.get_num_threads(), chunks)
+    if threads <= 1 or observations < _WORTH_THREADS:
+        work(0, chunks)
+        return
+    for _ in _executor(threads).map(lambda chunk: work(chunk, chunk + 1), range(chunks)):
+        pass
+
+
+@lru_cache(maxsize=1)
+def _executor(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="v2hdm-kernel")
+
+
+if hasattr(os, "register_at_fork"):
+    # A forked process has none of its parent's threads.
+    os.register_at_fork(after_in_child=_executor.cache_clear)
+
+
+class Seen(NamedTuple):
+    """K observations, and the intrinsics of the cameras, as kernels read them."""
+
+    camera: IntArray
+    frame: IntArray
+    corner: IntArray
+    pinhole_px: FloatArray
+    covariance_px: FloatArray
+    intrinsic: FloatArray
+
+    @classmethod
+    def of(cls, columns: Iterable[NDArray[Any]], intrinsic: FloatArray) -> Seen:
+        """Of columns in this order, copied only where their kind or layout is another."""
+        kinds = 3 * (np.int64,) + 3 * (np.float64,)
+        both = zip((*columns, intrinsic), kinds, strict=True)
+        made: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in both]
+        return cls(*made)
+
+
+@kernel
+def first_unsound(
+    seen: Seen, frames: int, symmetric_to: float, max_slope: float, by_corner: IntArray, by_camera: IntArray
+) -> int:
+    """The first observation that is unsound, or -1; adds up how often each corner and camera is seen."""
+    for k in range(len(seen.camera)):
+        c, n = seen.camera[k], seen.corner[k]
+        if not (0 <= c < len(by_camera) and 0 <= seen.frame[k] < frames and 0 <= n < len(by_corner)):
+            return k
+        by_corner[n] += 1
+        by_camera[c] += 1
+        xx, xy = seen.covariance_px[k, 0, 0], seen.covariance_px[k, 0, 1]
+        yx, yy = seen.covariance_px[k, 1, 0], seen.covariance_px[k, 1, 1]
+        if not (xx > 0 and xx * yy > yx * yx and xx * yy < math.inf):
+            return k
+        if not (xy - yx) * (xy - yx) <= symmetric_to * symmetric_to * xx * yy:
+            return k
+        for axis in range(2):
+            focal, centre = seen.intrinsic[c, axis], seen.intrinsic[c, 2 + axis]
+            if not abs((seen.pinhole_px[k, axis] - centre) / focal) <= max_slope:
+                return k
+    return -1
+
+
+@kernel
+def lay_out(
+    seen: Seen,
+    rank: IntArray,
+    frames: int,
+    order: IntArray,
+    corner: NDArray[np.int32],
+    pair: NDArray[np.int32],
+    measured: FloatArray,
+    root: FloatArray,
+) -> int:
+    """Write observations in an order (K,); returns a place there that repeats the one before, or -1."""
+    again = -1
+    for i in range(len(order)):
+        k = order[i]
+        c = seen.camera[k]
+        corner[i], pair[i] = rank[seen.corner[k]], c * frames + seen.frame[k]
+        if i and corner[i] == corner[i - 1] and pair[i] == pair[i - 1] and again < 0:
+            again = i
+        fx, fy = seen.intrinsic[c, 0], seen.intrinsic[c, 1]
+        measured[0, i] = (seen.pinhole_px[k, 0] - seen.intrinsic[c, 2]) / fx
+        measured[1, i] = (seen.pinhole_px[k, 1] - seen.intrinsic[c, 3]) / fy
+        first = math.sqrt(seen.covariance_px[k, 0, 0])
+        below = seen.covariance_px[k, 1, 0] / first
+        last = math.sqrt(seen.covariance_px[k, 1, 1] - below * below)
+        root[0, i], root[1, i], root[2, i] = fx / first, -below * fx / (first * last), fy / last
+    return again

@@ -1,7 +1,4 @@
-"""A bag without a ``drive.yaml``: its description from its topics and frames, as far as they suffice.
-
-The mounting of the cameras comes from ``/tf_static``.
-"""
+"""A bag without a ``drive.yaml``: its description from topics and frames, as far as they suffice."""
 
 from __future__ import annotations
 
@@ -15,9 +12,9 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.importers.bag import messages as kinds
+from v2hdm.io.importers.bag.messages import TF_STATIC, TF_TOPIC, Frames, frame_name
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
 from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of, import_streams
-from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
 from v2hdm.records import FloatArray
 from v2hdm.store.files import dump_yaml, load_yaml
 from v2hdm.store.folders import entry_folder, is_whole, new_entry

@@ -22,11 +22,20 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.importers.bag import messages as kinds
-from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
+from v2hdm.io.importers.bag.messages import (
+    IMAGE_KINDS,
+    TF_STATIC,
+    TF_TOPIC,
+    VIDEO,
+    Edge,
+    Frames,
+    VideoDecoder,
+    file_of,
+    frame_name,
+    transform_rows,
+)
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
-from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Edge, Frames, frame_name, transform_rows
-from v2hdm.io.importers.nmea import nmea_readings
-from v2hdm.io.importers.tables import Readings
+from v2hdm.io.importers.readings import Readings, nmea_readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray

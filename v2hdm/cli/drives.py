@@ -1,7 +1,4 @@
-"""``v2hdm check DRIVE``: one line per finding, a verdict, and pictures of the route and of sample images.
-
-docs/check.md says what each finding means. No torch is needed.
-"""
+"""``v2hdm check`` and ``localize``: what a drive is like, before it is mapped or in a map."""
 
 from __future__ import annotations
 
@@ -10,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of, steps_of
-from v2hdm.errors import EXIT_USER_ERROR, DriveError
+from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, DriveError
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Check a drive; 0 for PASS and WARN, 3 for FAIL."""
+def check(arguments: Sequence[str]) -> int:
+    """One line per finding, a verdict and pictures, without torch; 0 for PASS and WARN, 3 for FAIL."""
     parser = parser_of("check")
     add_drive(parser, "check")
     parser.add_argument("--no-ground", dest="ground", action="store_false", help="match no ground: faster")
@@ -76,3 +73,29 @@ def _recording_of(drive: Path) -> Path:
 
     file = drive / DRIVE_FILE
     return (drive / (read_yaml(file, DriveError).get("bag", "") if file.is_file() else "")).resolve()
+
+
+def localize_drive(arguments: Sequence[str]) -> int:
+    """Localise a drive in a map; 3 where the map does not explain the drive.
+
+    Only the first recorded pose is used; the others show how far off it is.
+    """
+    parser = parser_of("localize")
+    parser.add_argument("map", type=Path, help="result folder of v2hdm map, or the map.geojson in it")
+    add_drive(parser, "localized")
+    parsed = parser.parse_args(arguments)
+    from v2hdm.io.calibration.reading import trusted_calibrations
+    from v2hdm.io.maps.reading import read_geojson
+    from v2hdm.localization.run import localize, summary_lines, write_localised
+
+    path = parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map
+    hd_map, calibrations = read_geojson(path), trusted_calibrations(path.parent)
+    drive = drive_of(parsed)
+    folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
+    settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
+    made = f"v2hdm localize of {parsed.drive.resolve()} in {path.resolve()}"
+    with result_of(folder, made, settings) as unfinished:
+        found = localize(hd_map, drive, calibrations, workers=parsed.workers, progress=steps_of("images"))
+        write_localised(found, drive, unfinished)
+    print(*summary_lines(found), f"results in {folder}", sep="\n")
+    return 0 if found.explained else EXIT_FAILED_VERDICT

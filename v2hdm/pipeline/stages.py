@@ -1,4 +1,8 @@
-"""The stage of mapping: every method on every set of cameras, each set kept by itself."""
+"""The stages of detection and mapping, kept part by part: a run that was stopped goes on in the middle.
+
+A piece of detection rests on the pixels of its images and on what is known of their cameras, not on where or
+of which drive they are. Mapping is kept by sets of cameras, each with every method.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +13,91 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
 
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import WorkerError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
+from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.survey import Survey, compare_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
 from v2hdm.site.changes import Base
-from v2hdm.store.cache import Line, log_again, recorded
+from v2hdm.store.cache import Line, key_of, log_again, recorded
 from v2hdm.workers import side_by_side
+
+_DETECT = "detect"
+PIECE = 16  # images of a piece: a second or two of work
+_Masks = dict[str, NDArray[np.bool_]]
+_Piece = list[ImageDetections]
+
+
+def detect_in_pieces(
+    drive: Drive,
+    contents: Contents,
+    options: DetectorOptions,
+    context: Context,
+    detect: Detect = detect_images,
+) -> list[ImageDetections]:
+    """Detect in every image of a drive, in its order, where that is not known yet, by ``detect``."""
+    cache, progress = context.cache, context.steps("detect")
+    detector_key = cache.key(options, model_key(options))
+    masks = cache.get_or_make(
+        "own_vehicle",
+        key_of(detector_key, contents.key(drive)),
+        _Masks,
+        # On the CPU wherever the rest runs, so that it is the same and needs no GPU here.
+        lambda: own_vehicles(drive, Detector.load(options=replace(options, device="cpu"))),
+    )
+    drive = with_masks(drive, masks)
+    keys = _keys(drive, contents, detector_key)
+    pieces = {start: cache.get(_DETECT, key, _Piece) for start, key in keys.items()}
+    missing = [start for start, piece in pieces.items() if piece is None]
+    total = len(drive.images)
+    todo = [i for start in missing for i in range(start, min(start + PIECE, total))]
+    if len(todo) < total:
+        _log.info("detections in %d of %d images were kept by an earlier run", total - len(todo), total)
+    progress(total - len(todo), total)
+    begun: _Piece = []
+    done = 0
+
+    def take(found: ImageDetections) -> None:
+        nonlocal done
+        done += 1
+        start = found.image - found.image % PIECE
+        begun.append(replace(found, image=found.image - start))
+        if len(begun) == min(PIECE, total - start):
+            pieces[start] = cache.put(_DETECT, keys[start], _Piece, begun)
+            begun.clear()
+        progress(total - len(todo) + done, total)
+
+    if todo:
+        detect(drive, options, todo, context.processes, take)
+    return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
+
+
+def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]:
+    """The key of each piece, by its first image."""
+    cameras = {name: key_of(camera) for name, camera in drive.cameras.items()}
+    keys = {}
+    for start in range(0, len(drive.images), PIECE):
+        images = drive.images[start : start + PIECE]
+        known = [cameras[image.camera] for image in images]
+        keys[start] = key_of(detector_key, known, contents.of_images(images))
+    return keys
+
 
 _log = logging.getLogger(__name__)
 
 BEST = "Opt"  # the method whose map and calibration are the result
-STAGE = "map"
+_MAP = "map"
 
 
 @dataclass(frozen=True)
@@ -64,13 +136,13 @@ def map_camera_sets(
     *single, last = sets
     keys = {name: cache.key(begun, name, sets[name], None) for name in single}
     keys[last] = cache.key(begun, last, sets[last], (base, survey.check))
-    known = {name: cache.get(STAGE, key, MappedSet) for name, key in keys.items()}
+    known = {name: cache.get(_MAP, key, MappedSet) for name, key in keys.items()}
     found = {name: mapped for name, mapped in known.items() if mapped is not None}
     context.progress("map", len(found), len(sets))
 
     def take(made: tuple[str, MappedSet, list[Line]]) -> None:
         name, mapped, lines = made
-        found[name] = cache.put(STAGE, keys[name], MappedSet, mapped, lines)
+        found[name] = cache.put(_MAP, keys[name], MappedSet, mapped, lines)
         context.progress("map", len(found), len(sets))
 
     work = _Work(drive, detections, survey, base, last)

@@ -1,10 +1,13 @@
-"""Writing an HD map as OpenDRIVE 1.7, for simulators.
+"""Writing an HD map as XML: OpenDRIVE 1.7 for simulators, LandXML 1.2 for surveyors and road designers.
 
-Every lane between two lane lines is a road of its own, without links, for a map of paint does not say how
-lanes connect: its reference line is the left line, straight from vertex to vertex, its only lane ``-1`` is as
-wide as the right line is away. Every marking and symbol is an object ``roadMark`` of the nearest road, its
-outline exact in the object's own axes. Where no two lines bound a lane, one road without width runs along the
-longest line or through the markings and carries them.
+In OpenDRIVE every lane between two lane lines is a road of its own, without links, for a map of paint does
+not say how lanes connect: its reference line is the left line, straight from vertex to vertex, its only lane
+``-1`` is as wide as the right line is away. Every marking and symbol is an object ``roadMark`` of the nearest
+road, its outline exact in the object's own axes. Where no two lines bound a lane, one road without width runs
+along the longest line or through the markings and carries them.
+
+In LandXML every feature is a ``PlanFeature`` named by its id, its class as ``desc``, made of straight lines
+between points ``northing easting height``. Its ``Feature`` of properties holds sightings and sigma.
 """
 
 from __future__ import annotations
@@ -13,14 +16,16 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from v2hdm.geometry.geodetic import crs_of
+from v2hdm import __version__
+from v2hdm.geometry.geodetic import LOCAL, Grid, crs_of
 from v2hdm.geometry.planar import length_along
 from v2hdm.io.maps.closed_lanes import closed_lanes
-from v2hdm.io.maps.features import Feature, features_of
+from v2hdm.io.maps.features import Feature, features_of, properties_of
 from v2hdm.records import LANE_DASH, FloatArray, HdMap
 from v2hdm.store.files import replace_text, xml_text
 
@@ -169,3 +174,38 @@ def _cubic(start: float, growth: float) -> dict[str, str]:
 
 def _text(value: float) -> str:
     return f"{value:.9g}" if abs(value) < 1e5 else repr(float(value))
+
+
+_NAMESPACE = "http://www.landxml.org/schema/LandXML-1.2"
+
+
+def write_landxml(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+    """Write ``hd_map`` as LandXML, atomically, in metres of the ``grid``, else of the map's own frame."""
+    grid = grid or Grid(LOCAL, hd_map.origin)
+    now = datetime.now(UTC)
+    stamp = {"date": now.strftime("%Y-%m-%d"), "time": now.strftime("%H:%M:%S")}
+    root = ET.Element("LandXML", {"xmlns": _NAMESPACE, "version": "1.2", **stamp})
+    units = {"areaUnit": "squareMeter", "linearUnit": "meter", "volumeUnit": "cubicMeter"}
+    more = {"temperatureUnit": "celsius", "pressureUnit": "milliBars", "angularUnit": "decimal degrees"}
+    ET.SubElement(ET.SubElement(root, "Units"), "Metric", units | more)
+    system = {"desc": ", ".join(f"{key} {value}" for key, value in grid.stated.items())}
+    if grid.crs.upper().startswith("EPSG:"):
+        system["epsgCode"] = grid.crs[5:]
+    ET.SubElement(root, "CoordinateSystem", system)
+    ET.SubElement(root, "Application", {"name": "v2hdm", "version": __version__})
+    group = ET.SubElement(root, "PlanFeatures", {"name": "markings"})
+    for one in features_of(hd_map):
+        element = ET.SubElement(group, "PlanFeature", {"name": str(one.id), "desc": one.kind})
+        geometry = ET.SubElement(element, "CoordGeom")
+        east_first = one.positions(grid).tolist()
+        points = [f"{north:.4f} {east:.4f} {up:.4f}" for east, north, up in east_first]
+        for start, end in pairwise([*points, points[0]] if one.closed else points):
+            line = ET.SubElement(geometry, "Line")
+            ET.SubElement(line, "Start").text = start
+            ET.SubElement(line, "End").text = end
+        about = ET.SubElement(element, "Feature", {"code": "v2hdm"})
+        for key, value in properties_of(one).items():
+            if not isinstance(value, list):
+                text = f"{value:.5g}" if isinstance(value, float) else str(value)
+                ET.SubElement(about, "Property", {"label": key, "value": text})
+    replace_text(path, xml_text(root))

@@ -1,0 +1,106 @@
+"""``v2hdm report``, ``view``, ``labels`` and ``mosaic``: what is made of a finished result."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from v2hdm.cli.main import parser_of, result_of, steps_of
+from v2hdm.errors import MapFileError
+
+
+def report(arguments: Sequence[str]) -> None:
+    """Write ``report.html`` again: after an update, or where check points or a mosaic were added."""
+    parser = parser_of("report")
+    parser.add_argument("folder", type=Path, help="result folder of v2hdm map")
+    parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
+    parser.add_argument(
+        "--background",
+        type=Path,
+        metavar="PATH",
+        help="under the map: a GeoTIFF, such as an aerial picture, or a folder of XYZ tiles",
+    )
+    parsed = parser.parse_args(arguments)
+    from v2hdm.io.drive import drive_of
+    from v2hdm.report.page.document import write_page
+    from v2hdm.store.results import added_to
+
+    drive = drive_of(parsed.folder, parsed.drive)
+    with added_to(parsed.folder, "folder") as folder:
+        path = write_page(folder, drive, parsed.background)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + ("" if drive else ", without the drive's images"))
+
+
+def view(arguments: Sequence[str]) -> None:
+    """Serve the report, to correct markings in, until Ctrl-C; every correction is written at once."""
+    parser = parser_of("view")
+    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
+    parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
+    parser.add_argument("--corrections", type=Path, metavar="FILE", help="(RESULT.corrections.yaml)")
+    parsed = parser.parse_args(arguments)
+    from v2hdm.io.drive import drive_of
+    from v2hdm.report.view import file_beside, server_of
+
+    path = parsed.corrections or file_beside(parsed.result)
+    server, address, session = server_of(parsed.result, drive_of(parsed.result, parsed.drive), path)
+    try:
+        print(f"open {address}; Ctrl-C ends it", flush=True)
+        server.serve_forever()
+    except KeyboardInterrupt:
+        count = len(session.corrections)
+        print(f"{count} corrections in {path}: map.corrections={path} in the next run" if count else "ended")
+    finally:
+        server.server_close()
+
+
+def labels(arguments: Sequence[str]) -> None:
+    """Write ``instances.json``, the map in every image of its drive, in COCO's format."""
+    parser = parser_of("labels")
+    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="labels (outputs/<drive>-labels)")
+    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    parser.add_argument("--range", type=float, metavar="M", default=16.0, help="farthest label (16)")
+    parsed = parser.parse_args(arguments)
+    from v2hdm.io.drive import single_drive_of
+    from v2hdm.labels import FILE, write_labels
+
+    drive = single_drive_of(parsed.result, parsed.drive, "labels are")
+    folder = parsed.output or Path("outputs") / f"{drive.name}-labels"
+    made = f"v2hdm labels of {parsed.result.resolve()}"
+    with result_of(folder, made, {"result": str(parsed.result), "range_m": parsed.range}) as unfinished:
+        found = write_labels(parsed.result, drive, unfinished, parsed.range, steps_of("label images"))
+    print(
+        f"{found['shown']} labels in {found['images']} images, {found['unsure']} of unsure visibility; "
+        f"{found['hidden']} markings are hidden where they would be\n"
+        f"labels in {folder}: python -m train labels=map data.coco={folder / FILE} "
+        f"data.coco_images={drive.root}"
+    )
+
+
+def mosaic(arguments: Sequence[str]) -> None:
+    """Add the mosaic to a result: the ground as a GeoTIFF, and pictures before and after."""
+    parser = parser_of("mosaic")
+    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
+    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="side of a pixel (0.02)")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
+    parsed = parser.parse_args(arguments)
+    import torch  # noqa: F401  # its absence is reported before that of what is built on it
+
+    from v2hdm.io.drive import single_drive_of
+    from v2hdm.mosaic.result import write_mosaic
+    from v2hdm.pipeline.config import check_device
+    from v2hdm.report.page.document import write_page
+    from v2hdm.store.results import added_to
+
+    logging.basicConfig(format="%(message)s")
+    check_device(parsed.device)
+    if not parsed.result.is_dir():
+        raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
+    drive = single_drive_of(parsed.result, parsed.drive, "a mosaic is")
+    with added_to(parsed.result, "RESULT") as folder:
+        steps = steps_of("put images on the ground")
+        write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)
+        write_page(folder, drive)
+    print(f"mosaic in {parsed.result}, and under the map of its report.html")
