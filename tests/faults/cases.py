@@ -31,7 +31,7 @@ from tests.faults.making import (
     write,
     write_example,
 )
-from tests.faults.owners import geopackages, owners
+from tests.faults.owners import circles, geopackages, owners
 from tests.faults.small import small
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
@@ -347,6 +347,7 @@ def images() -> Iterator[Case]:
     deep = picture(".png", depth=np.uint16)
     yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits a channel; convert it to 8 bits")
     yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
+    yield detects("video: a pipe", "precious.txt", pipe("precious.txt"), "a pipe or a device")
     yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
     for orientation in range(2, 9):
         for kind in ("JPEG", "PNG", "TIFF", "WEBP"):
@@ -458,6 +459,9 @@ def outputs() -> Iterator[Case]:
     within = (*CHECKED[:-1], "precious.txt/x")
     yield Case("result within a file", CHECK, within, drive(), "cannot be written|is a file")
     yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "no results of ours")
+    through = both(imgs, lambda root: (root / "link").symlink_to("found.jsonl"))
+    more = {"code": 0, "leaves": "found.jsonl", "tells": True}
+    yield detects("output is a link to what is to be", "imgs/a.jpg --output link", through, "", **more)
     circle = both(drive(), lambda root: (root / "out").symlink_to("out"))
     yield Case("result onto a link in a circle", CHECK, CHECKED, circle, "leads nowhere|cannot")
     for most in (0, 10, 1000, 5000):
@@ -659,7 +663,7 @@ def _run_file(data: bytes) -> Prepare:
 def all_cases() -> list[Case]:
     """The table."""
     parts = (
-        texts, points, names, images, damages, fields, outputs, owners, geopackages, small,
+        texts, points, names, images, damages, fields, outputs, owners, circles, geopackages, small,
         arguments, settings, numbers,
     )  # fmt: skip
     return [case for part in parts for case in part()]

@@ -64,6 +64,38 @@ def owners() -> Iterator[Case]:
             yield Case(case, "v2hdm export", words.split(), harmed, says)
 
 
+CIRCLES = (
+    "check circle --output out", "check drive --no-ground --workers 1 --output circle",
+    "calibrate points circle --intrinsics camera_info.yaml --output out",
+    "calibrate points points.csv --intrinsics circle --output out",
+    "calibrate points points.csv --intrinsics camera_info.yaml --output circle",
+    "calibrate ground circle --output out", "calibrate compare circle calibration_front.yaml",
+    "localize circle drive --output out", "localize map.geojson circle --output out",
+    "map drive.path=circle output=. name=out", "map drive.path=drive output=circle name=out workers=1",
+    "report circle", "view circle", "labels circle", "mosaic circle",
+    "export circle --format csv", "export circle/map.geojson --format csv",
+    "export map.geojson --format csv --output circle", "export map.geojson --format csv --output circle/x",
+    "detect circle", "detect drive/front/images/000000.jpg --output circle",
+    "detect drive/front/images/000000.jpg --draw circle", "detect drive --model circle",
+    "cache prune --gb 0 --cache circle",
+)  # fmt: skip
+"""Each is given a link that leads to itself."""
+
+
+def circles() -> Iterator[Case]:
+    """A link in a circle in the place of every input and output."""
+    for line in CIRCLES:
+        words = line.split()
+        door = f"v2hdm {' '.join(words[:2] if words[0] == 'calibrate' else words[:1])}"
+        prepare = _site(_circle)
+        yield Case(f"a circle: {line}", door, words[len(door.split()) - 1 :], prepare, "circle|Symlink loop")
+
+
+def _circle(root: Path) -> None:
+    _result(root / "out", "v2hdm map of drive")
+    (root / "circle").symlink_to("circle")
+
+
 def _site(more: Callable[[Path], None]) -> Prepare:
     def prepare(root: Path) -> None:
         write_example(root / "drive")
