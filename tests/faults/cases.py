@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import yaml
 from PIL import Image
 
 from tests.calibration.site import INFO
@@ -112,6 +113,8 @@ YAML_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "python name": ("name: !!python/name:os.system\n", "the tag"),
     "own tag": ("name: !secret x\n", "the tag"),
     "binary tag": ("name: !!binary aGk=\n", "the tag"),
+    "half a letter": ('name: "\\ud800"\n', "line 1 .*half a letter"),
+    "half a letter in a key": ('"\\udc00": 1\n', "line 1 .*half a letter"),
     "set": ("name: !!set {a}\n", "the tag"),
     "key that is a list": ("? [a, b]\n: 1\n", "a key that is a list"),
     "mapping that is a list": ("name: !!map [1]\n", "YAML syntax error"),
@@ -131,6 +134,8 @@ JSON_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "depth hidden in a text": ('{"a": "]]]]]]]", "b": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
     "a key twice": ('{"v2hdm": {}, "v2hdm": {}}', "'v2hdm' is there twice"),
     "5000 digits": ('{"v2hdm": {"origin": ' + "9" * 5000 + '}, "features": []}', "origin"),
+    "half a letter": ('{"v2hdm": {"crs": "\\ud800"}, "features": []}', "half a letter"),
+    "half a letter in a key": ('{"\\uDC00": {}}', "half a letter"),
     "not a number": ('{"v2hdm": {}, "features": [{"properties": {"corners_map": NaN}}]}', "feature 0"),
     "no map": ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
     "features that are a text": ('{"v2hdm": {}, "features": "x"}', "not a map written by v2hdm"),
@@ -321,11 +326,23 @@ def names() -> Iterator[Case]:
             yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
         if isinstance(text, str):
             yield exported(f"class in a map: {name}", _map_of_class(text), says)
+        words = "points.csv --intrinsics camera_info.yaml --output out".split()
+        prepare, either = _camera_called(text), f"{says}|expected a text"
+        yield Case(f"intrinsics' camera: {name}", "v2hdm calibrate points", words, prepare, either)
     for word in ("both", "all", "Both"):
         yield checked(f"camera called {word}", "results of all", renamed(word))
     for number in (7, 1.5):
         more = {"code": 0, "leaves": "^work/here/out(/|$)", "tells": True}
         yield checked(f"camera called {number}", "verdict", renamed(number), **more)
+
+
+def _camera_called(name: object) -> Prepare:
+    def prepare(root: Path) -> None:
+        write_camera_info(INFO, root / "camera_info.yaml")
+        content = yaml.safe_load((root / "camera_info.yaml").read_text()) | {"camera_name": name}
+        (root / "camera_info.yaml").write_text(yaml.safe_dump(content))
+
+    return prepare
 
 
 def _map_of_class(kind: str) -> Prepare:
@@ -508,6 +525,7 @@ def arguments() -> Iterator[Case]:
         "nowhere.jpg": "nowhere.jpg: no such image, video or folder",
         "precious.txt": "neither an image nor a video",
         "imgs --limit 0": "--limit 0",
+        "nowhere\udcff": r"nowhere\?: no such image",
         "imgs --threads 0": "threads is 0",
         "imgs --threads 99999": "threads is 99999: set 1 to 256",
         "imgs --model nowhere.onnx": "nowhere.onnx: no such detector model",
@@ -522,6 +540,14 @@ def arguments() -> Iterator[Case]:
     }.items():
         imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
         yield Case(f"detect {line}", "v2hdm detect", line.split(), imgs, says)
+    imgs, more = _imgs(write("imgs/a.jpg", picture(height=240, width=320))), {"code": 0, "tells": True}
+    yield detects("detect --limit of 30 digits", f"imgs --limit {'9' * 30}", imgs, "", **more)
+    words = ("map.geojson", "--format", "gpkg", "--output", "\udcff")
+    yield Case(
+        "export into a name that is no UTF-8", "v2hdm export", words,
+        lambda root: write_geojson(make_map(), root / "map.geojson"), "a name that is no UTF-8",
+        leaves="here/\udcff$",
+    )  # fmt: skip
     for line, says in {
         "nowhere nowhere": "nowhere",
         "precious.txt precious.txt": "precious.txt",
