@@ -197,6 +197,13 @@ def flipped_png() -> bytes:
     return bytes(data)
 
 
+def chunk_of_4_gb() -> bytes:
+    """A PNG with an end, and before it a chunk that says it is longer than the file."""
+    data = picture(".png")
+    begin = data.index(b"IDAT") - 4
+    return data[:begin] + struct.pack(">I", 0xF3002000) + data[begin + 4 :]
+
+
 def turned(kind: str, orientation: int) -> bytes:
     """A picture of the example's size with an EXIF orientation."""
     exif, stream = Image.Exif(), io.BytesIO()
@@ -242,6 +249,7 @@ IMAGES: dict[str, tuple[bytes, str]] = {
     "start of a png": (b"\x89PNG\r\n\x1a\n", "truncated"),
     "half a jpeg": (picture()[:700], "truncated"),
     "half a png": (picture(".png")[:700], "truncated"),
+    "png with a chunk of 4 GB": (chunk_of_4_gb(), "damaged"),
     "png with a flipped bit": (flipped_png(), "damaged"),
     "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
     "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),
@@ -326,7 +334,7 @@ def names() -> Iterator[Case]:
             yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
         if isinstance(text, str):
             yield exported(f"class in a map: {name}", _map_of_class(text), says)
-        words = "points.csv --intrinsics camera_info.yaml --output out".split()
+        words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
         prepare, either = _camera_called(text), f"{says}|expected a text"
         yield Case(f"intrinsics' camera: {name}", "v2hdm calibrate points", words, prepare, either)
     for word in ("both", "all", "Both"):

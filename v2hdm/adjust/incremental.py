@@ -266,7 +266,9 @@ class IncrementalMap:
             estimate = replace(done.estimate, cam_from_vehicle=moved, clock_s=clock_s)
         behind = engine.report(done.estimate, problem.intrinsic[:, :2])[2].any()
         if behind or not gap <= _GAP_TOLERANCE:
-            raise _unsolved(f"marking {marking}", Status.BEHIND_CAMERA if behind else Status.EVALUATIONS_EXHAUSTED)
+            raise _unsolved(
+                f"marking {marking}", Status.BEHIND_CAMERA if behind else Status.EVALUATIONS_EXHAUSTED
+            )
         out = np.empty((problem.corner_count, 2))
         out[arrays.corner_order.cpu().numpy()] = done.estimate.corners_map.cpu().numpy()
         gain = np.zeros((len(out), 2, len(at)))

@@ -108,7 +108,8 @@ def detect_images(
         detector = Detector.load(options=options)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
     rough = _Rough(detector, lens, path, mounting, linear=linear)
-    frames = islice((_live_frames if live else _frames)(str(source), road, rough), limit and min(limit, sys.maxsize))
+    most = limit and min(limit, sys.maxsize)
+    frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
     return _found(frames, rough, stopwatch or Stopwatch())
 
 

@@ -14,7 +14,7 @@ from tests.benchmarks.faults.disks import expected_of
 from tests.benchmarks.faults.doors import cache_defects, map_arguments
 from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.running import Order, Row, folder_in, in_fork, row_of
-from tests.benchmarks.faults.situations import HERE, Expected, Situation
+from tests.benchmarks.faults.situations import HERE, Situation
 from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.frames import frame_faults
