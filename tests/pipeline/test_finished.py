@@ -120,7 +120,7 @@ def test_what_is_not_ours_is_reported_before_any_work(config, memory):
 @pytest.mark.parametrize("name", ["../other", "a/b", ".hidden", ".."])
 def test_a_name_that_leads_elsewhere_at_a_store_is_refused_before_any_work(name, config, memory):
     work = Work()
-    with pytest.raises(ConfigError, match="separator of folders|begins with a dot"):
+    with pytest.raises(ConfigError, match=r"separator of folders|begins with a dot"):
         take_or_make(replace(config, name=name), work, True, quiet)
     assert not work.done
     assert not memory.listed()

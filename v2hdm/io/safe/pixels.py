@@ -222,11 +222,11 @@ def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
 
 def _is_whole_png(data: bytes) -> bool:
     """Whether its chunks have their checksums and none ends beyond the file: decoders only warn, too late."""
-    kind = b""
-    for kind, at, length in _png_chunks(data):
-        if zlib.crc32(data[at - 4 : at + length]) != _unpack(">I", data, at + length)[0]:
-            return False
-    return kind == b"IEND"
+    chunks = [*_png_chunks(data)]
+    return any(kind == b"IEND" for kind, _, _ in chunks[-1:]) and all(
+        zlib.crc32(data[at - 4 : at + length]) == _unpack(">I", data, at + length)[0]
+        for _, at, length in chunks
+    )
 
 
 def _webp_header(data: _Data) -> Header:
