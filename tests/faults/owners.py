@@ -257,10 +257,28 @@ def geopackages() -> Iterator[Case]:
         )
     for name, (sql, says) in SQL.items():
         yield Case(f"geopackage: {name}", "v2hdm export", line, _executed(sql), says)
+    many = "geopackage: one row many times"
+    yield Case(many, "v2hdm export", line, _one_row_many_times, "rows are more than its bytes")
     for name, (wkb, says) in GEOMETRIES.items():
         blob = b"GP\0\1" + bytes(4) + wkb
         prepare = _executed(f"UPDATE markings SET geom = X'{blob.hex()}'")
         yield Case(f"geopackage: {name}", "v2hdm export", line, prepare, says)
+
+
+def _one_row_many_times(root: Path) -> None:
+    """One row of 3000 bytes, to which all pointers of its page lead."""
+    blob = "zeroblob(3000)"
+    _executed(f"DELETE FROM markings WHERE rowid > 1; UPDATE markings SET class = {blob}; VACUUM")(root)
+    path = root / "map.gpkg"
+    with closing(sqlite3.connect(path)) as data:
+        ((number,),) = data.execute("SELECT rootpage FROM sqlite_master WHERE name = 'markings'")
+        ((size,),) = data.execute("PRAGMA page_size")
+    content, at = bytearray(path.read_bytes()), (number - 1) * size
+    kind, _, cells, begin, _ = struct.unpack_from(">BHHHB", content, at)
+    assert (kind, cells) == (13, 1)  # a leaf of one cell
+    struct.pack_into(">H", content, at + 3, 500)
+    struct.pack_into(">500H", content, at + 8, *[begin] * 500)
+    path.write_bytes(content)
 
 
 def _executed(sql: str) -> Prepare:
