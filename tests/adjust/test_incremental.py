@@ -169,3 +169,20 @@ def test_a_preview_is_the_back_projection():
     sighted = by_marking(problem)[0]
     grown = grow(problem)
     np.testing.assert_allclose(grown.preview(sighted), grown.corners_map(0), atol=0.05)
+
+
+def test_a_marking_that_turns_a_camera_beyond_all_bounds_is_refused():
+    # A camera matrix of half the resolution, and a survey whose x has the wrong sign.
+    scene = street(frames=40, jitter=JITTER)
+    plain = replace(whole_markings(scene.problem), pose_sigma=JITTER)
+    mirrored = scene.corners_map * [-1.0, 1.0]
+    problem = replace(known_beside(plain, mirrored), lengths=None)
+    problem.intrinsic[:, :2] *= 0.5
+    grown, refused = IncrementalMap(problem, SolveOptions(loss="none")), 0
+    for marking, sighted in enumerate(by_marking(problem)):
+        try:
+            grown.observe(marking, sighted)
+        except AdjustError:
+            refused += 1
+        assert np.isfinite(grown.cam_from_vehicle).all()
+    assert refused

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from tests.adjust.scene import PIXEL_SIGMA, Scene, exp, make_scene, project, with_late_clocks
 from v2hdm.adjust import (
@@ -17,6 +18,7 @@ from v2hdm.adjust import (
     solve,
 )
 from v2hdm.adjust.problem import POSE_STATES
+from v2hdm.adjust.sensitivity import Sensitivity
 
 OPTIONS = SolveOptions(coarse=False, loss="none")
 POSES = PoseSigma(0.01, 0.001, 0.002, 0.005)
@@ -252,3 +254,16 @@ def test_noise_that_goes_together_along_the_route_contradicts_nothing():
         problem = seen_again(street, street.cam_from_vehicle[seen.camera], poses[seen.frame])
         worst.append(max(one.sigmas for one in score_faults(problem, solve(problem, OPTIONS))))
     assert max(worst) < 5
+
+
+def test_an_answer_grows_with_its_column_however_large():
+    # Where almost nothing determines a camera, a fault turns it by far more than poses can be turned.
+    solved = Sensitivity.at(solve(scene().problem, OPTIONS).covariance.whitening)
+    generator = torch.Generator().manual_seed(2)
+    column = {
+        name: torch.randn(row.shape, generator=generator, dtype=row.dtype)
+        for name, row in solved.residuals.items()
+    }
+    one = solved.flat(solved.efficient(column))
+    many = solved.flat(solved.efficient({name: 1e25 * row for name, row in column.items()}))
+    np.testing.assert_allclose(many / 1e25, one, atol=1e-6 * np.abs(one).max())

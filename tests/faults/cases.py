@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import yaml
 from PIL import Image
 
 from tests.calibration.site import INFO
@@ -31,7 +32,7 @@ from tests.faults.making import (
     write,
     write_example,
 )
-from tests.faults.owners import geopackages, owners
+from tests.faults.owners import circles, geopackages, owners
 from tests.faults.small import small
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
@@ -112,6 +113,8 @@ YAML_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "python name": ("name: !!python/name:os.system\n", "the tag"),
     "own tag": ("name: !secret x\n", "the tag"),
     "binary tag": ("name: !!binary aGk=\n", "the tag"),
+    "half a letter": ('name: "\\ud800"\n', "line 1 .*half a letter"),
+    "half a letter in a key": ('"\\udc00": 1\n', "line 1 .*half a letter"),
     "set": ("name: !!set {a}\n", "the tag"),
     "key that is a list": ("? [a, b]\n: 1\n", "a key that is a list"),
     "mapping that is a list": ("name: !!map [1]\n", "YAML syntax error"),
@@ -131,6 +134,8 @@ JSON_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "depth hidden in a text": ('{"a": "]]]]]]]", "b": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
     "a key twice": ('{"v2hdm": {}, "v2hdm": {}}', "'v2hdm' is there twice"),
     "5000 digits": ('{"v2hdm": {"origin": ' + "9" * 5000 + '}, "features": []}', "origin"),
+    "half a letter": ('{"v2hdm": {"crs": "\\ud800"}, "features": []}', "half a letter"),
+    "half a letter in a key": ('{"\\uDC00": {}}', "half a letter"),
     "not a number": ('{"v2hdm": {}, "features": [{"properties": {"corners_map": NaN}}]}', "feature 0"),
     "no map": ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
     "features that are a text": ('{"v2hdm": {}, "features": "x"}', "not a map written by v2hdm"),
@@ -192,6 +197,13 @@ def flipped_png() -> bytes:
     return bytes(data)
 
 
+def chunk_of_4_gb() -> bytes:
+    """A PNG with an end, and before it a chunk that says it is longer than the file."""
+    data = picture(".png")
+    begin = data.index(b"IDAT") - 4
+    return data[:begin] + struct.pack(">I", 0xF3002000) + data[begin + 4 :]
+
+
 def turned(kind: str, orientation: int) -> bytes:
     """A picture of the example's size with an EXIF orientation."""
     exif, stream = Image.Exif(), io.BytesIO()
@@ -237,6 +249,7 @@ IMAGES: dict[str, tuple[bytes, str]] = {
     "start of a png": (b"\x89PNG\r\n\x1a\n", "truncated"),
     "half a jpeg": (picture()[:700], "truncated"),
     "half a png": (picture(".png")[:700], "truncated"),
+    "png with a chunk of 4 GB": (chunk_of_4_gb(), "damaged"),
     "png with a flipped bit": (flipped_png(), "damaged"),
     "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
     "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),
@@ -321,11 +334,23 @@ def names() -> Iterator[Case]:
             yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
         if isinstance(text, str):
             yield exported(f"class in a map: {name}", _map_of_class(text), says)
+        words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
+        prepare, either = _camera_called(text), f"{says}|expected a text"
+        yield Case(f"intrinsics' camera: {name}", "v2hdm calibrate points", words, prepare, either)
     for word in ("both", "all", "Both"):
         yield checked(f"camera called {word}", "results of all", renamed(word))
     for number in (7, 1.5):
         more = {"code": 0, "leaves": "^work/here/out(/|$)", "tells": True}
         yield checked(f"camera called {number}", "verdict", renamed(number), **more)
+
+
+def _camera_called(name: object) -> Prepare:
+    def prepare(root: Path) -> None:
+        write_camera_info(INFO, root / "camera_info.yaml")
+        content = yaml.safe_load((root / "camera_info.yaml").read_text()) | {"camera_name": name}
+        (root / "camera_info.yaml").write_text(yaml.safe_dump(content))
+
+    return prepare
 
 
 def _map_of_class(kind: str) -> Prepare:
@@ -347,6 +372,7 @@ def images() -> Iterator[Case]:
     deep = picture(".png", depth=np.uint16)
     yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits a channel; convert it to 8 bits")
     yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
+    yield detects("video: a pipe", "precious.txt", pipe("precious.txt"), "a pipe or a device")
     yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
     for orientation in range(2, 9):
         for kind in ("JPEG", "PNG", "TIFF", "WEBP"):
@@ -458,6 +484,9 @@ def outputs() -> Iterator[Case]:
     within = (*CHECKED[:-1], "precious.txt/x")
     yield Case("result within a file", CHECK, within, drive(), "cannot be written|is a file")
     yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "no results of ours")
+    through = both(imgs, lambda root: (root / "link").symlink_to("found.jsonl"))
+    more = {"code": 0, "leaves": "found.jsonl", "tells": True}
+    yield detects("output is a link to what is to be", "imgs/a.jpg --output link", through, "", **more)
     circle = both(drive(), lambda root: (root / "out").symlink_to("out"))
     yield Case("result onto a link in a circle", CHECK, CHECKED, circle, "leads nowhere|cannot")
     for most in (0, 10, 1000, 5000):
@@ -504,6 +533,7 @@ def arguments() -> Iterator[Case]:
         "nowhere.jpg": "nowhere.jpg: no such image, video or folder",
         "precious.txt": "neither an image nor a video",
         "imgs --limit 0": "--limit 0",
+        "nowhere\udcff": r"nowhere\?: no such image",
         "imgs --threads 0": "threads is 0",
         "imgs --threads 99999": "threads is 99999: set 1 to 256",
         "imgs --model nowhere.onnx": "nowhere.onnx: no such detector model",
@@ -518,6 +548,14 @@ def arguments() -> Iterator[Case]:
     }.items():
         imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
         yield Case(f"detect {line}", "v2hdm detect", line.split(), imgs, says)
+    imgs, more = _imgs(write("imgs/a.jpg", picture(height=240, width=320))), {"code": 0, "tells": True}
+    yield detects("detect --limit of 30 digits", f"imgs --limit {'9' * 30}", imgs, "", **more)
+    words = ("map.geojson", "--format", "gpkg", "--output", "\udcff")
+    yield Case(
+        "export into a name that is no UTF-8", "v2hdm export", words,
+        lambda root: write_geojson(make_map(), root / "map.geojson"), "a name that is no UTF-8",
+        leaves="here/\udcff$",
+    )  # fmt: skip
     for line, says in {
         "nowhere nowhere": "nowhere",
         "precious.txt precious.txt": "precious.txt",
@@ -659,7 +697,7 @@ def _run_file(data: bytes) -> Prepare:
 def all_cases() -> list[Case]:
     """The table."""
     parts = (
-        texts, points, names, images, damages, fields, outputs, owners, geopackages, small,
+        texts, points, names, images, damages, fields, outputs, owners, circles, geopackages, small,
         arguments, settings, numbers,
     )  # fmt: skip
     return [case for part in parts for case in part()]

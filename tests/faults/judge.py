@@ -26,7 +26,8 @@ import pytest
 
 from v2hdm.cli.main import run as run_command
 
-LONGEST_S = 60
+LONGEST_S = 60  # of its own time, whatever else the machine does
+LONGEST_WAIT_S = 5 * LONGEST_S
 DATE = re.compile(rb"\d{4}-\d\d-\d\dT[\d:.]+Z")
 HYDRA_DOORS = ("v2hdm map", "v2hdm experiment", "train.__main__", "export.__main__")
 
@@ -163,13 +164,19 @@ def _in_time() -> Iterator[None]:
     def stop(*_: object) -> None:
         raise TookTooLongError
 
-    given = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(LONGEST_S)
+    limits = (
+        (signal.SIGALRM, signal.ITIMER_REAL, LONGEST_WAIT_S),
+        (signal.SIGPROF, signal.ITIMER_PROF, LONGEST_S),
+    )
+    given = {number: signal.signal(number, stop) for number, _, _ in limits}
+    for _, timer, most_s in limits:
+        signal.setitimer(timer, most_s)
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, given)
+        for number, timer, _ in limits:
+            signal.setitimer(timer, 0)
+            signal.signal(number, given[number])
 
 
 @contextlib.contextmanager

@@ -64,6 +64,38 @@ def owners() -> Iterator[Case]:
             yield Case(case, "v2hdm export", words.split(), harmed, says)
 
 
+CIRCLES = (
+    "check circle --output out", "check drive --no-ground --workers 1 --output circle",
+    "calibrate points circle --intrinsics camera_info.yaml --output out",
+    "calibrate points points.csv --intrinsics circle --output out",
+    "calibrate points points.csv --intrinsics camera_info.yaml --output circle",
+    "calibrate ground circle --output out", "calibrate compare circle calibration_front.yaml",
+    "localize circle drive --output out", "localize map.geojson circle --output out",
+    "map drive.path=circle output=. name=out", "map drive.path=drive output=circle name=out workers=1",
+    "report circle", "view circle", "labels circle", "mosaic circle",
+    "export circle --format csv", "export circle/map.geojson --format csv",
+    "export map.geojson --format csv --output circle", "export map.geojson --format csv --output circle/x",
+    "detect circle", "detect drive/front/images/000000.jpg --output circle",
+    "detect drive/front/images/000000.jpg --draw circle", "detect drive --model circle",
+    "cache prune --gb 0 --cache circle",
+)  # fmt: skip
+"""Each is given a link that leads to itself."""
+
+
+def circles() -> Iterator[Case]:
+    """A link in a circle in the place of every input and output."""
+    for line in CIRCLES:
+        words = line.split()
+        door = f"v2hdm {' '.join(words[:2] if words[0] == 'calibrate' else words[:1])}"
+        prepare = _site(_circle)
+        yield Case(f"a circle: {line}", door, words[len(door.split()) - 1 :], prepare, "circle|Symlink loop")
+
+
+def _circle(root: Path) -> None:
+    _result(root / "out", "v2hdm map of drive")
+    (root / "circle").symlink_to("circle")
+
+
 def _site(more: Callable[[Path], None]) -> Prepare:
     def prepare(root: Path) -> None:
         write_example(root / "drive")
@@ -225,10 +257,28 @@ def geopackages() -> Iterator[Case]:
         )
     for name, (sql, says) in SQL.items():
         yield Case(f"geopackage: {name}", "v2hdm export", line, _executed(sql), says)
+    many = "geopackage: one row many times"
+    yield Case(many, "v2hdm export", line, _one_row_many_times, "rows are more than its bytes")
     for name, (wkb, says) in GEOMETRIES.items():
         blob = b"GP\0\1" + bytes(4) + wkb
         prepare = _executed(f"UPDATE markings SET geom = X'{blob.hex()}'")
         yield Case(f"geopackage: {name}", "v2hdm export", line, prepare, says)
+
+
+def _one_row_many_times(root: Path) -> None:
+    """One row of 3000 bytes, to which all pointers of its page lead."""
+    blob = "zeroblob(3000)"
+    _executed(f"DELETE FROM markings WHERE rowid > 1; UPDATE markings SET class = {blob}; VACUUM")(root)
+    path = root / "map.gpkg"
+    with closing(sqlite3.connect(path)) as data:
+        ((number,),) = data.execute("SELECT rootpage FROM sqlite_master WHERE name = 'markings'")
+        ((size,),) = data.execute("PRAGMA page_size")
+    content, at = bytearray(path.read_bytes()), (number - 1) * size
+    kind, _, cells, begin, _ = struct.unpack_from(">BHHHB", content, at)
+    assert (kind, cells) == (13, 1)  # a leaf of one cell
+    struct.pack_into(">H", content, at + 3, 500)
+    struct.pack_into(">500H", content, at + 8, *[begin] * 500)
+    path.write_bytes(content)
 
 
 def _executed(sql: str) -> Prepare:

@@ -4,12 +4,13 @@ import os
 import tarfile
 from pathlib import Path
 
+import cv2
 import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.faults.cases import all_cases, damaged_inside
+from tests.faults.cases import all_cases, chunk_of_4_gb, damaged_inside
 from tests.faults.judge import HYDRA_DOORS, Case, judge
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
@@ -161,3 +162,11 @@ def test_the_decoders_complaints_are_kept_from_the_terminal(tmp_path, capfd):
     with pytest.raises(DriveError, match="damaged"):
         read_bgr(tmp_path / "a.jpg")
     assert capfd.readouterr().err == ""
+
+
+def test_a_chunk_that_ends_beyond_its_png_is_no_work_of_the_decoders(tmp_path, monkeypatch):
+    # It would allocate and clear the 4 GB that the chunk says it has.
+    (tmp_path / "a.png").write_bytes(chunk_of_4_gb())
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("the decoder was asked"))
+    with pytest.raises(DriveError, match="damaged"):
+        read_bgr(tmp_path / "a.png")

@@ -117,6 +117,15 @@ def test_what_is_not_ours_is_reported_before_any_work(config, memory):
     assert not work.done
 
 
+@pytest.mark.parametrize("name", ["../other", "a/b", ".hidden", ".."])
+def test_a_name_that_leads_elsewhere_at_a_store_is_refused_before_any_work(name, config, memory):
+    work = Work()
+    with pytest.raises(ConfigError, match=r"separator of folders|begins with a dot"):
+        take_or_make(replace(config, name=name), work, True, quiet)
+    assert not work.done
+    assert not memory.listed()
+
+
 def test_a_cache_at_a_store_is_refused(config, memory):
     with pytest.raises(ConfigError, match=r"cache=memory.*: is a URL; give a folder"):
         take_or_make(replace(config, cache=f"{memory}/cache"), Work(), True, quiet)

@@ -13,6 +13,7 @@ marking, so that markings that came since do not share them with the others.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -216,7 +217,7 @@ class IncrementalMap:
         every = list(self._sighted.values())
         problem, cameras = self._problem(every)
         options = replace(self._options, coarse=self._options.coarse and self._earlier is None)
-        solution = _sound(solve(problem, options), "the map")
+        solution = _sound(solve(problem, options))
         information = solution.covariance.camera_information()
         at = np.zeros((len(cameras), len(information) // len(cameras)))
         at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu().numpy()
@@ -251,8 +252,11 @@ class IncrementalMap:
             loss = narrowed(engine, estimate, robust, loss)
             held = factorise(engine, plan, estimate, loss, hold_cameras=True)
             share = partial(_joined, earlier, rows, held.reduced_factor, chart)
-            _, joint, step, _ = share(at, held.gradient)
-            done, at = held.linearised.evaluate(*held.step(step)), joint.mean
+            _, joint, whitened, _ = share(at, held.gradient)
+            step = held.step(whitened)
+            if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # beyond what the chart is of
+                raise _unsolved(f"marking {marking}", Status.STALLED)
+            done, at = held.linearised.evaluate(*step), joint.mean
             left = done.gradient, done.coupled, done.whitened
             own, joint, _, gained = share(at, whitened_gradient(plan, held.reduced_factor, *left))
             gap = gained / max(sum(done.terms.values()), 1.0)
@@ -262,8 +266,9 @@ class IncrementalMap:
             estimate = replace(done.estimate, cam_from_vehicle=moved, clock_s=clock_s)
         behind = engine.report(done.estimate, problem.intrinsic[:, :2])[2].any()
         if behind or not gap <= _GAP_TOLERANCE:
-            status = Status.BEHIND_CAMERA if behind else Status.EVALUATIONS_EXHAUSTED
-            raise AdjustError(f"marking {marking} cannot be solved for ({status.value}): {status.advice}")
+            raise _unsolved(
+                f"marking {marking}", Status.BEHIND_CAMERA if behind else Status.EVALUATIONS_EXHAUSTED
+            )
         out = np.empty((problem.corner_count, 2))
         out[arrays.corner_order.cpu().numpy()] = done.estimate.corners_map.cpu().numpy()
         gain = np.zeros((len(out), 2, len(at)))
@@ -320,14 +325,17 @@ def _scale(information: FloatArray) -> FloatArray:
     return np.asarray(root[:, None] * root)
 
 
-def _sound(solution: Solution, what: str) -> Solution:
-    """A solution that determines ``what``."""
-    said = f"{what} cannot be solved for ({solution.status.value}): {solution.status.advice}"
-    if solution.status is Status.UNDETERMINED:
-        raise UndeterminedError(said)
-    if solution.status is Status.BEHIND_CAMERA or not np.isfinite(solution.corners_map).all():
-        raise AdjustError(said)
+def _sound(solution: Solution) -> Solution:
+    """A solution that determines the map."""
+    bad = solution.status in (Status.BEHIND_CAMERA, Status.UNDETERMINED)
+    if bad or not np.isfinite(solution.corners_map).all():
+        raise _unsolved("the map", solution.status)
     return solution
+
+
+def _unsolved(what: str, status: Status) -> AdjustError:
+    kind = UndeterminedError if status is Status.UNDETERMINED else AdjustError
+    return kind(f"{what} cannot be solved for ({status.value}): {status.advice}")
 
 
 _Known = TypeVar("_Known", Observations, ControlPoints, KnownLengths)

@@ -121,7 +121,10 @@ class Sensitivity:
     def _along(self, whitened: Tensor) -> Rows:
         """Derivatives of all residuals along a step of all that is estimated, whitened."""
         base, arrays = self.whitening.estimate, self.arrays
-        step, tangents, own = self.whitening.step(whitened)
+        _, tangents, _ = self.whitening.step(whitened)
+        # Derivatives are linear, poses are not: along a step that moves no pair by more than 1 m or rad.
+        size = max(float(tangents.abs().max()), 1.0)
+        step, tangents, own = self.whitening.step(whitened / size)
         # Corners move with a step in proportion to it, so that of a whole step is their derivative.
         at = self.whitening.linearised.evaluate(step, tangents, own).estimate
         corners = at.corners_map - base.corners_map
@@ -138,8 +141,8 @@ class Sensitivity:
             )
             for by in (_STEP, -_STEP)
         )
-        moved = {name: (row - low[name]) / (2 * _STEP) for name, row in high.items()}
-        moved["observations"] = self.seen(self.turned(tangents) + along)
+        moved = {name: size * (row - low[name]) / (2 * _STEP) for name, row in high.items()}
+        moved["observations"] = size * self.seen(self.turned(tangents) + along)
         return moved
 
     def _coupling(self, column: Rows) -> Tensor:

@@ -38,11 +38,11 @@ def from_points(arguments: Sequence[str]) -> int:
     from v2hdm.calibration.points import read_points
     from v2hdm.detection.frames import read_bgr
     from v2hdm.io.calibration.intrinsics import read_intrinsics
+    from v2hdm.io.safe.texts import take_camera_name
 
     info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
     info = replace(info, name=parsed.name or info.name)
-    if "/" in info.name or info.name in ("", ".", ".."):
-        raise ConfigError(f"the camera is called {info.name!r}, which is no file name; give another --name")
+    take_camera_name(info.name, "--name" if parsed.name else f"{parsed.intrinsics} (--name)", ConfigError)
     points = read_points(parsed.points)
     image = None if parsed.image is None else read_bgr(parsed.image)
     if image is not None and image.shape[:2] != (info.height, info.width):

@@ -150,7 +150,7 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
                 if earlier.read(len(_FIRST)) not in (b"", _FIRST):
                     raise ConfigError(f"{output}: is there and holds no detections; give another --output")
         is_special = output.exists() and not output.is_file()  # a pipe, or /dev/null
-        place = nullcontext(output) if is_special else whole_file(output)
+        place = nullcontext(output) if is_special else whole_file(output.resolve())
         with place as partial, partial.open("w", encoding="utf-8") as stream:
             yield stream
     except OSError as error:

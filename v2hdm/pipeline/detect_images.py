@@ -108,7 +108,8 @@ def detect_images(
         detector = Detector.load(options=options)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
     rough = _Rough(detector, lens, path, mounting, linear=linear)
-    frames = islice((_live_frames if live else _frames)(str(source), road, rough), limit)
+    most = limit and min(limit, sys.maxsize)
+    frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
     return _found(frames, rough, stopwatch or Stopwatch())
 
 
@@ -233,8 +234,9 @@ def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
                 "or start from another folder for the camera"
             )
         return ((frame, road) for frame in _of_camera(int(source), road, rough))
-    if not path.exists():
-        raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
+    if not (path.is_dir() or path.is_file()):
+        kind = "is a pipe or a device" if path.exists() else "no such image, video or folder"
+        raise DriveError(f"{path}: {kind}; a camera is named by its index, such as 0")
     paths = list_images(path) if path.is_dir() else [path]
     is_drive = any(READERS[name][0](path) for name in (READERS if path.is_dir() else ("bag",)))
     if is_drive and paths in ([], [path]):

@@ -14,7 +14,7 @@ from tests.benchmarks.faults.disks import expected_of
 from tests.benchmarks.faults.doors import cache_defects, map_arguments
 from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.running import Order, Row, folder_in, in_fork, row_of
-from tests.benchmarks.faults.situations import HERE, Expected, Situation
+from tests.benchmarks.faults.situations import HERE, Situation
 from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.frames import frame_faults
@@ -111,7 +111,7 @@ def damaged_caches(order: Order) -> Iterator[Row]:
     """Entries of the cache: they are made anew, and the map is the same to the byte."""
     made = order.doors.given("cache")
     case = Case("cache", "v2hdm map", map_arguments(order.doors.drive), made, "")
-    yield from _told(order, Situation(case), "cache/stages/[!f]*/*.v2hdm")
+    yield from _told(order, Situation(case), "cache/stages/[!f]*/*.v2hdm", remade=True)
 
 
 def damaged_results(order: Order) -> Iterator[Row]:
@@ -133,8 +133,11 @@ def damaged_results(order: Order) -> Iterator[Row]:
     yield from _told(order, Situation(compare), "out/run/calibration_front.yaml")
 
 
-def _told(order: Order, situation: Situation, files: str) -> Iterator[Row]:
-    """A door with one of some files damaged: its result is that of the whole file, or it tells."""
+def _told(order: Order, situation: Situation, files: str, remade: bool = False) -> Iterator[Row]:
+    """A door with one of some files damaged: its result is that of the whole file, or it tells.
+
+    Where what was damaged is ``remade`` it is that of the whole file, told or not.
+    """
     if not re.search(order.only, situation.name):
         return
     expected, _ = expected_of(situation, order.scratch)
@@ -153,16 +156,18 @@ def _told(order: Order, situation: Situation, files: str) -> Iterator[Row]:
             defects = cache_defects(folder / HERE / situation.cache)
         # What was damaged and is not read is damaged afterwards, too.
         spoilt_too = replace(expected, loose=expected.loose | {HERE + how[0]})
-        defects += _defects(situation, spoilt_too, outcome)
+        took = spoilt_too.defects(situation, outcome)
+        defects += took if remade else _untold(outcome, took)
         row = row_of(f"{situation.name}: {': '.join(how)}", outcome, defects)
         is_told = row.end == "right" and re.search(_TELLS, f"{outcome.error}\n{outcome.output}", re.MULTILINE)
         yield Row(row.name, "told" if is_told else row.end, row.said)
 
 
-def _defects(situation: Situation, expected: Expected, outcome: Outcome) -> list[str]:
+def _untold(outcome: Outcome, defects: list[str]) -> list[str]:
+    """What there is to say where the user was not told."""
     says = re.search(_TELLS, f"{outcome.error}\n{outcome.output}", re.MULTILINE)
     if outcome.code == 2 or not says or "Traceback" in outcome.error:
-        return expected.defects(situation, outcome)
+        return defects
     return [] if outcome.code in (0, 3) else [f"exit code {outcome.code}"]
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 
 from tests.benchmarks.faults.failing_calls import Failure, watch
-from tests.faults.judge import LONGEST_S, Case, Ran, run_here
+from tests.faults.judge import LONGEST_WAIT_S, Case, Ran, run_here
 
 # A fork has none of the threads of OpenCV's pool, and would wait for them when it sets their number.
 cv2.setNumThreads(1)
@@ -42,7 +42,7 @@ class Forked:
             Path(name).write_text(json.dumps([*run_here(case), sorted(sys.modules)]))
             return 0
 
-        watched = watch(work, self.below, self.failure, LONGEST_S + 10)
+        watched = watch(work, self.below, self.failure, LONGEST_WAIT_S + 10)
         self.calls = watched.calls
         text = Path(name).read_text()
         Path(name).unlink()

@@ -78,10 +78,7 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     with _opened(path) as stored:
         data = stored[:]
     header = _checked(data, path)
-    # Decoders only warn of a chunk of a PNG that does not have its checksum.
-    chunks = _png_chunks(data) if data.startswith(_PNG) else ()
-    sums = [(data[at - 4 : at + length], _unpack(">I", data, at + length)[0]) for _, at, length in chunks]
-    if any(zlib.crc32(chunk) != expected for chunk, expected in sums):
+    if data.startswith(_PNG) and not _is_whole_png(data):
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
         _warn_turned(path.parent, header.orientation)
@@ -214,13 +211,22 @@ def _jpeg_header(data: _Data) -> Header | None:
 
 def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
     """Kind, begin and length of the body of each whole chunk (PNG, third edition, section 5.3)."""
-    at = len(_PNG)
-    while at + 12 <= len(data):
+    at, kind = len(_PNG), b""
+    while kind != b"IEND" and at + 12 <= len(data):
         (length,) = _unpack(">I", data, at)
         if at + 12 + length > len(data):
             break
-        yield data[at + 4 : at + 8], at + 8, length
+        yield (kind := data[at + 4 : at + 8]), at + 8, length
         at += 12 + length
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether its chunks have their checksums and none ends beyond the file: decoders only warn, too late."""
+    chunks = [*_png_chunks(data)]
+    return any(kind == b"IEND" for kind, _, _ in chunks[-1:]) and all(
+        zlib.crc32(data[at - 4 : at + length]) == _unpack(">I", data, at + length)[0]
+        for _, at, length in chunks
+    )
 
 
 def _webp_header(data: _Data) -> Header:

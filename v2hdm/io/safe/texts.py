@@ -28,6 +28,8 @@ MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing he
 MOST_NAME_LETTERS, _MOST_NAME_BYTES = 64, 200  # file systems end at 255 bytes
 _SHORT, _FEW = 60, 4
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
+_HALF = "half a letter (a surrogate without its other)"
+_ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
 _OPENING, _CLOSING = [ord("["), ord("{")], [ord("]"), ord("}")]
 
@@ -117,7 +119,12 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
         return int(digits) if len(digits) <= MOST_DIGITS else float("inf")
 
     try:
-        return json.loads(text, object_pairs_hook=once, parse_int=whole)
+        content = json.loads(text, object_pairs_hook=once, parse_int=whole)
+        if _ESCAPED_HALF.search(text):  # of a pair of UTF-16, unless the other is there, too
+            json.dumps(content, ensure_ascii=False).encode()
+        return content
+    except UnicodeEncodeError:
+        raise error(f"{where}: {_HALF}, where a text may be; mend it") from None
     except RecursionError:
         raise error(f"{where}: JSON nested too deep; mend it") from None
     except json.JSONDecodeError as failure:
@@ -208,6 +215,8 @@ class _Loader(yaml.SafeLoader):
         value = super().construct_scalar(node)
         if node.tag == _INT and len(value) > MOST_DIGITS:
             _refuse(f"a number of {len(value)} digits", node.start_mark)
+        if any("\ud800" <= letter <= "\udfff" for letter in value):
+            _refuse(_HALF, node.start_mark)
         return value
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
