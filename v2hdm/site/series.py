@@ -82,8 +82,11 @@ def in_series(
     known = in_line & marking
     if known.sum() < _LEAST:
         return None
-    longer_m = length_m * np.where(in_line, stretch - 1, 0.0)
-    longer_m2 = np.where(in_line, (length_m / step_m) ** 2 * apart_m2, 0.0)
+    # A way that is hardly known says no more of a dash's length than that bends stretch by so much at most.
+    unknown_m2, most_m2 = (length_m / step_m) ** 2 * apart_m2, (length_m * np.log(_STRETCH) / 2) ** 2
+    told = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
+    longer_m = length_m * told * np.where(in_line, stretch - 1, 0.0)
+    longer_m2 = np.where(in_line, told * unknown_m2, 0.0)
     fixed = norm.pdf(own_m[known], 0.0, np.sqrt(variance[known]))
     spread_m, often = _regularity((own_m - longer_m)[known], (variance + longer_m2)[known], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
