@@ -30,7 +30,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.patch import ImageQuads, Patches, grey_of, log_light
 from v2hdm.detection.propose import Proposal, Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
-from v2hdm.geometry.planar import Quad
+from v2hdm.geometry.planar import Quad, cross
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, BoolArray, FloatArray, MarkingDetection
 
 CLAIMED = (
@@ -516,6 +516,5 @@ def _follows(apart: FloatArray, axis: FloatArray, length: FloatArray, turned: Fl
 
 def _angle(axis: FloatArray, chord: FloatArray) -> FloatArray:
     """From axes of no sense of direction to chords (..., 2), rad, at most a right angle either way."""
-    across = axis[..., 0] * chord[..., 1] - axis[..., 1] * chord[..., 0]
     along = (axis * chord).sum(axis=-1)
-    return np.asarray(np.arctan2(across * np.where(along < 0, -1.0, 1.0), np.abs(along)))
+    return np.asarray(np.arctan2(cross(axis, chord) * np.where(along < 0, -1.0, 1.0), np.abs(along)))

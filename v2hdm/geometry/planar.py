@@ -26,14 +26,18 @@ def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
     return np.asarray((cross >= 0).all(axis=-1) | (cross <= 0).all(axis=-1))
 
 
+def cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Cross product (...) of vectors (..., 2): positive where it turns from the x towards the y axis."""
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
 def signed_area(polygon: FloatArray) -> FloatArray:
     """Shoelace area (...) of polygons (..., N, 2): positive where they turn from the x towards the y axis.
 
     That is counter-clockwise in the map and clockwise on the screen, whose v axis points down.
     """
     ahead = np.concatenate([polygon[..., 1:, :], polygon[..., :1, :]], axis=-2)
-    cross = polygon[..., 0] * ahead[..., 1] - polygon[..., 1] * ahead[..., 0]
-    return np.asarray(cross.sum(axis=-1) / 2)
+    return np.asarray(cross(polygon, ahead).sum(axis=-1) / 2)
 
 
 def winding(polygon: FloatArray) -> int:
@@ -185,7 +189,7 @@ class Quad:
         """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
         tangent = self.tangent
         before = tangent.take(_LAST, axis=-2)
-        determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
+        determinant = cross(before, tangent)
         determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
         jacobian = np.zeros((len(tangent), 4, 2, 8))
         # Each lies along the other's line.
@@ -290,8 +294,7 @@ def mean_corners(corners: FloatArray, valid: BoolArray) -> FloatArray:
 def _turns(corners: FloatArray) -> FloatArray:
     """Cross product (..., 4) of each side with the next: positive where they turn from x towards y."""
     side = following(corners) - corners
-    ahead = following(side)
-    return np.asarray(side[..., 0] * ahead[..., 1] - side[..., 1] * ahead[..., 0])
+    return cross(side, following(side))
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
+from v2hdm.geometry.planar import cross
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
 from v2hdm.site.shapes import MEMBER_M, Laid
@@ -114,8 +115,8 @@ def _ways(
     to, others = centre[near] - centre[:, None], axis[near]
     along, alike = np.einsum("nki,ni->nk", to, axis), np.einsum("nki,ni->nk", others, axis)
     others *= np.where(alike < 0, -1.0, 1.0)[..., None]
-    across, across_other = _cross(axis[:, None], to), _cross(to, others)
-    turn = np.arctan2(_cross(axis[:, None], others), np.abs(alike))
+    across, across_other = cross(axis[:, None], to), cross(to, others)
+    turn = np.arctan2(cross(axis[:, None], others), np.abs(alike))
     # The chord between two points of a circle makes equal angles with the tangents there.
     beside_m = np.abs(across - across_other) / 2
     follows = marking[near] & (np.abs(along) > length_m[:, None])
@@ -150,10 +151,6 @@ def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) 
         both = often * series + (1 - often) * otherwise
         often = float((1 + np.sum(often * series / np.maximum(both, 1e-300))) / (2 + len(off_m)))
     return spread_m, often
-
-
-def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
-    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def _times(middle: FloatArray, corners: Candidates) -> FloatArray:
