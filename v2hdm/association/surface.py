@@ -38,7 +38,7 @@ from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNois
 
 KNOTS_M = (1.75, 3.5, 5.25, 7.0, 8.75, 10.5)
 """Where beside the path the slope may change: every half lane of 3.5 m, as far as roads go. A crown lies
-along a lane line, half a lane or more from the middle of the vehicle's; one elsewhere is smoothed by 2 cm."""
+along a lane line, half a lane or more from the middle of the vehicle's; others lose 2 cm at most."""
 
 _SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
