@@ -258,3 +258,10 @@ def test_every_file_that_states_the_version_states_the_same():
     assert f"\n## [{__version__}]" in (ROOT / "CHANGELOG.md").read_text()
     # The wheel holds a library of another licence; what one cites is ours.
     assert citation["license"] == project["license"].split(" AND ")[0]
+
+
+def test_an_error_is_one_line_whatever_name_the_user_gave(capsys):
+    assert run(["check", "\x1b[2Jno\nsuch\u202edrive"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.rstrip("\n").isprintable()
