@@ -204,7 +204,7 @@ def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys):
     ("arguments", "words"),
     [
         (["--pixel-sigma", "0", "--survey-sigma", "0"], "are both 0"),
-        (["--name", "a/b"], "no file name; give another --name"),
+        (["--name", "a/b"], "--name: the name 'a/b' has a separator of folders; choose another"),
         (["--image", "half.png"], "the image is 640 x 360, but the intrinsics of 'front' are for 1280 x 720"),
         (["--image", "none.png"], "none.png: image listed but missing"),
     ],
