@@ -28,8 +28,7 @@ from v2hdm.report.metrics import driven_past, map_figures
 from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.store.files import load_json, write_json
 
-FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.02, 0.01, -0.01, 0.015, 0.02, -0.02, 0.01, 0.02, -0.01])
-ACROSS = 13  # functions of the spline to the side
+FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
 SEED = 4
 """Of a drive on level ground, 43 markings."""
@@ -130,7 +129,7 @@ def test_a_surface_read_back_shows_from_any_pose_what_the_plane_would(tmp_path):
     back = there[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
     paths = Paths.of(np.concatenate([there, back]), np.repeat([0, 1], len(there)))
     flat = Surface.level(paths)
-    surface = replace(flat, parameters=rng.normal(0.0, 0.02, len(flat.parameters)), datum_m=80.0)
+    surface = replace(flat, parameters=rng.normal(0.0, 0.01, len(flat.parameters)), datum_m=80.0)
     write_json(tmp_path / "ground.json", surface.stored())
     between = there.copy()  # poses that the surface was not made at
     between[:, :2, 3] += 0.3 * there[:, :2, 0]
@@ -167,8 +166,8 @@ def test_a_damaged_ground_is_named(damage):
 def test_ground_that_is_a_plane_is_seen_as_one_however_it_leans():
     poses = level(0.6 * np.arange(60))
     surface = Surface.level(way(poses))
-    along, across = np.meshgrid(np.arange(surface.knots[2]) - 1, np.arange(ACROSS) - 6, indexing="ij")
-    spline = 0.05 * surface.knots[1] * along + 0.03 * 2.5 * across  # a cubic spline's own grade and bank
+    along, across = np.meshgrid(np.arange(surface.knots[2]) - 1, np.arange(7) - 3, indexing="ij")
+    spline = 0.05 * surface.knots[1] * along + 0.03 * 5.0 * across  # a cubic spline's own grade and bank
     surface = replace(surface, parameters=np.concatenate([0 * FALLS, spline.ravel()]))
     rng = np.random.default_rng(6)
     frame = rng.integers(0, 60, 200)
@@ -238,8 +237,8 @@ def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_
 
 def test_the_ground_of_a_map_is_the_same_in_files(tmp_path):
     flat = Surface.level(way(arc()))
-    along, across = np.meshgrid(np.arange(flat.knots[2]), np.arange(ACROSS), indexing="ij")
-    smooth = np.concatenate([0 * FALLS, (0.3 * np.sin(along / 2) + 0.1 * np.cos(across / 4)).ravel()])
+    along, across = np.meshgrid(np.arange(flat.knots[2]), np.arange(7), indexing="ij")
+    smooth = np.concatenate([0 * FALLS, (0.3 * np.sin(along / 2) + 0.1 * np.cos(across / 2)).ravel()])
     surface = replace(flat, parameters=smooth, covariance=1e-4 * np.eye(len(smooth)), datum_m=80.0)
     strips = surface.strips()
     paths = write_map(HdMap((), ground=strips), tmp_path, "map", ["geotiff", "opencrg"])

@@ -36,19 +36,19 @@ from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
 
-KNOTS_M = (1.75, 3.5, 5.25, 7.0, 8.75, 10.5)
-"""Where beside the path the slope may change: every half lane of 3.5 m, as far as roads go. A crown lies
-along a lane line, half a lane or more from the middle of the vehicle's; others lose 2 cm at most."""
+KNOTS_M = (1.75, 3.5, 5.25)
+"""Where beside the path the slope may change: every half lane of 3.5 m. A crown lies along a lane line, half
+a lane or one and a half from the middle of the vehicle's own; one elsewhere is smoothed by 2 cm at most."""
 
 _SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
 _HINGES = 1 + 2 * len(KNOTS_M)
-_ALONG_M, _ACROSS_M = 3.0, 2.5  # between the spline's knots: a fourth of the way on which a ramp begins
+_ALONG_M, _ACROSS_M = 6.0, 5.0  # between the spline's knots: a third of a camera's reach, a lane with margins
 
 _GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and how far to either side it goes
-_SIDE_M = 12.5  # ground farther beside the path is as high as there, but for the cross-section
+_SIDE_M = 10.0  # ground farther beside the path is as high as there, but for the cross-section
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
 _WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
