@@ -136,7 +136,7 @@ def test_a_documented_block_runs(block, shell, folder_of):
 def test_a_documented_program_runs(block, shell, folder_of):
     folder = folder_of(block.document)
     (folder / "program.py").write_text(block.text)
-    shell("python program.py", folder)
+    assert shell("python program.py", folder), "every program prints what it found"
 
 
 @pytest.mark.parametrize("name", RUN_BY)

@@ -1,4 +1,4 @@
-"""Polygons in a plane, their area, points inside, and overlap, polylines, angles, and quadrilaterals.
+"""Geometry in a plane: polygons, polylines, angles and quadrilaterals.
 
 Quadrilaterals (..., 4, 2) have corners that run counter-clockwise as seen from above the ground, in the map
 as on the screen; the first is arbitrary. In the map, where y points up, their shoelace area is positive. In
@@ -27,7 +27,7 @@ def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
 
 
 def cross(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Cross product (...) of vectors (..., 2): positive where it turns from the x towards the y axis."""
+    """Cross product (...) of vectors (..., 2): positive where ``second`` is turned from x towards y."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 

@@ -143,7 +143,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     taken = candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations)
     weight, probability = np.asarray(taken, dtype=np.float64), np.zeros((len(candidates), _KINDS))
     believed = candidates
-    for _ in range(_PASSES):
+    for number in range(1, _PASSES + 1):
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         of_drive = share, paint, weight, probability[:, OTHER_LENGTH], _vague_evidence(counts, weight)
         space = _hypotheses(candidates, believed, shapes, *of_drive)
@@ -162,14 +162,15 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
         paint = _paint_error(hypotheses, each, np.asarray(candidates.known.all(axis=1)))
-        believed = _mixture(hypotheses, joint, paint)
+        if space.series is not None and number < _PASSES:
+            believed = _mixture(hypotheses, joint, paint)
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
     like_others = [one.fit[2] for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
     # A paint error has the tails of Student's t distribution, its square those of Fisher's.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
-    return Posterior(probability, log_odds, believed, evidence, misfit)
+    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
 
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:

@@ -33,7 +33,7 @@ _PASSES = 2  # rounds of expectation maximisation
 
 @dataclass(frozen=True)
 class Series:
-    """What the neighbours in its line say of each of N dashes."""
+    """Length and place of N dashes by their neighbours in the line."""
 
     longer_m: FloatArray  # (N,) than one of the class, 0 where no other follows
     longer_sigma_m: FloatArray  # (N,)
@@ -61,7 +61,7 @@ def in_series(
     sigma_m: float,
     weight: FloatArray,
 ) -> Series | None:
-    """What N solved dashes say of each other, ``believed`` to be where they are; None where too few follow.
+    """Learn the lines of N solved dashes, ``believed`` to be where they are; None where too few follow.
 
     ``laid`` is a shape of sigma ``sigma_m`` laid on each, ``shorter`` (N, 8) shortens it by 1 m, ``weight``
     (N,) is the probability of being a marking.
@@ -71,14 +71,16 @@ def in_series(
     longest = lengths.argmax(axis=1)
     length_m = lengths[rows, longest]
     axis = sides[rows, longest] / length_m[:, None]
-    marking = weight > 0.5
-    apart_m, apart_m2, off_m, off_m2 = _ways(believed, axis, length_m, marking)
+    marking, middle = weight > 0.5, np.tile(axis, 4) / 4
+    own_m2 = believed.along(middle, middle)
+    apart_m, apart_m2, off_m, off_m2 = _ways(believed, axis, own_m2, length_m, marking)
     own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     variance = candidates.along(shorter, shorter) + sigma_m**2
     usual = np.isfinite(apart_m) & marking & (own_m**2 < 9 * variance)
     if usual.sum() < _LEAST:
         return None
-    stretch, step_m = apart_m / np.median(apart_m[usual]), np.median(apart_m[usual])
+    step_m = np.median(apart_m[usual])
+    stretch = apart_m / step_m
     in_line = np.abs(np.log(stretch)) < np.log(_STRETCH)
     known = in_line & marking
     if known.sum() < _LEAST:
@@ -91,12 +93,10 @@ def in_series(
     fixed = norm.pdf(own_m[known], 0.0, np.sqrt(variance[known]))
     spread_m, often = _regularity((own_m - longer_m)[known], (variance + longer_m2)[known], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
-    middle = np.tile(axis, 4) / 4
     enclosed = known & np.isfinite(off_m)
     scatter_m, midway = MEMBER_M, 0.0
     if enclosed.sum() >= _LEAST:
-        own_m2 = believed.along(middle, middle) + off_m2
-        scatter_m, midway = _regularity(off_m[enclosed], own_m2[enclosed], 1 / apart_m[enclosed])
+        scatter_m, midway = _regularity(off_m[enclosed], (own_m2 + off_m2)[enclosed], 1 / apart_m[enclosed])
     middle_m = _times(middle, believed) + off_m
     return Series(
         longer_m, longer_sigma_m, often, apart_m, middle, middle_m, np.sqrt(off_m2 + scatter_m**2), midway
@@ -104,11 +104,12 @@ def in_series(
 
 
 def _ways(
-    believed: Candidates, axis: FloatArray, length_m: FloatArray, marking: BoolArray
+    believed: Candidates, axis: FloatArray, own_m2: FloatArray, length_m: FloatArray, marking: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """How far apart N dashes and their neighbours are, m, and how far they lie behind the middle; variances.
+    """For each dash the way to the next ones, m, and how far ahead their midpoint lies, m, with variances.
 
-    inf where a dash has no neighbour, nan where it has no two that enclose it alone.
+    ``own_m2`` (N,) is the variance of its place along ``axis`` (N, 2). The way is inf without a neighbour,
+    the midpoint nan without one on either side.
     """
     centre = believed.corners_map.mean(axis=1)
     near = cKDTree(centre).query(centre, min(_NEAR, len(centre)))[1].reshape(len(centre), -1)
@@ -122,8 +123,6 @@ def _ways(
     follows = marking[near] & (np.abs(along) > length_m[:, None])
     follows &= (np.abs(turn) < _TURN_RAD) & (beside_m < _BESIDE_M)
     arc_m = np.linalg.norm(to, axis=2) / np.sinc(turn / 2 / np.pi)
-    middle = np.tile(axis, 4) / 4
-    own_m2 = believed.along(middle, middle)
     ways = [np.where(follows & (sign * along > 0), arc_m, np.inf) for sign in (1, -1)]
     (ahead, ahead_m2, ahead_rad), (behind, behind_m2, behind_rad) = (
         (way.min(axis=1), *(each[np.arange(len(near)), way.argmin(axis=1)] for each in (own_m2[near], turn)))
@@ -133,16 +132,17 @@ def _ways(
         enclosed = np.abs(ahead - behind) < _UNEVEN * (ahead + behind)
         apart_m = np.where(enclosed, (ahead + behind) / 2, np.minimum(ahead, behind))
         off_m = np.where(enclosed, (ahead - behind) / 2, np.nan)
-    # Where a bend begins the ways differ by what the line is aside of its middle times the turns' difference.
+    # Where a bend begins, the two ways differ by the line's distance from the middle of the bend times the
+    # difference of their turns.
     off_m2 = (ahead_m2 + behind_m2 + (_ASIDE_M * (ahead_rad + behind_rad)) ** 2) / 4
     apart_m2 = np.where(enclosed, off_m2, own_m2 + np.where(ahead < behind, ahead_m2, behind_m2))
     return apart_m, apart_m2, off_m, off_m2
 
 
 def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) -> tuple[float, float]:
-    """How much dashes scatter about what their line says, m, and how often they follow it.
+    """Sigma, m, of dashes about the place or length that their line gives, and the share that follows it.
 
-    From how far off they are (N,), the variance of that, and its density (N,) ``otherwise``.
+    ``off_m`` (N,) is how far off each is, ``otherwise`` (N,) the density of that in a dash that does not.
     """
     # What scatters more than a class's markings do is in no series.
     spread_m, often = min(float(np.median(np.abs(off_m)) / norm.ppf(0.75)), MEMBER_M), 0.5
