@@ -1,10 +1,12 @@
 """A drive over a flat, rough floor, small enough for a test: every pixel is looked up where its ray lands."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
@@ -19,6 +21,9 @@ INFO = CameraInfo(
 CENTRE = np.array([1.0, 0.1, 2.2])
 NOISE = PoseNoise(position_m=0.005, heading_rad=0.0005, roll_pitch_rad=0.0005)
 ROI = np.array([[4.0, -2.5], [11.0, -2.5], [11.0, 2.5], [4.0, 2.5]])
+
+Heights = Callable[[FloatArray], FloatArray]
+"""Heights (N,) of points (N, 2)."""
 
 _TEXEL_M = 0.03
 _FLOOR_M = (-8.0, 46.0, -12.0, 30.0)
@@ -45,11 +50,17 @@ def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:
 
 
 def make_drive(
-    folder: Path, turn_deg: float, true: FloatArray, contrast: float = 30.0, grain: float = 0.0
+    folder: Path,
+    turn_deg: float,
+    true: FloatArray,
+    contrast: float = 30.0,
+    grain: float = 0.0,
+    crown: float = 0.0,
 ) -> Drive:
     """Render a drive into ``folder``; its guess is the truth, its poses are exact.
 
-    ``contrast`` of the floor and ``grain`` of the sensor are standard deviations in grey levels.
+    ``contrast`` of the floor and ``grain`` of the sensor are standard deviations in grey levels; ``crown`` is
+    the floor's fall to both sides of the path, on which the wheels stand at z = 0.
     """
     rng = np.random.default_rng(11)
     trajectory = path(turn_deg)
@@ -61,7 +72,7 @@ def make_drive(
     images = []
     for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         file = folder / "front" / f"{k:03d}.png"
-        seen = _look(floor, rays, pose)
+        seen = _look(floor, rays, pose, _crowned(trajectory, crown))
         cv2.imwrite(str(file), np.clip(seen + rng.normal(0.0, grain, seen.shape), 0, 255).astype(np.uint8))
         images.append(Image("front", float(stamp), file, pose))
     camera = Camera(
@@ -102,11 +113,21 @@ def _rays(true: FloatArray) -> FloatArray:
     return np.asarray(cam @ true[:3, :3])
 
 
-def _look(floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray) -> FloatArray:
+def _crowned(trajectory: Trajectory, fall: float) -> Heights:
+    """Heights (N,) of the floor at points (N, 2)."""
+    at = np.linspace(*trajectory.stamp_s[[0, -1]], 1000)
+    middle = cKDTree(interpolate(trajectory, at, np.inf)[0][:, :2, 3])
+    return lambda points: fall * (0.8 - middle.query(points)[0]) if fall else np.zeros(len(points))
+
+
+def _look(floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray, height_m: Heights) -> FloatArray:
     rays = rays_vehicle @ pose[:3, :3].T
     centre = pose[:3, :3] @ CENTRE + pose[:3, 3]
-    far = centre[2] / np.maximum(-rays[:, 2], 1e-3)
-    x, y = centre[0] + far * rays[:, 0], centre[1] + far * rays[:, 1]
+    above, down = centre[2], np.maximum(-rays[:, 2], 1e-3)
+    for _ in range(4):
+        ground = centre[:2] + (above / down)[:, None] * rays[:, :2]
+        above = centre[2] - height_m(ground)
+    x, y = ground.T
     columns = ((x - _FLOOR_M[0]) / _TEXEL_M).astype(np.float32).reshape(INFO.height, INFO.width)
     rows = ((y - _FLOOR_M[2]) / _TEXEL_M).astype(np.float32).reshape(INFO.height, INFO.width)
     return np.asarray(cv2.remap(floor, columns, rows, cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8))

@@ -105,8 +105,17 @@ def test_the_focal_length_of_an_exact_lens_is_right_within_its_sigma(tmp_path, t
     drive = make_drive(tmp_path, turn_deg, TRUE, 20.0, grain)
     estimate = estimate_ground(drive, "front", replace(FEW, free=("focal_scale",)))
     focal = estimate.parameters["focal_scale"]
-    assert focal.sigma < 0.01
+    assert focal.sigma < 0.012
     assert abs(focal.value) < 3 * focal.sigma
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 70.0])
+def test_a_crown_beneath_the_vehicle_is_not_taken_for_a_bent_lens(tmp_path, turn_deg):
+    drive = make_drive(tmp_path, turn_deg, TRUE, crown=0.03)
+    found = estimate_ground(drive, "front", replace(FEW, free=("distortion_k1",)))
+    bent, mounting = found.parameters["distortion_k1"], found.calibration.cam_from_vehicle
+    assert abs(bent.value) < 0.015
+    assert np.abs(-mounting[:3, :3].T @ mounting[:3, 3] - CENTRE)[2] < 0.03
 
 
 def test_errors_that_go_together_along_the_route_widen_a_variance():

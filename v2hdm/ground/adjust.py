@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from v2hdm.geometry.least_squares import Normal, gauss_newton
+from v2hdm.geometry.planar import cross
 from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.ground.model import GroundHits, Mount, by_lens, by_pixel, hit_ground
 from v2hdm.ground.prior import Observations, Prior
@@ -23,6 +25,9 @@ _CAUCHY = 2.5  # length of a whitened residual from which on it loses its weight
 # How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
 # against a pixel, but thousands of matches share it.
 _LENS_SIGMA_PX = 0.1
+# Fall of a road to both sides of a crown beneath the vehicle, whose wheels stand half a track beside it: it
+# looks like a bent lens (AASHTO, A Policy on Geometric Design of Highways and Streets, 7th ed., 4.2.2).
+_ROOF_SIGMA, _HALF_TRACK_M = 0.03, 0.8
 _BENDS = 6  # terms of a smooth error of each pixel coordinate: a polynomial of the second degree
 # Longer steps leave the range in which the equations are linear.
 _LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2
@@ -33,6 +38,7 @@ _LARGEST_NOISE_PX = 2.0  # what is further off is no noise of a pixel
 _STRETCHES = 12  # of the route: several metres each, longer than most errors go together
 
 TURN, CENTRE, BENDS = slice(0, 3), slice(3, 6), slice(6, 6 + 2 * _BENDS)
+_ROOF = BENDS.stop
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class Adjusted:
         covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
         pose_errors: (I, 6) estimated :data:`~v2hdm.ground.prior.STATES`.
         bends: (12,) estimated smooth error of the pixels, px.
+        roof: estimated fall of the ground to both sides of the path, m per m.
         poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
         weight: (N,) 1 for a match that fits, 0 for one that does not.
@@ -57,6 +64,7 @@ class Adjusted:
     covariance: FloatArray
     pose_errors: FloatArray
     bends: FloatArray
+    roof: float
     poses: FloatArray
     residual: FloatArray
     weight: FloatArray
@@ -66,12 +74,13 @@ class Adjusted:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """The estimate: mounting, freed parameter, errors of the poses (I, 6) and of the pixels (12,)."""
+    """The estimate: mounting, freed parameter, errors of the poses (I, 6) and of the pixels (12,), roof."""
 
     mount: Mount
     extra: float
     errors: FloatArray
     bends: FloatArray
+    roof: float
 
 
 @dataclass(frozen=True)
@@ -104,16 +113,16 @@ def adjust(
     """
     problem = _Problem(observations, prior, free, tolerance)
     damping = 0.0
-    begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS))
+    begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS), 0.0)
     if near is not None:
-        begin, damping = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends), _DAMPING
+        begin, damping = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends, near.roof), _DAMPING
         problem = replace(problem, sigma_px=problem.linearise(begin).sigma_px)
     fit = gauss_newton(
         problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED,
         damping=damping,
     )  # fmt: skip
     found, last = fit.x, fit.last
-    wanted = [*range(6), *range(BENDS.stop, problem.known)]
+    wanted = [*range(6), *range(_ROOF + 1, problem.known)]
     inverse = np.linalg.inv(last.information)
     own = inverse[: problem.known, : problem.known]
     return Adjusted(
@@ -122,6 +131,7 @@ def adjust(
         covariance=np.asarray(inverse[np.ix_(wanted, wanted)]),
         pose_errors=found.errors,
         bends=found.bends,
+        roof=found.roof,
         poses=problem.poses(found),
         residual=last.length,
         weight=last.weight,
@@ -150,7 +160,7 @@ def _short(step: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Unknowns, in order: turn, centre, bends, the freed parameter if any, and six errors of every pose.
+    """Unknowns, in order: turn, centre, bends, roof, a freed parameter if any, six errors of every pose.
 
     ``sigma_px`` is the standard deviation of the pixels, None to estimate it anew with every step.
     """
@@ -164,14 +174,15 @@ class _Problem:
     @property
     def known(self) -> int:
         """The number of unknowns beside the poses' errors."""
-        return BENDS.stop + (self.free is not None)
+        return _ROOF + 1 + (self.free is not None)
 
     @property
     def stiffness(self) -> FloatArray:
         """Prior information (U,) of the unknowns beside the poses' errors."""
         stiffness = np.zeros(self.known)
         # Too few matches must not make it singular: an angle is known to a radian, a parameter to ten units.
-        stiffness[TURN], stiffness[BENDS.stop :] = 1.0, 0.01
+        stiffness[TURN], stiffness[_ROOF + 1 :] = 1.0, 0.01
+        stiffness[_ROOF] = _ROOF_SIGMA**-2
         stiffness[CENTRE], stiffness[BENDS] = self.prior.centre_sigma_m**-2, _LENS_SIGMA_PX**-2
         return stiffness
 
@@ -186,7 +197,7 @@ class _Problem:
             elif self.free == "distortion_k1":
                 mount = mount.with_k1(change)
         errors = now.errors + step[self.known :].reshape(-1, 6)
-        return _Unknowns(mount, extra, errors, now.bends + step[BENDS])
+        return _Unknowns(mount, extra, errors, now.bends + step[BENDS], now.roof + float(step[_ROOF]))
 
     def poses(self, now: _Unknowns) -> FloatArray:
         """The poses (I, 4, 4) with their estimated errors and the freed parameter taken in."""
@@ -243,10 +254,12 @@ class _Problem:
             hits = hit_ground(now.mount, px, poses[image])
             by_px = by_pixel(now.mount, hits)
             bending = _bending(now.mount, px, by_px)
-            columns = [hits.by_mount(), bending]
+            falling = hits.by_fall(self._beside_m(hits.points_map) - _HALF_TRACK_M)
+            columns = [hits.by_mount(), bending, falling[:, :, None]]
             if self.free is not None:
                 columns.append(self._by_parameter(now.mount, hits, px, poses[image], image)[:, :, None])
-            points.append(hits.points_map + bending @ now.bends + (by_px @ off_px[:, :, None])[..., 0])
+            by_noise = (by_px @ off_px[:, :, None])[..., 0]
+            points.append(hits.points_map + bending @ now.bends + now.roof * falling + by_noise)
             known.append(np.concatenate(columns, axis=2))
             pose.append(hits.by_pose())
             slopes.append(by_px)
@@ -264,6 +277,15 @@ class _Problem:
         jacobian = np.concatenate([known[0] - known[1], pose[0], -pose[1]], axis=2)
         return points[0] - points[1], jacobian, root
 
+    def _beside_m(self, points_map: FloatArray) -> FloatArray:
+        """How far (N,) points (N, 2) lie beside the driven path; nan of none."""
+        known, out = np.isfinite(points_map).all(axis=1), np.full(len(points_map), np.nan)
+        course = self.prior.course_map
+        _, near = cKDTree(course).query(points_map[known])
+        ahead = np.gradient(course, axis=0)[near]
+        out[known] = np.abs(cross(ahead, points_map[known] - course[near])) / np.linalg.norm(ahead, axis=1)
+        return out
+
     def _by_parameter(
         self, mount: Mount, hits: GroundHits, px: FloatArray, poses: FloatArray, image: IntArray
     ) -> FloatArray:
@@ -271,7 +293,7 @@ class _Problem:
         if self.free == "clock_s":
             return hits.by_motion(self.prior.velocity[image])
         if self.free == "grade":
-            return np.asarray(-hits.plane[:, :, 2] * self.prior.climb_m[image][:, None])
+            return -hits.by_fall(self.prior.climb_m[image])
         return by_lens(mount, px, poses, str(self.free))
 
     def _sum_pairs(
@@ -304,6 +326,7 @@ class _Problem:
         stiffness = self.stiffness
         off = np.zeros(self.known)
         off[CENTRE], off[BENDS] = now.mount.centre_vehicle - self.prior.centre_vehicle, now.bends
+        off[_ROOF] = now.roof
         place = np.arange(self.known)
         information[place, place] += stiffness
         gradient[place] += stiffness * off

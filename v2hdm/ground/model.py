@@ -118,6 +118,10 @@ class GroundHits:
         """Derivative (N, 2, 6) by the vehicle's turn (3, rad) and shift (3, m), in vehicle axes."""
         return np.concatenate([self.plane @ -hat(self.point_vehicle), self.plane], axis=2)
 
+    def by_fall(self, lower_m: FloatArray) -> FloatArray:
+        """How the hits move (N, 2) where the ground lies ``lower_m`` (N,) below the plane, to first order."""
+        return np.asarray(self.plane[:, :, 2] * lower_m[:, None])
+
     def by_motion(self, velocity: FloatArray) -> FloatArray:
         """Derivative (N, 2) by time, the vehicle moving at ``velocity`` (N, 3): m/s, m/s, rad/s."""
         moved = np.zeros((len(velocity), 3))

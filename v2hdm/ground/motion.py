@@ -14,6 +14,8 @@ from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 # Half width of the parabola fitted to the poses: steering and pedals change the motion no faster.
 _SMOOTHING_S = 0.5
 _STANDING_MPS = 0.3  # below this a path has no direction: receivers wander by centimetres
+_PATH_STEP_M = 0.5
+_BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
 _ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
 
 
@@ -38,6 +40,15 @@ class Motion:
     def poses(self, clock_s: float = 0.0) -> FloatArray:
         """``map_from_vehicle`` (I, 4, 4), the images being taken ``clock_s`` after their stamps."""
         return interpolate(self.trajectory, self.stamp_s + clock_s, np.inf)[0]
+
+    def course_map(self) -> FloatArray:
+        """Places (N, 2) of the driven path, half a metre apart, continued straight at both ends."""
+        poses = self.trajectory.map_from_vehicle
+        at = np.arange(0.0, self.path_m[-1] + _PATH_STEP_M, _PATH_STEP_M)
+        keep = np.concatenate([[True], np.diff(self.path_m) > 1e-9])
+        path = np.column_stack([np.interp(at, self.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)])
+        beyond = np.arange(_PATH_STEP_M, _BEYOND_M, _PATH_STEP_M)[:, None]
+        return np.vstack([path, path[:1] - beyond * poses[0, :2, 0], path[-1:] + beyond * poses[-1, :2, 0]])
 
     def path_at_images(self, clock_s: float = 0.0) -> FloatArray:
         """Distance driven (I,) at the images."""

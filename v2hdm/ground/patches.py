@@ -40,8 +40,6 @@ _AROUND_M = 2.0  # how far beyond a region its ground is looked for: neighbourin
 _STILL_PX = (
     1.5  # what moves less between images far apart is bonnet, shadow of the vehicle, or dirt on the lens
 )
-_PATH_STEP_M = 0.5
-_BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
 
 
 @dataclass(frozen=True)
@@ -274,13 +272,13 @@ class Matcher:
         self._drive = drive
         self._image = motion.image
         self._roi = np.asarray(drive.cameras[camera].roi_vehicle, dtype=np.float64)
-        self._path = _path_of(motion)
+        self._path = motion.course_map()
         self._grey: dict[int, ImageArray] = {}
 
     def under(self, motion: Motion, turned: bool = False) -> Matcher:
         """The same images under another reading of the poses, the region ``turned`` to the other end."""
         other = copy(self)
-        other._path, other._roi = _path_of(motion), -self._roi if turned else self._roi
+        other._path, other._roi = motion.course_map(), -self._roi if turned else self._roi
         return other
 
     def match(
@@ -310,16 +308,6 @@ class Matcher:
         if row not in self._grey:
             self._grey[row] = read_grey(str(self._drive.images[int(self._image[row])].path))
         return self._grey[row]
-
-
-def _path_of(motion: Motion) -> FloatArray:
-    """Places (N, 2) of the driven path, half a metre apart, continued straight at both ends."""
-    poses = motion.trajectory.map_from_vehicle
-    at = np.arange(0.0, motion.path_m[-1] + _PATH_STEP_M, _PATH_STEP_M)
-    keep = np.concatenate([[True], np.diff(motion.path_m) > 1e-9])
-    path = np.column_stack([np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)])
-    beyond = np.arange(_PATH_STEP_M, _BEYOND_M, _PATH_STEP_M)[:, None]
-    return np.vstack([path, path[:1] - beyond * poses[0, :2, 0], path[-1:] + beyond * poses[-1, :2, 0]])
 
 
 def read_grey(path: str) -> ImageArray:

@@ -52,6 +52,7 @@ class Prior:
         pose_information: (6, I, I) of the poses' errors; see :func:`pose_information`.
         velocity: (I, 3) smoothed motion.
         climb_m: (I,) by how much a grade of 1 has lifted the poses, m.
+        course_map: (N, 2) places of the driven path, m.
         centre_vehicle: (3,) surveyed camera centre, m.
         centre_sigma_m: (3,) its standard deviations.
     """
@@ -60,6 +61,7 @@ class Prior:
     pose_information: FloatArray
     velocity: FloatArray
     climb_m: FloatArray
+    course_map: FloatArray
     centre_vehicle: FloatArray
     centre_sigma_m: FloatArray
 
@@ -118,6 +120,7 @@ class Stated:
             pose_information=pose_information(self.drive.pose_noise, path_m, factors),
             velocity=self.motion.velocity_at_images(self.clock_s)[rows],
             climb_m=path_m - path_m.mean(),
+            course_map=self.motion.course_map(),
             centre_vehicle=self.guess.centre_vehicle if survey is None else survey.centre_vehicle,
             centre_sigma_m=sigma_m,
         )
