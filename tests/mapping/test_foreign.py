@@ -80,7 +80,10 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
         solved.append([one.image for one in inputs.detections])
         if left is None:
             raise MappingError("no marking is left")
-        return SimpleNamespace(row=np.arange(rows)), (ScoreTest(Fault.CLOCK, -1, 0, -1, gain=left),), None
+        return SimpleNamespace(row=np.arange(rows))
+
+    def tested(*_):
+        return (ScoreTest(Fault.CLOCK, -1, 0, -1, gain=left),)
 
     for name, value in (
         ("foreign_stretch", (3.0, 6.0, gain)),
@@ -89,6 +92,7 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     ):
         monkeypatch.setattr(recovery, name, lambda *_, value=value: value)
     monkeypatch.setattr(recovery, "_settled", settled)
+    monkeypatch.setattr(recovery, "_tested", tested)
     images = [SimpleNamespace(stamp_s=float(n)) for n in range(10)]
     detections = [SimpleNamespace(image=n) for n in range(10)]
     inputs = recovery.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]

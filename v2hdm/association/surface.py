@@ -20,8 +20,9 @@ poses by which they are moved, a corner then fits its pixels exactly where its p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,11 +63,14 @@ _REACH_M = 40.0  # ground farther from the camera stays as it is: H is known bes
 _TURN_M = 10.0  # by which places count as apart for a heading that differs by a radian
 _STEPS = 12  # of the secant method, where four to six are enough
 _SURE_M = 1e-7  # of its end
-_STEP_PX = 0.5  # of the differences by pixel
+_STEP_PX, _TOUCH_M = 0.5, 0.01  # of the differences by pixel, and of heights by place
 _LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell from the road's, all the way
 _MOST_RECORDED = 500  # places of the path whose records are taken, evenly
-_FORGOTTEN = 1e-3  # share of the variance of all heights that is left out with the many errors that are small
+_FORGOTTEN = 1e-2  # share of the variance of all heights that is left out with the many errors that are small
 _RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
+
+Heights = Callable[[FloatArray], FloatArray]
+"""Heights (K,) at points (K, 2)."""
 
 FILE = "ground.json"  # in a result folder
 
@@ -165,10 +169,13 @@ class Paths:
 
     def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points (K, 2) of the path at stations (K,), unit vectors of the heading there, and its sense."""
-        columns = np.column_stack([self.points_map, self.ahead])
-        at = np.column_stack([np.interp(station_m, self.station_m, one) for one in columns.T])
+        columns, last = np.hstack([self.points_map, self.ahead]), len(self.station_m) - 1
+        near = np.searchsorted(self.station_m, station_m).clip(max=last)
+        before = np.maximum(near - 1, 0)
+        begin_m, way_m = self.station_m[before], self.station_m[near] - self.station_m[before]
+        share = np.clip((station_m - begin_m) / np.where(way_m > 0, way_m, 1.0), 0.0, 1.0)[:, None]
+        at = (1 - share) * columns[before] + share * columns[near]
         ahead = at[:, 2:] / np.maximum(np.linalg.norm(at[:, 2:], axis=1, keepdims=True), 1e-9)
-        near = np.searchsorted(self.station_m, station_m).clip(max=len(self.station_m) - 1)
         return at[:, :2], ahead, self.sense[near]
 
     def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
@@ -293,7 +300,15 @@ class Surface:
         """Heights (K,) of the ground at points (K, 2) above the planes that frames (K,) stand on."""
         away, (height, forwards, sideways) = self._from(points_map, frame), self._stands
         plane = height[frame] + away[:, 0] * forwards[frame] + away[:, 1] * sideways[frame]
-        return np.asarray(self._columns(*self.paths.beside(points_map, frame)) @ self.parameters - plane)
+        return np.asarray(self._height_m(*self.paths.beside(points_map, frame)) - plane)
+
+    def _height_m(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
+        """Heights (K,) at stations (K,), to the left (K,)."""
+        i, by_way = _cubic(station_m, *self.knots)
+        j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
+        around = self.parameters[_HINGES:].reshape(-1, _ACROSS)[i[:, :, None], j[:, None, :]]
+        spline = np.einsum("ki,kij,kj->k", by_way, around, by_side, optimize=True)
+        return np.asarray(_hinges(left_m) @ self.parameters[:_HINGES] + spline)
 
     def height_m(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Heights (K,) of the ground at points (K, 2) of the map, and their standard deviations (K,)."""
@@ -445,12 +460,13 @@ class Surface:
             towards += weighted @ value
         return known, towards, datum_m
 
-    def points(
-        self, rays: FloatArray, centre_map: FloatArray, frame: IntArray
+    def _meet(
+        self, rays: FloatArray, centre_map: FloatArray, frame: IntArray, seen_height_m: Heights
     ) -> tuple[FloatArray, BoolArray]:
         """Where rays (K, 3) from cameras (K, 3) at frames (K,) meet the ground (K, 2), and which (K,) do.
 
-        Those that meet it nowhere, or far away, stay on the plane.
+        Those that meet it nowhere, or far away, stay on the plane. ``seen_height_m`` are the heights (K,) at
+        points (K, 2).
         """
         with np.errstate(all="ignore"):
             plane = centre_map[:, :2] - (centre_map[:, 2:] / rays[:, 2:]) * rays[:, :2]
@@ -463,17 +479,20 @@ class Surface:
             return points[:, :2] - self._leaning(points[:, :2], points[:, 2], frame)
 
         def above(far: FloatArray) -> FloatArray:
-            height_m = self.seen_height_m(on_map(far), frame)
-            return np.asarray(centre_map[:, 2] + far * rays[:, 2] - height_m)
+            return np.asarray(centre_map[:, 2] + far * rays[:, 2] - seen_height_m(on_map(far)))
 
         before = above(last)
         far = last - before / down
         for _ in range(_STEPS):
             off = above(far)
+            if (np.abs(off[found]) < _SURE_M).all():
+                break
             with np.errstate(all="ignore"):
                 fall = np.where(np.abs(far - last) > 1e-12, (off - before) / (far - last), down)
             last, before, far = far, off, far - off / np.where(fall < 0, fall, down)
-        found &= (np.abs(above(far)) < _SURE_M) & (far > 0)
+        else:
+            off = above(far)
+        found &= (np.abs(off) < _SURE_M) & (far > 0)
         out[found] = on_map(far)[found]
         return np.where(found[:, None], out, plane), found
 
@@ -484,31 +503,50 @@ class Surface:
 
         Each is of a camera ``intrinsic`` (K, 3, 3) at ``cam_from_map`` (K, 4, 4), taken at ``frame`` (K,).
         """
-        turn = cam_from_map[:, :3, :3]
-        cam = np.linalg.solve(intrinsic, np.column_stack([pixels, np.ones(len(pixels))])[..., None])
-        rays = (np.swapaxes(turn, 1, 2) @ cam)[..., 0]
-        points, found = self.points(rays, camera_centre(cam_from_map), frame)
-        plan = pinhole_px_from_ground(intrinsic, cam_from_map)
-        moved = apply_homography(plan, np.where(found[:, None], points, 0.0)[:, None])[:, 0]
-        return np.where(found[:, None], moved, pixels)
+        view = _View(intrinsic, cam_from_map)
+        points, found = self._shown(view, frame, pixels)
+        return np.where(found[:, None], view.on_plane_px(points, found), pixels)
+
+    def _shown(self, view: _View, frame: IntArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """The ground's points (K, 2) at pixels (K, 2), and which (K,) show it."""
+        heights = partial(self.seen_height_m, frame=frame)
+        return self._meet(view.rays(pixels), view.centre, frame, heights)
+
+    def _pixels_by_pixels(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
+        """The derivative (K, 2, 2) of :meth:`flattened_px`, over planes that touch the ground there."""
+        points, found = self._shown(view, frame, pixels)
+        height_m, slope = self.seen_height_m(points, frame), np.empty_like(points)
+        for axis, step in enumerate(_TOUCH_M * np.eye(2)):
+            rise_m = self.seen_height_m(points + step, frame) - self.seen_height_m(points - step, frame)
+            slope[:, axis] = rise_m / (2 * _TOUCH_M)
+
+        def touching(at_map: FloatArray) -> FloatArray:
+            return np.asarray(height_m + np.einsum("ki,ki->k", slope, at_map - points))
+
+        def moved(to_px: FloatArray) -> FloatArray:
+            at, near = self._meet(view.rays(to_px), view.centre, frame, touching)
+            return np.where((found & near)[:, None], view.on_plane_px(at, near), to_px)
+
+        columns = [moved(pixels + step) - moved(pixels - step) for step in _STEP_PX * np.eye(2)]
+        return np.stack(columns, axis=2) / (2 * _STEP_PX)
 
     def flattened(self, sightings: Sightings, rig: Rig) -> Sightings:
         """``sightings`` as if all that they show lay on the plane z = 0, under the cameras of ``rig``."""
 
         def moved(camera: IntArray, frame: IntArray, pixels: FloatArray) -> FloatArray:
-            known = np.isfinite(pixels).all(axis=1)
-            camera, frame, out = camera[known], frame[known], pixels.copy()
+            known, out = np.isfinite(pixels).all(axis=1), pixels.copy()
+            camera, frame = camera[known], frame[known]
             cam_from_map = rig.cam_from_map(camera, frame)
             out[known] = self.flattened_px(rig.intrinsic[camera], cam_from_map, frame, pixels[known])
             return out
 
         camera, frame = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4)
         pixels = sightings.corners_pinhole_px.reshape(-1, 2)
-        columns = [
-            moved(camera, frame, pixels + step) - moved(camera, frame, pixels - step)
-            for step in _STEP_PX * np.eye(2)
-        ]
-        jacobian = np.stack(columns, axis=2).reshape(-1, 4, 2, 2) / (2 * _STEP_PX)
+        known, jacobian = np.isfinite(pixels).all(axis=1), np.full((len(pixels), 2, 2), np.nan)
+        own = camera[known], frame[known]
+        view = _View(rig.intrinsic[own[0]], rig.cam_from_map(*own))
+        jacobian[known] = self._pixels_by_pixels(view, own[1], pixels[known])
+        by_corner = jacobian.reshape(-1, 4, 2, 2)
         symbols = sightings.symbols
         if len(symbols.camera):
             length = [len(outline) for outline in symbols.outlines_pinhole_px]
@@ -520,6 +558,25 @@ class Surface:
         return replace(
             sightings,
             corners_pinhole_px=moved(camera, frame, pixels).reshape(-1, 4, 2),
-            covariance_px=jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2),
+            covariance_px=by_corner @ sightings.covariance_px @ np.swapaxes(by_corner, -1, -2),
             symbols=symbols,
         )
+
+
+class _View:
+    """Cameras ``intrinsic`` (K, 3, 3) at ``cam_from_map`` (K, 4, 4)."""
+
+    def __init__(self, intrinsic: FloatArray, cam_from_map: FloatArray) -> None:
+        self._map_from_px = np.swapaxes(cam_from_map[:, :3, :3], 1, 2) @ np.linalg.inv(intrinsic)
+        self._px_from_plane = pinhole_px_from_ground(intrinsic, cam_from_map)
+        self.centre = camera_centre(cam_from_map)
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Directions (K, 3) in the map of pinhole pixels (K, 2)."""
+        homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+        return np.asarray((self._map_from_px @ homogeneous[..., None])[..., 0])
+
+    def on_plane_px(self, points_map: FloatArray, found: BoolArray) -> FloatArray:
+        """Where points (K, 2) of the plane are seen; meaningless where not ``found``."""
+        shown = np.where(found[:, None], points_map, 0.0)
+        return np.asarray(apply_homography(self._px_from_plane, shown[:, None])[:, 0])

@@ -165,7 +165,16 @@ class Optimiser:
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
-        bundle = self._fit_ground(bundle, progress)
+        return self.settle_from(bundle, progress)
+
+    def settle_from(
+        self, bundle: Bundle, progress: Callable[[str], None] = silent, surface: Surface | None = None
+    ) -> Bundle:
+        """Settle ground and noise of the poses from a ``bundle`` of the same sightings.
+
+        ``surface`` is what that makes likeliest, if it is known (:meth:`likeliest_surface`).
+        """
+        bundle = self._fit_ground(bundle, progress, surface)
         progress("noise of the poses")
         return self._weigh_poses(bundle)
 
@@ -333,41 +342,43 @@ class Optimiser:
         association = self._with_all_that_fit(association, rig)
         bundle = self._solve(association, self._usable(association, rig), rig)
         self._reweigh(bundle)
-        return self._weigh_poses(self._fit_ground(bundle, progress))
+        return self.settle_from(bundle, progress)
 
-    def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None]) -> Bundle:
+    def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None], surface: Surface | None) -> Bundle:
         """The solve over the ground that the drive shows, if it is not to be a plane."""
         if self._options.ground != SURFACE:
             return bundle
         progress("surface of the ground")
-        surface = self._ground(bundle, None)
-        for _ in range(_GROUND_ROUNDS):
-            surface, _, step_m = self._better_ground(bundle, self._ground(bundle, surface))
+        step_m = np.inf
+        for number in range(_GROUND_ROUNDS):
+            if number or surface is None:
+                surface, _, step_m = self._better_ground(bundle, surface)
             self.surface, self.sightings = surface, surface.flattened(self._seen, bundle.rig)
             association = self._associate(bundle.rig)
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
             if step_m < _SETTLED_M:
                 break
-        _log.info("%s: %s", ", ".join(self.camera_names), surface.sentence)
+        if surface is not None:
+            _log.info("%s: %s", ", ".join(self.camera_names), surface.sentence)
         return bundle
 
-    def _ground(self, bundle: Bundle, surface: Surface | None) -> Surface:
-        """``surface``, or else the level, along the path that ``bundle`` found."""
+    def _better_ground(self, bundle: Bundle, surface: Surface | None) -> tuple[Surface, float, float]:
+        """The likeliest ground under ``bundle``, from ``surface`` or level, its gain, and its step, m."""
         paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.visit)
-        return Surface.level(paths) if surface is None else replace(surface, paths=paths)
-
-    def _better_ground(self, bundle: Bundle, surface: Surface) -> tuple[Surface, float, float]:
-        """The likeliest ground from ``surface`` under ``bundle``, its gain, and the step of its heights."""
+        surface = Surface.level(paths) if surface is None else replace(surface, paths=paths)
         points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
         columns = surface.seen_columns(points_map, self._seen.frame[bundle.row])
         better, gain = surface.estimated(*height_information(bundle.solution, columns), self._recorded)
         step_m = columns @ (better.parameters - surface.parameters)
         return better, gain, float(np.sqrt(np.mean(step_m**2)))
 
-    def ground_gain(self, bundle: Bundle) -> float:
-        """How much better than its plane a surface would explain ``bundle``, less what noise would (AIC)."""
-        return self._better_ground(bundle, self._ground(bundle, None))[1]
+    def likeliest_surface(self, bundle: Bundle) -> tuple[Surface, float]:
+        """The surface that ``bundle``, over the plane, makes likeliest, and its gain.
+
+        The gain is how much better it would explain ``bundle``, less what noise would (AIC).
+        """
+        return self._better_ground(bundle, None)[:2]
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which sightings make groups."""

@@ -145,18 +145,11 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
     while True:
-        # 1. Associate and solve, all at once or marking by marking; test the inputs against all else.
-        settled, found, worst = _settled(inputs, progress)
+        # 1. Associate and solve, all at once or marking by marking.
+        settled = _settled(inputs, progress)
         # 2. Where the drive contradicts the plane, and a surface explains all of it, take that.
-        if inputs.options.ground == AUTO and _is_bent(inputs, settled, found):
-            curved = replace(inputs, options=replace(inputs.options, ground=SURFACE))
-            over, tests, rival = _settled(curved, progress)
-            explained = rival is None or rival.fault not in _LIKE_GROUND
-            is_curved = explained and curved.optimiser.is_curved(over)
-            if is_curved:
-                inputs, settled, found, worst = curved, over, tests, rival
-            taken = "a surface" if is_curved else "a plane: no surface explains the drive"
-            _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
+        inputs, settled, found = _over_ground(inputs, settled, progress)
+        worst = _worst(found)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
         foreign, left = _foreign(inputs, settled, found, progress), None
@@ -180,19 +173,49 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     return Outcome(inputs, optimised.bundle, replace(evidence, foreign=foreign)), optimised
 
 
-def _settled(
-    inputs: Inputs, progress: Callable[[str], None]
-) -> tuple[Bundle, tuple[ScoreTest, ...], ScoreTest | None]:
-    """A solve over all observations, the tests of its inputs, and the one that is contradicted most."""
+def _settled(inputs: Inputs, progress: Callable[[str], None]) -> Bundle:
+    """A solve over all observations, over the plane unless the options ask for a surface."""
     if inputs.options.mode == INCREMENTAL:
-        settled = inputs.optimiser.grow(progress)
-    else:
-        settled = inputs.optimiser.settle(inputs.tracks, progress)
+        return inputs.optimiser.grow(progress)
+    return inputs.optimiser.settle(inputs.tracks, progress)
+
+
+def _tested(inputs: Inputs, settled: Bundle, progress: Callable[[str], None]) -> tuple[ScoreTest, ...]:
+    """The tests of the inputs that ``settled`` was solved with, the likeliest fault first."""
     progress("tests of the inputs")
     found = score_faults(settled.problem, settled.solution)
     stated = (one for one in found if _is_stated(one, settled, inputs.drive))
-    found = tuple(sorted(stated, key=log_odds, reverse=True))
-    return settled, found, next((one for one in found if is_contradicted(one)), None)
+    return tuple(sorted(stated, key=log_odds, reverse=True))
+
+
+def _worst(found: Sequence[ScoreTest]) -> ScoreTest | None:
+    return next((one for one in found if is_contradicted(one)), None)
+
+
+def _over_ground(
+    inputs: Inputs, settled: Bundle, progress: Callable[[str], None]
+) -> tuple[Inputs, Bundle, tuple[ScoreTest, ...]]:
+    """The inputs, ``settled`` and its tests, or those over a surface where the drive shows one.
+
+    A plane is contradicted where the ground surely falls or rises, if only by as little as outliers leave.
+    """
+    if inputs.options.ground != AUTO:
+        return inputs, settled, _tested(inputs, settled, progress)
+    surface, gain = inputs.optimiser.likeliest_surface(settled)
+    is_bent = gain > CLEAR_SIGMAS**2 / 2
+    found = () if is_bent else _tested(inputs, settled, progress)
+    if is_bent or any(one.fault is Fault.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
+        curved = replace(inputs, options=replace(inputs.options, ground=SURFACE))
+        over = curved.optimiser.settle_from(settled, progress, surface)
+        tests = _tested(curved, over, progress)
+        rival = _worst(tests)
+        explained = rival is None or rival.fault not in _LIKE_GROUND
+        is_curved = explained and curved.optimiser.is_curved(over)
+        taken = "a surface" if is_curved else "a plane: no surface explains the drive"
+        _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
+        if is_curved:
+            return curved, over, tests
+    return inputs, settled, found or _tested(inputs, settled, progress)
 
 
 def _foreign(
@@ -212,20 +235,14 @@ def _foreign(
     beyond = ((stamp_s < begin_s) | (stamp_s > end_s)).tolist()
     rest = replace(inputs, detections=list(compress(inputs.detections, beyond)))
     try:
-        without, tests, _ = _settled(rest, progress)
+        without = _settled(rest, progress)
+        tests = _tested(rest, without, progress)
     except (AdjustError, MappingError) as failure:
         _log.warning("whether images from %.1f to %.1f s are foreign: %s", begin_s, end_s, failure)
         return begin_s, end_s, gain
     left = max([0.0, *map(log_odds, tests)]) * len(settled.row) / len(without.row)
     gain += max(log_odds(suspect) - left, 0.0)
     return begin_s, end_s, gain
-
-
-def _is_bent(inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest]) -> bool:
-    """Whether the ground surely falls or rises, if only by as little as outliers leave."""
-    if any(one.fault is Fault.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
-        return True
-    return inputs.optimiser.ground_gain(settled) > CLEAR_SIGMAS**2 / 2
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
