@@ -3,13 +3,14 @@ r"""The ground where it is no plane: its heights along and beside the path, and 
 Everything else of the mapping knows the plane z = 0 on which the vehicle stands. The ground's height at the
 way s along the path, d to its left, is
 
-.. math:: H(s, d) = -a_0 |d| - \sum_k a_k \max(0, \pm d - d_k) + \sum_{ij} c_{ij} B_i(s) B_j(d),
+.. math:: H(s, d) = g x(s, d) - a_0 |d| - \sum_k a_k \max(0, \pm d - d_k) + \sum_{ij} c_{ij} B_i(s) B_j(d),
 
-a cross-section alike along the route, whose slopes change at the path and at knots beside it (a crown), and a
-bicubic spline: grade, bank, ramps, crests and dips. Of its priors, slopes a are 0 +- 3 %; second
-differences of c along, across and both ways have a standard deviation each, estimated from the drive by its
-marginal likelihood, so that a plane is what is left where nothing speaks against it; on the path heights and
-slopes are the recorded ones (:mod:`v2hdm.io.drive.road`), within their noise.
+a grade of the whole map, a cross-section alike along the route, whose slopes change at the path and at
+knots beside it (a crown), and a bicubic spline: bank, ramps, crests and dips. The grade stands apart: where
+the path begins to bend, a plane has a kink in s. Of the priors, slopes a are 0 +- 3 %; second derivatives
+along, across and both ways have a standard deviation each, estimated from the drive by its marginal
+likelihood, so that a plane is what is left where nothing speaks against it; on the path heights and slopes
+are the recorded ones (:mod:`v2hdm.io.drive.road`), within their noise.
 
 A frame sees heights above the plane on which the vehicle stands there, which touches H: planes are none of
 it.
@@ -20,7 +21,7 @@ poses by which they are moved, a corner then fits its pixels exactly where its p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -29,11 +30,12 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.optimize import minimize
-from scipy.sparse import csr_array, diags_array, hstack
+from scipy.sparse import csr_array, diags_array, hstack, kron
 from scipy.spatial import cKDTree
 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
+from v2hdm.geometry.planar import cross
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
 
@@ -45,15 +47,22 @@ _SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
-_HINGES = 1 + 2 * len(KNOTS_M)
+_GRADE_SIGMA = 0.1
+"""Standard deviation of the grade of all the ground: the steepest roads rise by 10 to 15 %."""
+
+_GRADES, _HINGES = 2, 1 + 2 * len(KNOTS_M)
+_SHAPE = _GRADES + _HINGES  # parameters before the spline's
 _ALONG_M, _ACROSS_M = 6.0, 5.0  # between the spline's knots: a third of a camera's reach, a lane with margins
 
 _GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and how far to either side it goes
-_SIDE_M = 10.0  # ground farther beside the path is as high as there, but for the cross-section
+_SIDE_M = 12.5  # ground farther beside the path is as high as there, but for the grade
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
 _WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
 
+_TIGHTEST = (
+    0.3  # share of the way along the path that is left beside it in a bend: ground beyond is another's
+)
 _CURVATURE = 1e-3  # usual second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
 
@@ -178,6 +187,13 @@ class Paths:
         ahead = at[:, 2:] / np.maximum(np.linalg.norm(at[:, 2:], axis=1, keepdims=True), 1e-9)
         return at[:, :2], ahead, self.sense[near]
 
+    def places(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
+        """Points (K, 2) of the map at stations (K,), to the left (K,); the path goes on beyond its ends."""
+        at, ahead, sense = self.at(station_m)
+        beyond = sense * (station_m - np.clip(station_m, *self.station_m[[0, -1]]))
+        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        return np.asarray(at + beyond[:, None] * ahead + left_m[:, None] * left)
+
     def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
         """The same paths with the frames of vehicles at poses (F, 4, 4), in any order."""
         position, ahead = map_from_vehicle[:, :2, 3], map_from_vehicle[:, :2, 0]
@@ -198,6 +214,7 @@ class Paths:
 
 def _hinges(left_m: FloatArray) -> FloatArray:
     """The heights (K, B) that a unit of each slope of a cross-section gives to points (K,) to the left."""
+    left_m = np.clip(left_m, -_SIDE_M, _SIDE_M)
     sides = [np.maximum(side * left_m - knot, 0.0) for side in (1.0, -1.0) for knot in KNOTS_M]
     return -np.column_stack([np.abs(left_m), *sides])
 
@@ -215,7 +232,8 @@ class Surface:
     """The ground along the ``paths``."""
 
     paths: Paths  # of the visits
-    parameters: FloatArray  # (B,) slopes a of the cross-section, left ones first, then c, across within along
+    # (B,) g, then the slopes a, left ones first, then c, across within along
+    parameters: FloatArray
     covariance: FloatArray  # (B, B) of them
     # the spline's first along the way, m, the way between two, m, and how many functions they make
     knots: tuple[float, float, int]
@@ -232,7 +250,7 @@ class Surface:
         begin_m, end_m = (paths.station_m[[0, -1]] + [-_AHEAD_M, _AHEAD_M]).tolist()
         step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
         along = int(np.ceil((end_m - begin_m) / step_m)) + 3
-        size = _HINGES + along * _ACROSS
+        size = _SHAPE + along * _ACROSS
         return cls(paths, np.zeros(size), np.zeros((size, size)), (begin_m, step_m, along))
 
     def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
@@ -243,7 +261,12 @@ class Surface:
         value = (by_way[:, :, None] * by_side[:, None, :]).reshape(-1)
         bounds = 16 * np.arange(len(station_m) + 1)
         spline = csr_array((value, index, bounds), (len(station_m), self.knots[2] * _ACROSS))
-        return csr_array(hstack([csr_array(_hinges(left_m)), spline]))
+        shape = np.hstack([self._off_middle(station_m, left_m), _hinges(left_m)])
+        return csr_array(hstack([csr_array(shape), spline]))
+
+    def _off_middle(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
+        """Map x and y (K, 2) of places at stations (K,), to the left (K,), from the middle of the path."""
+        return np.asarray(self.paths.places(station_m, left_m) - self.paths.points_map.mean(axis=0))
 
     def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
         """Height, slope along the heading and to the left (F, B each) of frames' planes by the parameters.
@@ -251,16 +274,17 @@ class Surface:
         A plane touches the ground under the wheels: on a crown its origin is lower than the ground there.
         """
         paths, (long, wide) = self.paths, _WHEELS_M
-        # Between two places the path is a chord, up to 5 mm off a bend, but the vehicle was on it.
-        station, _ = paths.beside(paths.position_map, np.arange(len(paths.place)))
-        left = np.full(len(station), wide)
-        rear, front = (
-            (self._columns(at, left), self._columns(at, -left))
-            for at in (station, station + long * paths.sense[paths.place])
-        )
-        height, ahead = (rear[0] + rear[1]) / 2, (front[0] + front[1]) / 2
-        sideways = (rear[0] - rear[1] + front[0] - front[1]) / (4 * wide)
-        return height, (ahead - height) / long, sideways
+        frame, ahead = np.arange(len(paths.place)), paths.heading
+        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        # In a bend the front wheels are beside the path that the rear axle takes.
+        (right_rear, left_rear), (right_front, left_front) = (
+            [self._columns(*paths.beside(paths.position_map + along * ahead + side * left, frame))
+             for side in (-wide, wide)]
+            for along in (0.0, long)
+        )  # fmt: skip
+        rear, front = (right_rear + left_rear) / 2, (right_front + left_front) / 2
+        sideways = (left_rear - right_rear + left_front - right_front) / (4 * wide)
+        return rear, (front - rear) / long, sideways
 
     def _from(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Points (K, 2) ahead and to the left of the vehicle at frames (K,), m."""
@@ -306,9 +330,10 @@ class Surface:
         """Heights (K,) at stations (K,), to the left (K,)."""
         i, by_way = _cubic(station_m, *self.knots)
         j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
-        around = self.parameters[_HINGES:].reshape(-1, _ACROSS)[i[:, :, None], j[:, None, :]]
+        around = self.parameters[_SHAPE:].reshape(-1, _ACROSS)[i[:, :, None], j[:, None, :]]
         spline = np.einsum("ki,kij,kj->k", by_way, around, by_side, optimize=True)
-        return np.asarray(_hinges(left_m) @ self.parameters[:_HINGES] + spline)
+        graded = self._off_middle(station_m, left_m) @ self.parameters[:_GRADES]
+        return np.asarray(graded + _hinges(left_m) @ self.parameters[_GRADES:_SHAPE] + spline)
 
     def height_m(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Heights (K,) of the ground at points (K, 2) of the map, and their standard deviations (K,)."""
@@ -331,7 +356,7 @@ class Surface:
         height_m = self.seen_height_m(points_map, np.full(len(points_map), frame))
         centre = camera_centre(cam_from_map)
         place, frames = points_map, np.full(len(points_map), frame)
-        for _ in range(2):
+        for _ in range(4):
             points_map = place + self._leaning(points_map, height_m, frames)
         off = points_map - centre[:2]
         known = (np.linalg.norm(off, axis=1) < _REACH_M) & (height_m < centre[2] / 2)
@@ -356,7 +381,7 @@ class Surface:
             raise ValueError("not a ground: numbers are missing") from None
         places, none = len(station), np.zeros((0, 2))
         shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
-        expected = ((places, 2), (places, 2), (places,), (2,), (_HINGES + along * _ACROSS,))
+        expected = ((places, 2), (places, 2), (places,), (2,), (_SHAPE + along * _ACROSS,))
         numbers = np.array([begin_m, step_m, datum_m])
         arrays = (numbers, points, ahead, sense, station, ends, parameters)
         is_sound = shapes == expected and places and all(np.isfinite(one).all() for one in arrays)
@@ -406,10 +431,10 @@ class Surface:
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score
-        usual, whole = np.full(3, np.log(_CURVATURE)), information + known
+        usual, whole, bends = np.full(3, np.log(_CURVATURE)), information + known, self._bends()
 
         def cost(sizes: FloatArray) -> float:
-            prior = self._smoothness(sizes)
+            prior = self._smoothness(bends, sizes)
             try:
                 lower, own = (cholesky(one, lower=True) for one in (whole + prior, prior))
             except np.linalg.LinAlgError:  # so even that rounding leaves nothing of the ridge
@@ -420,23 +445,48 @@ class Surface:
 
         search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
         best = minimize(cost, usual, method="Nelder-Mead", options=search).x
-        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(best)), dtype=np.float64)
+        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(bends, best)), dtype=np.float64)
         parameters = covariance @ towards
         moved = parameters - self.parameters
         gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
         found = replace(self, parameters=parameters, covariance=covariance, datum_m=datum_m)
         return found, float(gain)
 
-    def _smoothness(self, sizes: FloatArray) -> FloatArray:
-        """The prior's information (B, B), by the logarithms of the sizes (3,) of second differences."""
-        _, step_m, along = self.knots
-        ways = [[np.eye(n), np.diff(np.eye(n), axis=0) / h, np.diff(np.eye(n), 2, axis=0) / h**2]
-                for n, h in ((along, step_m), (_ACROSS, _ACROSS_M))]  # fmt: skip
-        grams = [[one.T @ one for one in way] for way in ways]
-        spline = np.eye(along * _ACROSS) / _RIDGE_M**2
-        for size, order in zip(np.exp(-2 * sizes).tolist(), (2, 1, 0), strict=True):
-            spline += size * np.kron(grams[0][order], grams[1][2 - order])
-        return np.asarray(block_diag(_SLOPE_SIGMA**-2 * np.eye(_HINGES), spline))
+    def _bends(self) -> list[FloatArray]:
+        """J'J (B, B) of second derivatives along, along and across, and across, at the spline's nodes.
+
+        They are those by the map's directions, so that no plane bends, not even beside a bend of the path:
+        there (1 - kappa d) ds is the way on the map.
+        """
+        begin_m, step_m, count = self.knots
+        (value, slope, bend), (value_across, slope_across, bend_across) = (
+            [diags_array(weights, offsets=[0, 1, 2], shape=(n - 2, n))
+             for weights in ([1 / 6, 2 / 3, 1 / 6], [-0.5 / h, 0.0, 0.5 / h], [h**-2, -2 * h**-2, h**-2])]
+            for n, h in ((count, step_m), (_ACROSS, _ACROSS_M))
+        )  # fmt: skip
+        station = begin_m + step_m * np.arange(count - 2, dtype=np.float64)
+        (_, before, sense), (_, behind, _) = (
+            self.paths.at(station + way) for way in (-step_m / 2, step_m / 2)
+        )
+        turned = sense * np.arctan2(cross(before, behind), np.einsum("ni,ni->n", before, behind)) / step_m
+        left_m = -_SIDE_M + _ACROSS_M * np.arange(_ACROSS - 2)
+        kappa, rate = (np.repeat(one, len(left_m)) for one in (turned, np.gradient(turned, step_m)))
+        left_m = np.tile(left_m, len(station))
+        way = np.maximum(1.0 - kappa * left_m, _TIGHTEST)
+        ahead = diags_array(1 / way) @ kron(slope, value_across)
+        along = kron(bend, value_across) + diags_array(rate * left_m) @ ahead
+        along = diags_array(way**-2) @ (along - diags_array(kappa * way) @ kron(value, slope_across))
+        mixed = diags_array(1 / way) @ (kron(slope, slope_across) + diags_array(kappa) @ ahead)
+        rows = along, mixed, kron(value, bend_across)
+        return [np.asarray((one.T @ one).toarray()) for one in rows]
+
+    def _smoothness(self, bends: Sequence[FloatArray], sizes: FloatArray) -> FloatArray:
+        """The prior's information (B, B), by the logarithms of the sizes (3,) of second derivatives."""
+        spline = np.eye(len(bends[0])) / _RIDGE_M**2
+        for size, own in zip(np.exp(-2 * sizes).tolist(), bends, strict=True):
+            spline += size * own
+        slopes = np.repeat([_GRADE_SIGMA, _SLOPE_SIGMA], [_GRADES, _HINGES])
+        return np.asarray(block_diag(np.diag(slopes**-2), spline))
 
     def _recorded(self, recorded: Recorded) -> tuple[FloatArray, FloatArray, float]:
         """Information (B, B) of what was recorded on the path, that times its values, and the mean height."""
