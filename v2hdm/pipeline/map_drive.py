@@ -141,7 +141,7 @@ def _mapped(
         with context.timed("wear"):
             sets = _with_wear(sets, checked.drive, earlier, context)
     except (MappingError, AdjustError) as failure:
-        if not checked.has_failed:
+        if all(one.status is not Status.FAIL for one in checked.findings):
             raise
         failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
         verdict = Verdict.of([*checked.findings, failed])

@@ -23,7 +23,7 @@ from v2hdm.records import Calibration, FloatArray, Marking
 from v2hdm.report.check_points import CheckTable, squared
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
-from v2hdm.verdict.results.solution import doubted, name_of_input, relied_on
+from v2hdm.verdict.results.solution import CHECKS, doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
 _AHEAD_M = 10.0  # within which a vehicle uses what it sees on the ground
@@ -65,7 +65,7 @@ def _conditions(evidence: SolveEvidence) -> str:
     """The inputs that absolute accuracy rests on: one that may be wrong, or those that no image shows."""
     doubtful, relied = doubted(evidence), relied_on(evidence)
     if doubtful is not None:
-        return f" (unless the {name_of_input(doubtful)} is off, as it may be)"
+        return f" (unless the {CHECKS[doubtful.fault][0]} is off, as it may be)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
 
 
