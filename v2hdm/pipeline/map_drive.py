@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
@@ -222,12 +223,5 @@ def _judge(
     if compared is not None:
         figures["check_points"] = compared.figures()
         headlines.append(compared.headline)
-    return replace(
-        result,
-        verdict=verdict,
-        figures=figures,
-        headlines=headlines,
-        detections=tuple(detections),
-        methods=methods,
-        check_points=compared,
-    )
+    judged: dict[str, Any] = {"verdict": verdict, "figures": figures, "headlines": headlines}
+    return replace(result, **judged, detections=tuple(detections), methods=methods, check_points=compared)

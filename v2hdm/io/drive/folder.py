@@ -29,17 +29,10 @@ _DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "t
 _CAMERA_KEYS = (
     ("camera_info", "images"),
     (
-        "mounting",
-        "cam_from_vehicle",
-        "ipm",
-        "initial_ipm",
-        "roi_vehicle",
-        "centre_prior",
-        "linear_response",
-        "mask",
-        "read_out_s",
+        "mounting", "cam_from_vehicle", "ipm", "initial_ipm", "roi_vehicle", "centre_prior",
+        "linear_response", "mask", "read_out_s",
     ),
-)
+)  # fmt: skip
 
 
 def is_folder_drive(path: Path) -> bool:

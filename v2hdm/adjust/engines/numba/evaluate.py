@@ -81,13 +81,10 @@ def _carry(
         x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
             j, t = k - layout.begin[first], layout.pair[k]
-            fx, fy, fz = _oppose(
-                known,
-                j,
-                base.table[t, 0] * x + base.table[t, 1] * y,
-                base.table[t, 4] * x + base.table[t, 5] * y,
-                base.table[t, 8] * x + base.table[t, 9] * y,
-            )
+            mx = base.table[t, 0] * x + base.table[t, 1] * y
+            my = base.table[t, 4] * x + base.table[t, 5] * y
+            mz = base.table[t, 8] * x + base.table[t, 9] * y
+            fx, fy, fz = _oppose(known, j, mx, my, mz)
             add_force(out.coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
 
 
@@ -128,14 +125,10 @@ def _pushed(
     for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
         j, t = k - layout.begin[first], layout.pair[k]
         _recall(layout, base, k, c, known, j)
-        fx, fy, fz = _oppose(
-            known,
-            j,
-            motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1],
-            motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2],
-            motion[t, 2] + motion[t, 3] * known[j, 1] - motion[t, 4] * known[j, 0],
-        )
-        ax, ay = along_axes(base.table, t, fx, fy, fz)
+        mx = motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1]
+        my = motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2]
+        mz = motion[t, 2] + motion[t, 3] * known[j, 1] - motion[t, 4] * known[j, 0]
+        ax, ay = along_axes(base.table, t, *_oppose(known, j, mx, my, mz))
         sx += ax
         sy += ay
     return sx, sy
