@@ -31,7 +31,8 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
     route = np.column_stack([np.linspace(0, 25, 26), np.zeros(26)]).tolist()
     true = diamonds(TRUE, (Lane(LANE_LINE, np.array([[0.0, 1.0], [20.0, 1.0]]), 1),))
     return {
-        "port": port, "seed": seed, "started_from": started_from, "route": route, "failures": [],
+        "title": port if seed is None else f"{port} seed {seed}", "port": port, "seed": seed,
+        "started_from": started_from, "route": route, "failures": [],
         "truth": Truth(true, {}, np.empty((0, 4, 4)), np.empty((0, len(TRUE))), (), {}),
         "maps": maps,
         "expected": {name: [True] * 5 for name in maps},

@@ -214,14 +214,8 @@ class Arrays:
         count = bounds[1] - bounds[0]
         corner = torch.repeat_interleave(count)
         rows = torch.arange(len(corner), device=corner.device) + (bounds[1] - count.cumsum(0))[corner]
-        return Run(
-            slice(0, len(rows)),
-            slice(0, len(corners)),
-            self.pair[rows].long(),
-            corner,
-            self.measured[:, rows],
-            self.root_information[:, rows],
-        )
+        seen = self.pair[rows].long(), corner, self.measured[:, rows], self.root_information[:, rows]
+        return Run(slice(0, len(rows)), slice(0, len(corners)), *seen)
 
     def whole(self) -> Run:
         """Everything as one run."""

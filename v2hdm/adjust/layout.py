@@ -110,14 +110,8 @@ def make_arrays(
     rank[corner_order] = np.arange(len(corner_order))
     order, corner, pair, measured, root = _sorted_observations(problem, rank)
     states, transition, information_root = state_prior(problem, pose_states)
-    # Without a survey the information is 0.
-    centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
-    if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
-        centre, centre_root = problem.centre_vehicle, 1 / problem.centre_sigma_m
-    control, control_root = np.zeros((problem.corner_count, 2)), np.zeros((problem.corner_count, 3))
-    if problem.control is not None:
-        control[problem.control.corner] = problem.control.points_map
-        control_root[problem.control.corner] = problem.control.root_information
+    centre, centre_root, control, control_root = _surveys(problem)
+    known = _lengths(problem, rank)
     clock_twist, sigma_s = _clock_twist(problem, clock_offset)
     moments: IntArray | None = None
     motion: FloatArray | None = None
@@ -130,8 +124,6 @@ def make_arrays(
         if read_out:
             clock_twist = np.concatenate([clock_twist, twist[..., None]], axis=2)
             sigma_s = [*sigma_s, problem.read_out_sigma_s]
-    none = np.zeros(0)
-    known = problem.lengths or KnownLengths(none.astype(np.int64), none.astype(np.int64), none, none)
     return Arrays(
         order=index(order),
         corner_order=index(corner_order),
@@ -151,12 +143,29 @@ def make_arrays(
         clock_information_root=1 / real(np.array(sigma_s, dtype=np.float64)),
         control=real(control[corner_order]),
         control_root=real(control_root[corner_order]),
-        lengths=Lengths(
-            index(rank[known.first]), index(rank[known.second]), real(known.length_m), real(1 / known.sigma_m)
-        ),
+        lengths=Lengths(*map(index, known[:2]), *map(real, known[2:])),
         frame_of_moment=None if moments is None else index(moments),
         read_out=None if motion is None else real(motion),
     )
+
+
+def _surveys(problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Surveyed centres (C, 3) and corners (N, 2), each with its root information, 0 without a survey."""
+    centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
+    if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
+        centre, centre_root = problem.centre_vehicle, 1 / problem.centre_sigma_m
+    control, control_root = np.zeros((problem.corner_count, 2)), np.zeros((problem.corner_count, 3))
+    if problem.control is not None:
+        control[problem.control.corner] = problem.control.points_map
+        control_root[problem.control.corner] = problem.control.root_information
+    return centre, centre_root, control, control_root
+
+
+def _lengths(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
+    """Known lengths: the ranks of their first and second corners, the lengths, m, and root information."""
+    none = np.zeros(0)
+    known = problem.lengths or KnownLengths(none.astype(np.int64), none.astype(np.int64), none, none)
+    return rank[known.first], rank[known.second], known.length_m, 1 / known.sigma_m
 
 
 def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:

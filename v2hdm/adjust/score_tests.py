@@ -160,13 +160,8 @@ class _Answer:
         efficient = solved.flat(solved.efficient(column))
         information = solved.by_stretch(efficient, efficient)
         own = sum(float(row.square().sum()) for row in column.values())
-        return cls(
-            hypothesis,
-            -solved.by_stretch(efficient, solved.flat(solved.residuals)),
-            information,
-            solved.by_stretch(efficient, solved.noise).T,
-            own,
-        )
+        score = -solved.by_stretch(efficient, solved.flat(solved.residuals))
+        return cls(hypothesis, score, information, solved.by_stretch(efficient, solved.noise).T, own)
 
     @property
     def is_observable(self) -> bool:

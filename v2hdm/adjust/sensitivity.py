@@ -61,15 +61,12 @@ class Sensitivity:
     def noise(self) -> FloatArray:
         """Residuals (R, D) that noise as the model has it would leave, drawn."""
         generator = torch.Generator().manual_seed(0)
-        drawn = [
-            self.efficient(
-                {
-                    name: torch.randn(row.shape, generator=generator, dtype=row.dtype).to(row.device)
-                    for name, row in self.residuals.items()
-                }
-            )
-            for _ in range(_DRAWS)
-        ]
+
+        def like(row: Tensor) -> Tensor:
+            return torch.randn(row.shape, generator=generator, dtype=row.dtype).to(row.device)
+
+        residuals = self.residuals.items()
+        drawn = [self.efficient({name: like(row) for name, row in residuals}) for _ in range(_DRAWS)]
         return np.stack([self.flat(one) for one in drawn], axis=1)
 
     @property

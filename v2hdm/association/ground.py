@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, Sightings, Symbols, frames_of
 from v2hdm.geometry.ipm import (
     apply_homography,
-    direction_covariance,
     flat_motion,
     ground_from_pinhole_px,
     project_ground,
@@ -46,10 +45,6 @@ class Located:
     def range_m(self) -> FloatArray:
         """Horizontal distance (S, 4) of each corner from its camera."""
         return np.asarray(np.linalg.norm(self.ray_map, axis=-1))
-
-    def direction_covariance_m2(self, sigma_rad: float) -> FloatArray:
-        """The part (S, 4, 2, 2) of ``covariance_m2`` due to an uncertain viewing direction."""
-        return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)
 
 
 def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import Located
 from v2hdm.association.sightings import Rig, Sightings
-from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.ipm import direction_covariance, project_ground
 from v2hdm.geometry.planar import SHIFTS, align, diameters
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -115,7 +115,8 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     grouped = (association.group >= 0)[:, None]
     informs = association.in_group_order(located.informs) & grouped
     point = association.in_group_order(located.valid) & grouped
-    noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
+    noise = located.covariance_m2
+    noise = noise + direction_covariance(located.ray_map, located.height_m[:, None], jitter_rad)
     on_line = known_elsewhere(association, located.valid, located.informs)
     noise[on_line] = line_only(noise[on_line], _OPEN_END_M)
     covariance = association.in_group_order(noise) + _CORNER_FLOOR_M**2 * np.eye(2)

@@ -83,11 +83,6 @@ class Seen:
         """N."""
         return len(self.points_px)
 
-    @property
-    def log_anywhere(self) -> float:
-        """Log density of the pixel of a wrong point."""
-        return -float(np.log(self.info.width * self.info.height))
-
     def covariance(self, cam_from_vehicle: FloatArray) -> FloatArray:
         """V (..., N, 2, 2), px^2, under mountings (..., 4, 4)."""
         pinhole_from_ground = pinhole_px_from_ground(self.info.intrinsic, cam_from_vehicle)
@@ -134,7 +129,8 @@ class Seen:
         q = np.asarray(factor)[..., None]
         log_right = -square / (2 * q) - np.log(2 * np.pi * q * np.sqrt(np.linalg.det(covariance)))
         right = np.log1p(-_WRONG_SHARE) + log_right
-        total = np.logaddexp(right, np.log(_WRONG_SHARE) + self.log_anywhere)
+        log_anywhere = -float(np.log(self.info.width * self.info.height))
+        total = np.logaddexp(right, np.log(_WRONG_SHARE) + log_anywhere)
         return total, np.asarray(np.exp(right - total))
 
     def log_posterior(

@@ -16,17 +16,9 @@ def check(arguments: Sequence[str]) -> int:
     add_drive(parser, "check")
     parser.add_argument("--no-ground", dest="ground", action="store_false", help="match no ground: faster")
     parser.add_argument("--list-topics", action="store_true", help="only list a bag's topics and drive.yaml")
-    parser.add_argument(
-        "--write", type=Path, metavar="DIR", help="write a bag's, video's or image folder's drive.yaml"
-    )
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=VALUE",
-        help="with --write: what it asks for",
-    )
+    written, wanted = "write a bag's, video's or image folder's drive.yaml", "with --write: what it asks for"
+    parser.add_argument("--write", type=Path, metavar="DIR", help=written)
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=wanted)
     parser.add_argument("--all", action="store_true", help="also print the checks that passed")
     parsed = parser.parse_args(arguments)
     if parsed.list_topics:

@@ -32,16 +32,10 @@ def run(arguments: Sequence[str]) -> None:
         "of a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated",
     )
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder of files (default: that of MAP)")
-    parser.add_argument(
-        "--projector",
-        metavar="NAME",
-        help="of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)",
-    )
-    parser.add_argument(
-        "--crs",
-        metavar="NAME",
-        help="system of a map's coordinates, such as EPSG:25832, or local for the drive's own frame",
-    )
+    ways = "of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)"
+    parser.add_argument("--projector", metavar="NAME", help=ways)
+    system = "system of a map's coordinates, such as EPSG:25832, or local for the drive's own frame"
+    parser.add_argument("--crs", metavar="NAME", help=system)
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
     from v2hdm.store.results import listed_files

@@ -15,12 +15,8 @@ def report(arguments: Sequence[str]) -> None:
     parser = parser_of("report")
     parser.add_argument("folder", type=Path, help="result folder of v2hdm map")
     parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
-    parser.add_argument(
-        "--background",
-        type=Path,
-        metavar="PATH",
-        help="under the map: a GeoTIFF, such as an aerial picture, or a folder of XYZ tiles",
-    )
+    under = "under the map: a GeoTIFF, such as an aerial picture, or a folder of XYZ tiles"
+    parser.add_argument("--background", type=Path, metavar="PATH", help=under)
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
     from v2hdm.report.page.document import write_page

@@ -34,16 +34,9 @@ from v2hdm.geometry.planar import Quad, cross
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, BoolArray, FloatArray, MarkingDetection
 
 CLAIMED = (
-    "odds_inside",
-    "surest_inside",
-    "paint_beside",
-    "certainty",
-    "share",
-    "size_share",
-    "line_share",
-    "symbol_share",
-    "touches_symbol",
-)
+    "odds_inside", "surest_inside", "paint_beside", "certainty", "share", "size_share", "line_share",
+    "symbol_share", "touches_symbol",
+)  # fmt: skip
 """The features that are claims of the network.
 
 Log odds of paint inside, their mean and ninth decile, and their mean beside the side where they are highest;

@@ -61,6 +61,7 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
     """The record of a drive before it is mapped."""
     sets = camera_sets(drive)
     return {
+        "title": job.title,
         "port": job.port,
         "seed": job.seed,
         "started_from": " and ".join(sorted({camera.initial_ipm for camera in drive.cameras.values()})),
@@ -114,17 +115,13 @@ class Matched:
 class Measured:
     """The figures of one drive: by camera set, then by row."""
 
+    title: str
     port: str
     seed: int | None
     started_from: str
     rows: Mapping[str, Mapping[str, Row]]
     matched: Mapping[str, Mapping[str, Matched]]
     failures: tuple[tuple[str, str, str], ...]
-
-    @property
-    def title(self) -> str:
-        """The drive in words."""
-        return self.port if self.seed is None else f"{self.port} seed {self.seed}"
 
 
 def measure(record: Mapping[str, Any]) -> Measured:
@@ -142,8 +139,8 @@ def measure(record: Mapping[str, Any]) -> Measured:
         rows[cameras] = {row: _row(maps[row], truth, expected, found[row], shared) for row in maps}
         matched[cameras] = found
     failures = tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"])
-    port, seed, started_from = (record[name] for name in ("port", "seed", "started_from"))
-    return Measured(port, seed, started_from, rows, matched, failures)
+    title, port, seed, started_from = (record[name] for name in ("title", "port", "seed", "started_from"))
+    return Measured(title, port, seed, started_from, rows, matched, failures)
 
 
 def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:

@@ -14,7 +14,7 @@ from rich.console import Console
 from v2hdm.errors import ConfigError, WorkerError
 from v2hdm.experiment.drive import Measured, drive_record, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
-from v2hdm.experiment.summary import claims, save_figures, write_tables, write_words
+from v2hdm.experiment.summary import claims, filled, save_figures, words, write_tables
 from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.files import replace_text
@@ -38,7 +38,8 @@ def run_experiment(
             drawing = partial(progress, "figures", "draw")
             captions = save_figures(folder, records, measured, drawing)
             write_tables(folder, measured)
-            write_words(folder, measured, captions, config)
+            replace_text(folder / "experiment.md", words(measured, config))
+            replace_text(folder / "figures.md", filled("figures.md", captions=captions))
     except OSError as failure:
         raise ConfigError(f"{folder}: cannot be written ({failure.strerror}); set output=") from failure
     return folder, measured

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{mean} +- {np.std(known, ddof=1):.{max(digits, 1)}f}" if len(known) > 1 else mean
 
 
-_RATIOS = (
+_RATIOS: tuple[tuple[str, str, str, str, float, str | None], ...] = (
     ("the optimisation is as good as a manual calibration", "Opt", "CNI", "<=", 1.1, "calibrated"),
     ("it repairs a borrowed calibration", "ENI", "Opt", ">=", 10.0, "estimated"),
     ("its IPM serves as well as the manual one", "ONI", "CNI", "<=", 1.2, None),
@@ -131,10 +132,17 @@ def claims(measured: Sequence[Measured]) -> list[Claim]:
     found = []
     for port, drives in by_port(measured).items():
         started = drives[0].started_from
-        for cameras in drives[0].rows:
-            for text, above, below, sign, limit, needed in _RATIOS:
-                if needed in (None, started):
-                    found.append(_claim(text, port, drives, cameras, (above, below), sign, limit))
+        tested = [ratio[:5] for ratio in _RATIOS if ratio[5] in (None, started)]
+        for cameras, (text, above, below, sign, limit) in product(drives[0].rows, tested):
+            pairs = [(row[above], row[below]) for row in _common(drives, cameras, (above, below))]
+            values = _known(one.rmse_m / other.rmse_m for one, other in pairs)
+            shared = _known(one.shared_rmse_m / other.shared_rmse_m for one, other in pairs)
+            mean = float(np.mean(values)) if values else float("nan")
+            holds = mean <= limit if sign == "<=" else mean >= limit
+            where = f"{port}, {cameras}"
+            found.append(
+                Claim(f"{text}: {above} / {below}", where, f"{sign} {limit:g}", values, holds, shared)
+            )
         found += _more_with_more(port, drives)
     return [claim for claim in found if claim.values]
 
@@ -153,42 +161,12 @@ def _more_with_more(port: str, drives: Sequence[Measured]) -> list[Claim]:
     return [Claim(text, f"{port}, {sets[-1]}", "> 1", tuple(values), bool(values and np.mean(values) > 1))]
 
 
-def _claim(
-    text: str,
-    port: str,
-    drives: Sequence[Measured],
-    cameras: str,
-    methods: tuple[str, str],
-    sign: str,
-    limit: float,
-) -> Claim:
-    """The ratio of two methods' corner RMSE, which is to be at least or at most some value."""
-    pairs = [(row[methods[0]], row[methods[1]]) for row in _common(drives, cameras, methods)]
-    values = _known(above.rmse_m / below.rmse_m for above, below in pairs)
-    shared = _known(above.shared_rmse_m / below.shared_rmse_m for above, below in pairs)
-    mean = float(np.mean(values)) if values else float("nan")
-    holds = mean <= limit if sign == "<=" else mean >= limit
-    title = f"{text}: {' / '.join(methods)}"
-    return Claim(title, f"{port}, {cameras}", f"{sign} {limit:g}", values, holds, shared)
-
-
-def write_words(
-    folder: Path,
-    measured: Sequence[Measured],
-    captions: Mapping[str, tuple[str, Mapping[str, Any]]],
-    config: ExperimentConfig,
-) -> None:
-    """Write ``experiment.md``, the text, and ``figures.md``, the figures with their captions."""
-    replace_text(folder / "experiment.md", words(measured, config))
-    replace_text(folder / "figures.md", _filled("figures.md", captions=captions))
-
-
 def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
     """The text in Markdown."""
     tested = claims(measured)
     holds = ("**no**", "yes")
     lines = [[c.text, c.where, c.limit, c.figure, _with_range(c.shared), holds[c.holds]] for c in tested]
-    return _filled(
+    return filled(
         "experiment.md",
         config=config,
         version=__version__,
@@ -202,7 +180,8 @@ def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
     )
 
 
-def _filled(template: str, **values: Any) -> str:
+def filled(template: str, **values: Any) -> str:
+    """The text of a template of this package."""
     loader = jinja2.PackageLoader("v2hdm.experiment")
     found = jinja2.Environment(
         loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True

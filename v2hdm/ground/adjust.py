@@ -338,12 +338,3 @@ def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
     u, v = (2 * px / [mount.info.width, mount.info.height] - 1).T
     terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
     return np.concatenate([by_px[:, :, k, None] * terms[:, None] for k in (0, 1)], axis=2)
-
-
-def tangent_covariance(mount: Mount, covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of the left tangent of ``cam_from_vehicle`` from that of turn and centre."""
-    turn = -mount.vehicle_from_cam_rotation.T
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, CENTRE] = turn
-    jacobian[3:, TURN] = turn
-    return np.asarray(jacobian @ covariance[:6, :6] @ jacobian.T)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from v2hdm.ground.adjust import CENTRE, Adjusted, adjust, tangent_covariance
+from v2hdm.ground.adjust import CENTRE, Adjusted, adjust
 from v2hdm.ground.model import Mount, guessed_mount
-from v2hdm.ground.motion import Motion, changing_pairs, motion_of, spread_pairs
+from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
 from v2hdm.ground.prior import Observations, Stated, state_sigmas
 from v2hdm.ground.results import (
@@ -132,7 +132,7 @@ def _solve(
     pairs = spread_pairs(path_m, options.pairs, *_APART_M)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
     if free is not None:
-        moves = stated.motion.moves_ground_mps()
+        moves = stated.motion.velocity_at_images() * [1.0, 1.0, ARM_M]  # of the ground in view, m/s
         pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, *_CLOCK_APART_M)])
     poses = stated.poses()
     for stage in stages:
@@ -164,7 +164,9 @@ def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> G
     # Ground that is no plane is tilted and lifted for all pairs alike.
     tilt, pitch = _FLATNESS_M / (2 * STRIP_M), _FLATNESS_M / (2 * _APART_M[1])
     flatness = np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
-    covariance = tangent_covariance(mount, factor * adjusted.covariance[:6, :6] + flatness)
+    # The left tangent of ``cam_from_vehicle``, shift and turn, by turn and centre in vehicle axes.
+    by_own = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
+    covariance = by_own @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_own.T
     return replace(
         nothing,
         status=GroundStatus.FOUND,

@@ -16,7 +16,7 @@ _SMOOTHING_S = 0.5
 _STANDING_MPS = 0.3  # below this a path has no direction: receivers wander by centimetres
 _PATH_STEP_M = 0.5
 _BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
-_ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
+ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,6 @@ class Motion:
     def path_at_images(self, clock_s: float = 0.0) -> FloatArray:
         """Distance driven (I,) at the images."""
         return np.interp(self.stamp_s + clock_s, self.trajectory.stamp_s, self.path_m)
-
-    def moves_ground_mps(self) -> FloatArray:
-        """How fast (I, 3) the ground in view moves by each of the velocities at the images."""
-        return self.velocity_at_images() * [1.0, 1.0, _ARM_M]
 
     def velocity_at_images(self, clock_s: float = 0.0) -> FloatArray:
         """Smoothed velocity (I, 3) at the images."""

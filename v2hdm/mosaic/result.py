@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,33 +65,30 @@ def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:
     return Canvas(corner, _CELL_M, rows, columns, (float(right[0]), float(right[1])))
 
 
-class Panel(NamedTuple):
-    """One of the pictures that are compared."""
-
-    title: str
-    shots: Sequence[Shot]
-
-
 def save_comparison(
-    path: Path, map_from_vehicle: FloatArray, panels: Sequence[Panel], lenses: Mapping[str, Lens], device: str
+    path: Path,
+    map_from_vehicle: FloatArray,
+    panels: Mapping[str, Sequence[Shot]],
+    lenses: Mapping[str, Lens],
+    device: str,
 ) -> None:
-    """Draw the ground about a pose (4, 4) as several sets of shots show it, side by side, as PNG."""
+    """Draw the ground about a pose (4, 4) as several sets of shots, by title, show it, side by side."""
     canvas = close_up_canvas(map_from_vehicle)
-    pictures = [whole(canvas, panel.shots, lenses, device) for panel in panels]
+    pictures = [whole(canvas, shots, lenses, device) for shots in panels.values()]
     last = pictures[-1]
     grey = cv2.cvtColor(np.ascontiguousarray(last[..., :3]), cv2.COLOR_RGB2GRAY)[last[..., 3] > 0]
     low, high = np.percentile(grey, (0.2, 99.8)) if grey.size else (0.0, 255.0)
     height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.8
     with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
         every = np.atleast_1d(fig.subplots(1, len(panels)))
-        for axes, panel, rgba in zip(every, panels, pictures, strict=True):
+        for axes, title, rgba in zip(every, panels, pictures, strict=True):
             bgr = rgba[..., :3].astype(np.float32)
             stretched = np.clip((bgr - 0.5 * low) / (max(high, low + 1) - 0.5 * low), 0, 1)
             seen = rgba[..., 3:].astype(np.float32) / 255  # white where nothing was seen
             axes.imshow(
                 1 - seen * (1 - stretched), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased"
             )
-            axes.set(title=panel.title, xticks=[], yticks=[])
+            axes.set(title=title, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
             axes.plot([0.4, 0.4 + _BAR_M], [0.4, 0.4], color="white", lw=3, solid_capstyle="butt")
             axes.text(0.4 + _BAR_M / 2, 0.52, f"{_BAR_M:g} m", color="white", ha="center", va="bottom")
@@ -230,10 +227,10 @@ def write_mosaic(
         "geotiff_resolution_m": resolution_m,
         "crs": crs_of(drive.origin),
     }
-    panels = [
-        Panel("before: initial calibration, recorded poses", ground.before),
-        Panel("after: optimised calibration, adjusted poses", ground.after),
-    ]
+    panels = {
+        "before: initial calibration, recorded poses": ground.before,
+        "after: optimised calibration, adjusted poses": ground.after,
+    }
     save_comparison(folder / COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
     write_json(folder / EXTENT, content)
     return content

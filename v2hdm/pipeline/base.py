@@ -68,11 +68,7 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
 
 def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
     """Reads the grey values of a drive's images."""
-
-    def grey(image: Image) -> NDArray[np.float32]:
-        return read_grey(image, drive.cameras[image.camera])
-
-    return grey
+    return lambda image: read_grey(image, drive.cameras[image.camera])
 
 
 def changes_json(changes: Changes) -> dict[str, Any]:

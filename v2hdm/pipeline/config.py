@@ -150,11 +150,8 @@ _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
     (Within(0, 1), "simulate.exposure.", "exposure_s"),
     (Within(0, 1, open=True), "simulate.exposure.", "level"),
     (POSITIVE, "simulate.exposure.", "full_well_electrons"),
-    (
-        NOT_NEGATIVE,
-        "simulate.disturbance.",
-        "roll_pitch_deg heave_m rtk_white_m rtk_correlated_m heading_deg",
-    ),
+    (NOT_NEGATIVE, "simulate.disturbance.", "roll_pitch_deg heave_m heading_deg rtk_white_m"),
+    (NOT_NEGATIVE, "simulate.disturbance.", "rtk_correlated_m"),
     (NOT_NEGATIVE, "simulate.calibration.", "survey_sigma_m click_sigma_px centre_sigma_m"),
     (POSITIVE, "simulate.disturbance.", "jitter_correlation_s rtk_correlation_m heading_correlation_s"),
     (SHARE, "simulate.paint.", "wear dirt"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -107,7 +107,7 @@ def detect_images(
             options.max_range_m = _ROUGH_RANGE_M
         detector = Detector.load(options=options)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
-    rough = _Rough(detector, lens, path, mounting, linear=linear)
+    rough = _Rough(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
     return _found(frames, rough, stopwatch or Stopwatch())
@@ -130,24 +130,20 @@ def _lens(
     return None
 
 
+@dataclass
 class _Rough:
     """The detector for the images of a camera without a calibration, whose mounting they show."""
 
-    def __init__(
-        self,
-        detector: Detector,
-        lens: CameraInfo | None,
-        file: Path | None,
-        mounting: Sequence[float] | None,
-        *,
-        linear: bool,
-    ):
-        self.detector, self.lens = detector, lens
-        self._file, self._mounting, self._linear = file, mounting, linear
-        self._estimate: MountingEstimate | None = None
-        self._road: RoadDetector | None = None
-        self._shown, self._said = 0, False
-        self.folder: Sequence[Path] = ()
+    detector: Detector
+    lens: CameraInfo | None
+    file: Path | None
+    mounting: Sequence[float] | None
+    linear: bool
+    folder: Sequence[Path] = ()
+    _estimate: MountingEstimate | None = None
+    _road: RoadDetector | None = None
+    _shown: int = 0
+    _said: bool = False
 
     def road(self, frame: Frame) -> RoadDetector:
         """The detector for the next image; it says what the mounting is taken to be.
@@ -181,12 +177,12 @@ class _Rough:
         angles_deg = np.rad2deg([found.pitch_rad, found.fov_rad, found.roll_rad])
         rough = rough_calibration(info.name, info.width, info.height, found.height_m, *angles_deg.tolist())
         sigma = float(np.hypot(found.sigma_rad[0], BODY_SIGMA_RAD)), found.log_focal_sigma
-        camera = camera_from_calibration(replace(rough, info=info), self._linear, sigma)
+        camera = camera_from_calibration(replace(rough, info=info), self.linear, sigma)
         return RoadDetector(self.detector, camera)
 
     def _prior(self, columns: int, rows: int) -> tuple[CameraInfo, Mounting]:
         """The camera's lens, and what its mounting is taken to be before its first image."""
-        height_m, pitch_deg, fov_deg = self._mounting or ROUGH_MOUNTING
+        height_m, pitch_deg, fov_deg = self.mounting or ROUGH_MOUNTING
         if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
             raise ConfigError(
                 f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
@@ -195,16 +191,16 @@ class _Rough:
         lens = self.lens
         if lens is not None:
             fov_deg = float(2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsic[0, 0])))
-        sigma_deg = _UNKNOWN_PITCH_DEG if self._mounting is None else _STATED_PITCH_DEG
-        if self._mounting is None:
-            known = "no --camera" if lens is None else f"no mounting in {self._file}"
+        sigma_deg = _UNKNOWN_PITCH_DEG if self.mounting is None else _STATED_PITCH_DEG
+        if self.mounting is None:
+            known = "no --camera" if lens is None else f"no mounting in {self.file}"
             print(
                 f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide"
                 ", unless the images show another horizon (--mounting says otherwise); positions in px only",
                 file=sys.stderr,
             )
         pitch_rad, fov_rad, sigma_rad, roll_rad = np.deg2rad([pitch_deg, fov_deg, sigma_deg, _ROLL_DEG])
-        log_focal = _LOG_FOCAL if self._mounting is None and lens is None else 0.0
+        log_focal = _LOG_FOCAL if self.mounting is None and lens is None else 0.0
         prior = Mounting(height_m, pitch_rad, 0.0, fov_rad, (sigma_rad, roll_rad), log_focal)
         rough = rough_calibration("camera", columns, rows, height_m, pitch_deg, fov_deg)
         return lens or rough.info, prior

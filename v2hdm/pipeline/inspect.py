@@ -34,11 +34,6 @@ class Inspection:
         """The drive with corrected clocks, and its cameras as they were described."""
         return replace(self.drive, cameras=self.given)
 
-    @property
-    def has_failed(self) -> bool:
-        """Whether a check says that no right map can come of this drive."""
-        return any(finding.status is Status.FAIL for finding in self.findings)
-
 
 def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[int, int], None]) -> Inspection:
     """Check a drive and correct what can be corrected; ``max_gap_s`` bounds the gaps between poses."""

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
@@ -141,7 +142,7 @@ def _mapped(
         with context.timed("wear"):
             sets = _with_wear(sets, checked.drive, earlier, context)
     except (MappingError, AdjustError) as failure:
-        if not checked.has_failed:
+        if all(one.status is not Status.FAIL for one in checked.findings):
             raise
         failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
         verdict = Verdict.of([*checked.findings, failed])
@@ -222,12 +223,5 @@ def _judge(
     if compared is not None:
         figures["check_points"] = compared.figures()
         headlines.append(compared.headline)
-    return replace(
-        result,
-        verdict=verdict,
-        figures=figures,
-        headlines=headlines,
-        detections=tuple(detections),
-        methods=methods,
-        check_points=compared,
-    )
+    judged: dict[str, Any] = {"verdict": verdict, "figures": figures, "headlines": headlines}
+    return replace(result, **judged, detections=tuple(detections), methods=methods, check_points=compared)

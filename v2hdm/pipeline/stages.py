@@ -150,7 +150,8 @@ def map_camera_sets(
     todo = [
         (name, sets[name]) for name in sorted(sets, key=lambda name: -len(sets[name])) if name not in found
     ]
-    if len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and work.is_large:
+    is_large = sum(len(one.markings) for one in detections) > _WORTH_PROCESSES
+    if len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and is_large:
         for _, made in side_by_side(work, todo, context.processes, lambda *_: None):
             if isinstance(made, WorkerError):
                 raise made
@@ -175,11 +176,6 @@ class _Work:
     survey: Survey
     base: Base | None
     last: str
-
-    @property
-    def is_large(self) -> bool:
-        """Whether processes are worth their start."""
-        return sum(len(found.markings) for found in self.detections) > _WORTH_PROCESSES
 
     def __call__(self, job: _Job, _: Progress = silent) -> tuple[str, MappedSet, list[Line]]:
         """Map one set of cameras; returns its name, the result and what was logged."""

@@ -63,11 +63,6 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
             fig.savefig(partial, format="png")
 
 
-def set_image_axes(axes: Axes, left: float, right: float, bottom: float, top: float) -> None:
-    """Axes of an image, whose rows rise downwards."""
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)")
-
-
 def draw_arrows(
     axes: Axes, places: FloatArray, arrows: FloatArray, longest: float, span: float, **look: Any
 ) -> None:

@@ -87,14 +87,6 @@ def in_use(cache: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def use_until_exit(cache: Path) -> None:
-    """Protect what is used in a cache until this process ends, unless it does so already."""
-    if not _used[cache.resolve()]:
-        held = ExitStack()
-        held.enter_context(in_use(cache))
-        atexit.register(held.close)
-
-
 def unused_before(cache: Path) -> float:
     """The time, s since 1970, before which nothing was last used that a run in progress uses."""
     earliest = time.time()
@@ -123,7 +115,10 @@ _STALE_S = 3600.0  # a folder that nothing was written to for so long was left b
 
 def note_use(folder: Path) -> None:
     """Note that a folder and its cache are in use now, and list its files where that was never done."""
-    use_until_exit(folder.parent)
+    if not _used[folder.parent.resolve()]:
+        held = ExitStack()
+        held.enter_context(in_use(folder.parent))
+        atexit.register(held.close)
     with suppress(OSError):
         if (folder / LIST).is_file():
             os.utime(folder / LIST)

@@ -64,15 +64,9 @@ _EXTENSION_SIGMA = 0.03
 """Beyond its own points a line is drawn while it is known within this share of the image's width."""
 
 ALONE = (
-    "best_crossings",
-    "log_length_m",
-    "log_length_px",
-    "log_rows",
-    "along_road",
-    "paint_odds",
-    "paint_along",
+    "best_crossings", "log_length_m", "log_length_px", "log_rows", "along_road", "paint_odds", "paint_along",
     "dash_share",
-)
+)  # fmt: skip
 """Features of a line by itself: log odds of its three surest crossings; its length on the ground, in the
 image and down the image (upright things are as tall as they are long); the log ratio of its being along the
 road; the log odds of its surest paint; the mean log odds of paint along it, and the share of that which the

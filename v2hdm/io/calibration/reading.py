@@ -255,12 +255,8 @@ def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
 
 
 def roi_of_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
-    """The region of interest (4, 2) of a camera for which none is stated."""
-    return roi_ahead(inverse(extrinsic_from_ipm(info, ipm)))
-
-
-def roi_ahead(vehicle_from_cam: FloatArray) -> FloatArray:
-    """A rectangle (4, 2) on the ground in the direction in which a camera looks."""
+    """The region of interest (4, 2) of a camera for which none is stated: a rectangle where it looks."""
+    vehicle_from_cam = inverse(extrinsic_from_ipm(info, ipm))
     forward, down = vehicle_from_cam[:2, 2], vehicle_from_cam[:2, 1]
     # A camera that looks straight down has its image's top ahead.
     along = forward if np.linalg.norm(forward) > np.sqrt(1 - _STEEPEST_RAY**2) else -down

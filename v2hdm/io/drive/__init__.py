@@ -9,14 +9,14 @@ from typing import Any
 
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.rigid import with_clock_offsets
-from v2hdm.io.drive.folder import folder_drive_name, is_folder_drive, read_description, read_folder_drive
+from v2hdm.io.drive.folder import DRIVE_FILE, is_folder_drive, name_of, read_description, read_folder_drive
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.io.importers.bag.describe import describe_bag
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.records import Drive, Trajectory
-from v2hdm.store.files import load_json
+from v2hdm.store.files import load_json, load_yaml
 
 __all__ = [
     "READERS", "KittiOptions", "ReadOptions", "Trajectory", "drive_name", "join_drives",
@@ -76,7 +76,7 @@ def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> D
 def drive_name(path: Path) -> str:
     """The name of the drive at ``path``: that in its ``drive.yaml``, else its folder's."""
     if is_folder_drive(path):
-        return folder_drive_name(path)
+        return name_of(load_yaml(path / DRIVE_FILE, DriveError), path)
     return path.resolve().stem if is_bag(path) else path.resolve().name
 
 

@@ -29,17 +29,10 @@ _DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "t
 _CAMERA_KEYS = (
     ("camera_info", "images"),
     (
-        "mounting",
-        "cam_from_vehicle",
-        "ipm",
-        "initial_ipm",
-        "roi_vehicle",
-        "centre_prior",
-        "linear_response",
-        "mask",
-        "read_out_s",
+        "mounting", "cam_from_vehicle", "ipm", "initial_ipm", "roi_vehicle", "centre_prior",
+        "linear_response", "mask", "read_out_s",
     ),
-)
+)  # fmt: skip
 
 
 def is_folder_drive(path: Path) -> bool:
@@ -96,17 +89,13 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         truth = path / take_text(content["truth"], f"{where}: truth", DriveError)
         if not truth.is_dir():
             raise DriveError(f"{where}: truth: no such folder {truth}; restore it or drop the key")
-    name = _name(content, path)
+    name = name_of(content, path)
     drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=recorded.trajectory)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
-def folder_drive_name(path: Path) -> str:
-    """The name that the drive at ``path`` gives itself."""
-    return _name(load_yaml(path / DRIVE_FILE, DriveError), path)
-
-
-def _name(content: dict[str, Any], path: Path) -> str:
+def name_of(content: dict[str, Any], path: Path) -> str:
+    """The name that the ``content`` of a ``drive.yaml`` at ``path`` gives the drive, else its folder's."""
     return take_name(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
 
 

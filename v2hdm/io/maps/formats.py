@@ -226,7 +226,6 @@ def write_map(
         if chosen == "geojson" and hd_map.origin is None and crs is None:
             _log.warning(
                 "%s: the drive has no origin on the earth, so its coordinates are metres, which a GIS opens "
-                "as degrees; the format gpkg says what they are",
-                path.name,
-            )
+                "as degrees; the format gpkg says what they are", path.name,
+            )  # fmt: skip
     return written

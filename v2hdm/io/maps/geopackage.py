@@ -244,14 +244,8 @@ def _layer(
 ) -> ET.Element:
     """Add a layer below those that are there."""
     identity = f"v2hdm_layer_{name}"  # QGIS gives those of ten letters and fewer another
-    entry = {
-        "id": identity,
-        "name": name,
-        "source": source,
-        "providerKey": provider,
-        "checked": "Qt::Checked",
-    }
-    ET.SubElement(tree, "layer-tree-layer", entry | {"expanded": "1"})
+    entry = {"id": identity, "name": name, "source": source, "providerKey": provider}
+    ET.SubElement(tree, "layer-tree-layer", entry | {"checked": "Qt::Checked", "expanded": "1"})
     element = ET.SubElement(layers, "maplayer", dict(kind))
     for tag, text in (("id", identity), ("datasource", source), ("layername", name), ("provider", provider)):
         ET.SubElement(element, tag).text = text

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from v2hdm.records import FloatArray, HdMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
 from v2hdm.report.page.layers import SIGMAS_95
-from v2hdm.report.style import OKABE_ITO, RC, draw_arrows, set_image_axes
+from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
 INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
 """Colours of text, axes, grid and background: those that ``page.css`` replaces by its theme's."""
@@ -161,8 +161,9 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
             # The longest arrow spans one and a half cells.
             span, colour = 1.5 * width_px / CELLS[1], OKABE_ITO[_ORDER[number % len(_ORDER)]]
             draw_arrows(axes, *fields[number], longest, span, color=colour, width=0.005, headwidth=3.6)
-            set_image_axes(axes, 0, width_px, height_px, 0)
-            axes.set_aspect("equal")
+            axes.set(
+                xlim=(0, width_px), ylim=(height_px, 0), xlabel="u (px)", ylabel="v (px)", aspect="equal"
+            )
             axes.set_title(name, pad=14)  # room for the key of the arrows, which the layout overlooks
             for side in ("top", "right"):
                 axes.spines[side].set_visible(True)

@@ -87,13 +87,7 @@ def _ellipses(facts: Facts) -> str:
 
 
 FILE = "report.html"  # name of the page in a result folder
-_ASSETS = {
-    "leaflet.js": "vendor",
-    "leaflet.css": "vendor",
-    "page.css": "templates",
-    "map.js": "templates",
-    "edit.js": "templates",
-}
+_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
 """Scripts and styles that stand in the page as they are, by the folder that holds them."""
 
 
@@ -132,7 +126,11 @@ def page_text(
         page.map_data["background"] = kept if background is None else background_layer(background, facts)
     return environment.get_template("page.html").render(
         page=page,
-        assets={name: (here / where / name).read_text(encoding="utf-8") for name, where in _ASSETS.items()},
+        assets={
+            name: (here / where / name).read_text(encoding="utf-8")
+            for where, names in _ASSETS.items()
+            for name in names
+        },
         map_json=json_text(page.map_data),
         pictures_json=json_text(page.pictures),
         editing_json=editing and json_text(editing),

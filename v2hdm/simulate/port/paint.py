@@ -34,6 +34,7 @@ _PIECE_OVERLAP_M = 0.1
 _LEAST_GAP_M = 1.7
 _LINE_GAP_M = 1.1
 _STENCIL_TRIES = 10
+_STRAIGHT_PER_M = 1e-4  # curvature below which the route counts as straight
 _DIAMOND = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
 _ARROW_M = [
     np.array([[-1.5, -0.08], [0.55, -0.08], [0.55, 0.08], [-1.5, 0.08]]),
@@ -175,7 +176,7 @@ class _Painter:
             yaw = float(route.yaw_at(at)[0]) + np.deg2rad(rng.normal(0.0, config.placing_sigma_deg))
             centre = route.points_at(at, offset_m + rng.normal(0.0, config.placing_sigma_m))[0]
             worn, seed = self._worn(), self._seed()
-            if is_field and not route.is_straight(at)[0]:
+            if is_field and abs(np.interp(at[0], route.station_m, route.curvature)) >= _STRAIGHT_PER_M:
                 continue
             # Rows beyond the lanes may run into another stretch of the route behind a turn.
             near_route = float(route.distance_to(centre[None])[0]) < abs(offset_m) - 0.5

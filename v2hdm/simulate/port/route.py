@@ -52,10 +52,6 @@ class Route:
         x, y = self.points_at(at, offset_m)[0].tolist()
         return (x, y), float(self.yaw_at(at)[0])
 
-    def is_straight(self, station_m: FloatArray) -> FloatArray:
-        """Whether (K,) the path is straight at stations (K,)."""
-        return np.asarray(np.abs(np.interp(station_m, self.station_m, self.curvature)) < 1e-4)
-
     def station_at(self, stamp_s: FloatArray) -> FloatArray:
         """Stations (K,) reached at times (K,): the speed swings slowly by an eighth about its mean."""
         swing = _SPEED_PERIOD_S / (2 * np.pi)

@@ -23,7 +23,7 @@ from v2hdm.records import Calibration, FloatArray, Marking
 from v2hdm.report.check_points import CheckTable, squared
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
-from v2hdm.verdict.results.solution import doubted, name_of_input, relied_on
+from v2hdm.verdict.results.solution import CHECKS, doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
 _AHEAD_M = 10.0  # within which a vehicle uses what it sees on the ground
@@ -48,13 +48,8 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         says += f"{goal}; {uncertain} more left out as too uncertain" if uncertain else goal
         coarse = [one for one, own_m in zip(markings, radius_m.max(axis=1), strict=True) if own_m > goal_m]
         met = 100 * (len(markings) - len(coarse)) // len(markings)
-        yield _judged(
-            "map",
-            reached_m,
-            goal_m,
-            says,
-            f"{met} % of the markings meet it; {_largest_part(best, coarse or markings)}",
-        )
+        helps = f"{met} % of the markings meet it; {_largest_part(best, coarse or markings)}"
+        yield _judged("map", reached_m, goal_m, says, helps)
     for name, one in best.calibrations.items():
         left_m, helps = ground_ahead(one)
         says = f"its mounting leaves the ground ahead known to {_cm(left_m)} (95 %){goal}"
@@ -65,7 +60,7 @@ def _conditions(evidence: SolveEvidence) -> str:
     """The inputs that absolute accuracy rests on: one that may be wrong, or those that no image shows."""
     doubtful, relied = doubted(evidence), relied_on(evidence)
     if doubtful is not None:
-        return f" (unless the {name_of_input(doubtful)} is off, as it may be)"
+        return f" (unless the {CHECKS[doubtful.fault][0]} is off, as it may be)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
 
 
@@ -180,13 +175,8 @@ def check_points(table: CheckTable) -> Finding:
         return Finding(CHECK, Status.WARN, None, None, "", says, "map")
     off_m, covariance = table.off_m.ravel(), table.covariance_m2
     value, limit = _ratio(table.squared, len(off_m)), _limit(len(off_m))
-    status, says = (
-        Status.PASS,
-        (
-            f"{len(table.compared)} of {total} lie {100 * table.rmse_m:.1f} cm off the map (RMSE), as far as "
-            "map and survey state"
-        ),
-    )
+    off = f"{len(table.compared)} of {total} lie {100 * table.rmse_m:.1f} cm off the map (RMSE)"
+    status, says = Status.PASS, f"{off}, as far as map and survey state"
     if value > limit:
         status, says = _explained(table, off_m, covariance)
     return Finding(CHECK, status, value, limit, "", says, "map")

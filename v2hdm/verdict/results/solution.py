@@ -63,7 +63,7 @@ _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
 _LEVER_OBSERVABLE_M = 0.025
 
 # The check that reports each fault, and the recovery.
-_CHECKS: Mapping[Fault, tuple[str, str]] = {
+CHECKS: Mapping[Fault, tuple[str, str]] = {
     Fault.CLOCK: (
         "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
     ),
@@ -200,7 +200,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     raised |= {one.check for one in named}
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.score_tests:
-        by_check.setdefault(_CHECKS[one.fault][0], []).append(one)
+        by_check.setdefault(CHECKS[one.fault][0], []).append(one)
     unobservable = list(_unobservable(evidence, raised))
     said = raised | {one.check for one in unobservable if not _observable(by_check[one.check])}
     findings += [_agrees(check, tested) for check, tested in by_check.items() if check not in said]
@@ -225,7 +225,7 @@ def _is_observable(one: Contradiction) -> bool:
 
 def _corrected(one: Contradiction) -> Finding:
     done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
-    says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
+    says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {CHECKS[one.fault][1]}"
     return _input(one, Status.WARN, says)
 
 
@@ -248,16 +248,16 @@ def _contradicted(still: list[Contradiction]) -> Finding:
     one = still[0]
     rivals = [_words(other) for other in still if log_odds(other) > log_odds(one) - _RIVAL_LOG_ODDS]
     says = f"{' or '.join(rivals)} ({one.sigmas:.0f} sigmas)"
-    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
+    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {CHECKS[one.fault][1]}")
 
 
 def _doubtful(one: Contradiction) -> Finding:
-    says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {_CHECKS[one.fault][1]}"
+    says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {CHECKS[one.fault][1]}"
     return _input(one, Status.WARN, says)
 
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
-    check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
+    check, about = CHECKS[one.fault][0], ", ".join(one.cameras)
     return Finding(check, status, one.sigmas, even_sigmas(one), "sigmas", says, about)
 
 
@@ -303,11 +303,6 @@ def relied_on(evidence: SolveEvidence) -> list[str]:
     loose = {"the clocks": _loosest_clock_s(evidence) > CLOCK_OBSERVABLE_S}
     loose["the surveyed centres"] = bool(_loose_levers(evidence))
     return [name for name, is_loose in loose.items() if is_loose]
-
-
-def name_of_input(one: Contradiction) -> str:
-    """The name of the check of an input."""
-    return _CHECKS[one.fault][0]
 
 
 def _loosest_clock_s(evidence: SolveEvidence) -> float:

@@ -81,13 +81,10 @@ def _carry(
         x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
             j, t = k - layout.begin[first], layout.pair[k]
-            fx, fy, fz = _oppose(
-                known,
-                j,
-                base.table[t, 0] * x + base.table[t, 1] * y,
-                base.table[t, 4] * x + base.table[t, 5] * y,
-                base.table[t, 8] * x + base.table[t, 9] * y,
-            )
+            mx = base.table[t, 0] * x + base.table[t, 1] * y
+            my = base.table[t, 4] * x + base.table[t, 5] * y
+            mz = base.table[t, 8] * x + base.table[t, 9] * y
+            fx, fy, fz = _oppose(known, j, mx, my, mz)
             add_force(out.coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
 
 
@@ -109,6 +106,64 @@ def carry(
             _carry(layout, base, q, u, coupled, scratch, out)
 
 
+@inlined
+def _pushed(
+    layout: Layout,
+    base: Base,
+    c: int,
+    coupled: bool,
+    motion: FloatArray,
+    cameras: FloatArray,
+    first: int,
+    known: FloatArray,
+) -> tuple[float, float]:
+    """The push of a step of cameras and frames on corner c, of a unit from ``first`` on, not yet whitened."""
+    sx = sy = 0.0
+    for p in range(len(cameras) if len(base.rows) else 0):
+        sx += base.rows[2 * c, p] * cameras[p]
+        sy += base.rows[2 * c + 1, p] * cameras[p]
+    for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
+        j, t = k - layout.begin[first], layout.pair[k]
+        _recall(layout, base, k, c, known, j)
+        mx = motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1]
+        my = motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2]
+        mz = motion[t, 2] + motion[t, 3] * known[j, 1] - motion[t, 4] * known[j, 0]
+        ax, ay = along_axes(base.table, t, *_oppose(known, j, mx, my, mz))
+        sx += ax
+        sy += ay
+    return sx, sy
+
+
+@inlined
+def _at_corner(
+    layout: Layout,
+    base: Base,
+    table: FloatArray,
+    c: int,
+    slot: IntArray,
+    out: Evaluation,
+    total: float,
+    product: float,
+) -> tuple[float, float, float, float]:
+    """The gradient at corner c where it has moved to, and the loss so far; adds to the pairs' gradients."""
+    gx = gy = 0.0
+    for k in range(layout.begin[c], layout.begin[c + 1]):
+        px, py, pz, inverse, slope, du, dv = see(layout, table, k, out.corners[c, 0], out.corners[c, 1])
+        r0, r1 = whiten(layout, k, du, dv)
+        squared = r0 * r0 + r1 * r1
+        total, product = add_loss(base, squared, total, product)
+        weight = weigh(base, squared)
+        w0, w1 = weight * r0, weight * r1
+        fu = layout.root[0, k] * w0 + layout.root[1, k] * w1
+        fv = layout.root[2, k] * w1
+        fx, fy, fz = fu * inverse, fv * inverse, (fu * px + fv * py) * slope
+        ax, ay = along_axes(table, layout.pair[k], fx, fy, fz)
+        gx += ax
+        gy += ay
+        add_force(out.wrench, slot[layout.pair[k]], px, py, pz, fx, fy, fz)
+    return gx, gy, total, product
+
+
 @kernel
 def evaluate(
     begin: int,
@@ -128,35 +183,18 @@ def evaluate(
     frames have states, ``cameras`` (D,) that of the cameras' unknowns, ``own`` (2 N,) the corners' whitened
     variables.
     """
-    slot, _, _, known, _, step, gradient, _ = scratch
-    states = len(base.rows) == 0
+    step, gradient, states = scratch.step, scratch.gradient, len(base.rows) == 0
     for q in range(begin, end):
-        number_touched(layout, q, slot)
+        number_touched(layout, q, scratch.slot)
         total, product = 0.0, 1.0
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
             first, last = layout.unit[u], layout.unit[u + 1]
             coupled = states and not layout.kept[u]
             for c in range(first, last):
-                sx = sy = 0.0
-                if not states:
-                    for p in range(len(cameras)):
-                        sx += base.rows[2 * c, p] * cameras[p]
-                        sy += base.rows[2 * c + 1, p] * cameras[p]
-                for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
-                    j, t = k - layout.begin[first], layout.pair[k]
-                    _recall(layout, base, k, c, known, j)
-                    fx, fy, fz = _oppose(
-                        known,
-                        j,
-                        motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1],
-                        motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2],
-                        motion[t, 2] + motion[t, 3] * known[j, 1] - motion[t, 4] * known[j, 0],
-                    )
-                    ax, ay = along_axes(base.table, t, fx, fy, fz)
-                    sx += ax
-                    sy += ay
                 i = 2 * (c - first)
-                step[i], step[i + 1] = sx, sy
+                step[i], step[i + 1] = _pushed(
+                    layout, base, c, coupled, motion, cameras, first, scratch.known
+                )
             if coupled:
                 solve_unit(layout, base, u, step)
             for i in range(2 * (last - first)):
@@ -164,24 +202,11 @@ def evaluate(
             solve_unit_transposed(layout, base, u, step)
             for c in range(first, last):
                 i = 2 * (c - first)
-                x, y = base.corners[c, 0] + step[i], base.corners[c, 1] + step[i + 1]
-                out.corners[c, 0], out.corners[c, 1] = x, y
-                gx = gy = 0.0
-                for k in range(layout.begin[c], layout.begin[c + 1]):
-                    px, py, pz, inverse, slope, du, dv = see(layout, table, k, x, y)
-                    r0, r1 = whiten(layout, k, du, dv)
-                    squared = r0 * r0 + r1 * r1
-                    total, product = add_loss(base, squared, total, product)
-                    weight = weigh(base, squared)
-                    w0, w1 = weight * r0, weight * r1
-                    fu = layout.root[0, k] * w0 + layout.root[1, k] * w1
-                    fv = layout.root[2, k] * w1
-                    fx, fy, fz = fu * inverse, fv * inverse, (fu * px + fv * py) * slope
-                    ax, ay = along_axes(table, layout.pair[k], fx, fy, fz)
-                    gx += ax
-                    gy += ay
-                    add_force(out.wrench, slot[layout.pair[k]], px, py, pz, fx, fy, fz)
-                gradient[i], gradient[i + 1] = gx, gy
+                out.corners[c, 0] = base.corners[c, 0] + step[i]
+                out.corners[c, 1] = base.corners[c, 1] + step[i + 1]
+                gradient[i], gradient[i + 1], total, product = _at_corner(
+                    layout, base, table, c, scratch.slot, out, total, product
+                )
             add_corner_priors(layout, u, out.corners, gradient, out.costs[q])
             _carry(layout, base, q, u, coupled, scratch, out)
         if base.code == 2:

@@ -84,6 +84,86 @@ def add_camera(
             rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
 
 
+@inlined
+def _add_corner(
+    layout: Layout,
+    base: Base,
+    clock: FloatArray,
+    by_pair: bool,
+    q: int,
+    c: int,
+    first: int,
+    scratch: Scratch,
+    out: Linearisation,
+    total: float,
+    product: float,
+) -> tuple[float, float]:
+    """Add the observations of corner c, of a unit from ``first`` on, to gradients, blocks, rows and loss."""
+    slot, jacobian, coupling, _, block, _, gradient, rows = scratch
+    cameras, i = len(base.table) // layout.moments, 2 * (c - first)
+    each, states = out.tip.shape[1] // cameras, len(base.rows) == 0
+    gx = gy = xx = yx = yy = 0.0
+    for k in range(layout.begin[c], layout.begin[c + 1]):
+        r0, r1, px, py, pz = differentiate(
+            layout, base.table, k, base.corners[c, 0], base.corners[c, 1], jacobian
+        )
+        squared = r0 * r0 + r1 * r1
+        total, product = add_loss(base, squared, total, product)
+        weight = weigh(base, squared)
+        w0, w1 = weight * r0, weight * r1
+        gx += jacobian[12] * w0 + jacobian[14] * w1
+        gy += jacobian[13] * w0 + jacobian[15] * w1
+        at, camera = slot[layout.pair[k]], layout.pair[k] // layout.moments
+        fx, fy = jacobian[0] * w0 + jacobian[6] * w1, jacobian[7] * w1
+        add_force(out.wrench, at, px, py, pz, fx, fy, jacobian[2] * w0 + jacobian[8] * w1)
+        weight = floored(weight)
+        xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
+        yx += weight * (jacobian[13] * jacobian[12] + jacobian[15] * jacobian[14])
+        yy += weight * (jacobian[13] * jacobian[13] + jacobian[15] * jacobian[15])
+        _add_square(jacobian, weight, out.own, at if by_pair else q * cameras + camera)
+        j = k - layout.begin[first] if states else 0
+        couple(jacobian, weight, coupling, j)
+        add_camera(coupling, j, clock, layout.pair[k], each, rows, i, camera * each)
+    a, b, d = layout.control_root[c, 0], layout.control_root[c, 1], layout.control_root[c, 2]
+    block[i, i] = xx + a * a + b * b
+    block[i + 1, i], block[i + 1, i + 1] = yx + b * d, yy + d * d
+    gradient[i], gradient[i + 1] = gx, gy
+    return total, product
+
+
+@inlined
+def _add_square(jacobian: FloatArray, weight: float, own: FloatArray, owner: int) -> None:
+    """Add J'J of an observation by its pair, the upper triangle row by row, to row ``owner`` of ``own``."""
+    m = 0
+    for p in range(6):
+        top, low = weight * jacobian[p], weight * jacobian[6 + p]
+        for s in range(p, 6):
+            own[owner, m] += top * jacobian[s] + low * jacobian[6 + s]
+            m += 1
+
+
+@inlined
+def _carry_back(layout: Layout, u: int, scratch: Scratch, coupled: FloatArray) -> None:
+    """Add W times unit u's ``gradient`` to the pairs that see it."""
+    coupling, gradient, first = scratch.coupling, scratch.gradient, layout.unit[u]
+    for c in range(first, layout.unit[u + 1]):
+        x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            at, j = scratch.slot[layout.pair[k]], k - layout.begin[first]
+            for p in range(6):
+                coupled[at, p] += coupling[j, p] * x + coupling[j, 6 + p] * y
+
+
+@inlined
+def _add_products(rows: FloatArray, count: int, tip: FloatArray) -> None:
+    """Add B'B of a unit's ``count`` rows to the lower triangle of the ``tip``."""
+    for i in range(0, count, 2):
+        for p in range(len(tip)):
+            top, low = rows[i, p], rows[i + 1, p]
+            for s in range(p + 1):
+                tip[p, s] += top * rows[i, s] + low * rows[i + 1, s]
+
+
 @kernel
 def linearise(
     begin: int,
@@ -100,55 +180,23 @@ def linearise(
     ``clock`` (P, 6 Q) are the pairs' left tangents by the clock offset of their camera; ``by_pair`` asks for
     J'J by pair.
     """
-    table, corners, states = base.table, base.corners, len(base.rows) == 0
-    cameras, width = len(table) // layout.moments, out.tip.shape[1]
-    each = width // cameras
-    slot, jacobian, coupling, _, block, _, gradient, rows = scratch
+    states, width = len(base.rows) == 0, out.tip.shape[1]
+    block, gradient, rows = scratch.block, scratch.gradient, scratch.rows
     for q in range(begin, end):
-        number_touched(layout, q, slot)
+        number_touched(layout, q, scratch.slot)
         total, product = 0.0, 1.0
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
             first, last = layout.unit[u], layout.unit[u + 1]
-            size, seen = last - first, layout.begin[first]
+            size = last - first
             block[: 2 * size, : 2 * size] = 0.0
             gradient[: 2 * size] = 0.0
             rows[: 2 * size] = 0.0
             for c in range(first, last):
-                i = 2 * (c - first)
-                x, y = corners[c, 0], corners[c, 1]
-                gx = gy = xx = yx = yy = 0.0
-                for k in range(layout.begin[c], layout.begin[c + 1]):
-                    r0, r1, px, py, pz = differentiate(layout, table, k, x, y, jacobian)
-                    squared = r0 * r0 + r1 * r1
-                    total, product = add_loss(base, squared, total, product)
-                    weight = weigh(base, squared)
-                    w0, w1 = weight * r0, weight * r1
-                    gx += jacobian[12] * w0 + jacobian[14] * w1
-                    gy += jacobian[13] * w0 + jacobian[15] * w1
-                    at = slot[layout.pair[k]]
-                    fx, fy = jacobian[0] * w0 + jacobian[6] * w1, jacobian[7] * w1
-                    fz = jacobian[2] * w0 + jacobian[8] * w1
-                    add_force(out.wrench, at, px, py, pz, fx, fy, fz)
-                    weight = floored(weight)
-                    xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
-                    yx += weight * (jacobian[13] * jacobian[12] + jacobian[15] * jacobian[14])
-                    yy += weight * (jacobian[13] * jacobian[13] + jacobian[15] * jacobian[15])
-                    camera = layout.pair[k] // layout.moments
-                    owner, m = at if by_pair else q * cameras + camera, 0
-                    for p in range(6):
-                        top, low = weight * jacobian[p], weight * jacobian[6 + p]
-                        for s in range(p, 6):
-                            out.own[owner, m] += top * jacobian[s] + low * jacobian[6 + s]
-                            m += 1
-                    j, column = k - seen if states else 0, camera * each
-                    couple(jacobian, weight, coupling, j)
-                    add_camera(coupling, j, clock, layout.pair[k], each, rows, i, column)
-                a, b, d = layout.control_root[c, 0], layout.control_root[c, 1], layout.control_root[c, 2]
-                block[i, i] = xx + a * a + b * b
-                block[i + 1, i], block[i + 1, i + 1] = yx + b * d, yy + d * d
-                gradient[i], gradient[i + 1] = gx, gy
-            add_corner_priors(layout, u, corners, gradient, out.costs[q])
-            _add_lengths(layout, u, corners, block)
+                total, product = _add_corner(
+                    layout, base, clock, by_pair, q, c, first, scratch, out, total, product
+                )
+            add_corner_priors(layout, u, base.corners, gradient, out.costs[q])
+            _add_lengths(layout, u, base.corners, block)
             if layout.kept[u]:
                 keep_unit(layout, base, u, block)
                 for i in range(2 * size):
@@ -166,19 +214,8 @@ def linearise(
                     out.carried[q, p] += rows[i, p] * gradient[i]
             if states:
                 solve_unit_transposed(layout, base, u, gradient)
-                for c in range(first, last):
-                    i = 2 * (c - first)
-                    x, y = gradient[i], gradient[i + 1]
-                    for k in range(layout.begin[c], layout.begin[c + 1]):
-                        at, j = slot[layout.pair[k]], k - seen
-                        for p in range(6):
-                            out.coupled[at, p] += coupling[j, p] * x + coupling[j, 6 + p] * y
-            tip = out.tip[q]
-            for i in range(0, 2 * size, 2):
-                for p in range(width):
-                    top, low = rows[i, p], rows[i + 1, p]
-                    for s in range(p + 1):
-                        tip[p, s] += top * rows[i, s] + low * rows[i + 1, s]
+                _carry_back(layout, u, scratch, out.coupled)
+            _add_products(rows, 2 * size, out.tip[q])
         if base.code == 2:
             total += base.scale * base.scale * math.log(product)
         out.costs[q, 0] = total / 2
