@@ -177,7 +177,7 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(tiny_driv
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"name": "../elsewhere"}, "the name '../elsewhere' has a separator"),
+        ({"name": "../elsewhere"}, "the name '../elsewhere' has a path separator"),
         ({"workers": -1}, "workers is -1"),
         ({"mapping": MappingOptions(loss="square")}, "mapping.loss is 'square'"),
         ({"mapping": MappingOptions(model_floor_px=-0.1)}, "mapping.model_floor_px is -0.1"),

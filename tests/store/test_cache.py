@@ -291,7 +291,7 @@ def test_a_file_system_without_locks_is_reported(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(fcntl, "flock", refuse)
     with (tmp_path / "a.lock").open("w") as stream:
         assert take_lock(stream)
-    assert "a.lock: no lock can be held here" in caplog.text
+    assert "a.lock: no lock is possible here" in caplog.text
 
 
 def test_what_killed_runs_have_left_goes(cache):
@@ -437,7 +437,7 @@ def test_a_changed_file_is_read_and_told_of_once(written, caplog):
     (told,) = caplog.records
     assert told.levelno == logging.WARNING
     assert str(written) in told.getMessage()
-    assert "is not as we wrote it" in told.getMessage()
+    assert "has changed since we wrote it" in told.getMessage()
 
 
 def test_a_damaged_list_says_nothing(written, caplog):

@@ -156,7 +156,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             if is_curved:
                 inputs, settled, found, worst = curved, over, tests, rival
             taken = "a surface" if is_curved else "a plane: no surface explains the drive"
-            _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
+            _log.info("%s: the ground is mapped as %s", ", ".join(inputs.cameras), taken)
         optimiser, drive = inputs.optimiser, inputs.drive
         # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
         foreign, left = _foreign(inputs, settled, found, progress), None
@@ -253,7 +253,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
     if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
         return True
-    _log.warning("the surveyed point %s is of no use: the marking there did not enter the map", one.about)
+    _log.warning("the surveyed point %s is not used: its marking did not enter the map", one.about)
     return False
 
 
