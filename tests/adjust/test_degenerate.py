@@ -44,8 +44,8 @@ def bad_lengths():
     return {
         "known length 1 is from corner 4 to itself": lengths(second=(1, 4)),
         "the distance of corners 4 and 6 is given twice": lengths(first=(4, 6), second=(6, 4)),
-        "known length 1 names corners 4 and 9999; one is not there": lengths(second=(1, 9999)),
-        "known length 0 names corners -1 and 1; one is not there": lengths(first=(-1, 4)),
+        "known length 1 names corners 4 and 9999; one does not exist": lengths(second=(1, 9999)),
+        "known length 0 names corners -1 and 1; one does not exist": lengths(first=(-1, 4)),
         "known length 0 is -0.5 m: give one above 0": lengths(length_m=(-0.5, 0.7)),
         "known length 1 is nan m: give one above 0": lengths(length_m=(0.5, np.nan)),
         "sigma_m of known length 0 is not above 0 and finite": lengths(sigma_m=(0.0, 0.01)),

@@ -101,7 +101,7 @@ def test_a_cache_that_cannot_be_written_is_reported_once_and_work_goes_on(tmp_pa
     cache = StageCache(tmp_path / "cache")
     for value in ([1], [2]):
         assert made(cache, value) == value
-    assert len([one for one in caplog.records if "nothing can be kept" in one.message]) == 1
+    assert len([one for one in caplog.records if "later runs cannot resume" in one.message]) == 1
 
 
 def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path):
