@@ -17,7 +17,7 @@ _COMMAND = Command(
     "python -m train.ship",
     "Make a trained network the detector's own.",
     "train",
-    "interrupted; the same command goes on from here, and the detector's files are as they were",
+    "interrupted; the same command resumes from here, and the detector's files are unchanged",
 )
 
 

@@ -113,11 +113,11 @@ class Catalogue:
         for name in entries:
             if not (isinstance(name, str) and _NAME.fullmatch(name)):
                 raise ConfigError(
-                    f"{where}: class {shown(name)}: use letters, digits and underscores, 64 at most"
+                    f"{where}: class {shown(name)}: use at most 64 letters, digits and underscores"
                 )
             if (other := taken.get(name.lower())) is not None:
                 raise ConfigError(
-                    f"{where}: {shown(name)} is the name of {shown(other)} already; choose another"
+                    f"{where}: {shown(name)} is already the name of {shown(other)}; choose another"
                 )
             taken[name.lower()] = name
         own = {name: _read_class(name, entry, where) for name, entry in entries.items()}
@@ -126,17 +126,17 @@ class Catalogue:
         for name, one in own.items():
             if one.family == LINE or one.group in lanes:
                 raise ConfigError(
-                    f"{where}: {shown(name)} would be paint of lanes, which know their own classes only "
+                    f"{where}: {shown(name)} would be lane paint, which has fixed classes "
                     f"({', '.join(self.lane_paint)}); choose another family and group"
                 )
             if one.group not in groups | set(own):
                 known = ", ".join(sorted(groups - lanes))
                 raise ConfigError(
                     f"{where}: group of {shown(name)} is {shown(one.group)}; name one of {known}, "
-                    "or a class of yours"
+                    "or a class of your own"
                 )
         if len(self.classes) + len(own) > _MOST_CLASSES:
-            raise ConfigError(f"{where}: more than {_MOST_CLASSES} classes in all; drop some")
+            raise ConfigError(f"{where}: more than {_MOST_CLASSES} classes in total; drop some")
         return Catalogue({**self.classes, **own})
 
 
@@ -149,15 +149,13 @@ def _read_entries(path: Path) -> dict[Any, Any]:
     content = read_yaml(path, ConfigError)
     entries = content.get("classes") if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries:
-        raise ConfigError(f"{path}: no `classes` in it; list them as v2hdm/catalogue.yaml does")
+        raise ConfigError(f"{path}: has no `classes`; list them as in v2hdm/catalogue.yaml")
     return entries
 
 
 def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
     if not isinstance(entry, dict) or not set(entry) <= _KEYS:
-        raise ConfigError(
-            f"{where}: class {shown(name)} may have {', '.join(sorted(_KEYS))} and nothing else"
-        )
+        raise ConfigError(f"{where}: class {shown(name)} may have only {', '.join(sorted(_KEYS))}")
     said = {"softness": _SOFTNESS, "group": name, **entry}
 
     def refuse(key: str, advice: str) -> ConfigError:

@@ -55,11 +55,11 @@ def describe(error: BaseException) -> str | None:
     if isinstance(error, V2hdmError):
         return str(error)
     if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
-        return "the memory is not enough for this; give less at once, or fewer workers"
+        return "not enough memory; process less at once, or with fewer workers"
     if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):  # pathlib's, to Python 3.12
-        return f"{error}; mend or remove the link"
+        return f"{error}; fix or remove the link"
     if isinstance(error, UnicodeEncodeError):  # no file's content, for readers refuse halves of letters
-        return f"{error.object[max(error.start - 40, 0) : error.end]}: a name that is no UTF-8; rename it"
+        return f"{error.object[max(error.start - 40, 0) : error.end]}: a name that is not UTF-8; rename it"
     # Disks that are full, gone or read-only can fail any call.
     if isinstance(error, OSError) and not isinstance(error, ConnectionError):
         where = f"{error.filename}: " if error.filename else ""

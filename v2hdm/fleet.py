@@ -159,7 +159,7 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
     config = to_dataclass(composed, RunConfig, f"set it in {file}")
     for place in (config.output, config.cache):
         if place.startswith("memory:"):
-            raise ConfigError(f"{place}: is gone with the process that wrote it, and a fleet has many")
+            raise ConfigError(f"{place}: is temporary, for one process, and a fleet has many")
     return composed, config
 
 
@@ -245,6 +245,6 @@ def _mapped(job: Job, progress: Progress) -> tuple[Row, str]:
         line = describe(error)
         if line is not None:
             return Row.of_error(job.name, job.source, line), ""
-        line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
+        line = f"a bug in V2HDM, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
         return Row.of_error(job.name, job.source, line), traceback.format_exc()
     return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""

@@ -177,7 +177,7 @@ def write_labels(
     if facts.hd_map is None or facts.route is None or status not in ("PASS", "WARN"):
         raise MapFileError(
             f"{folder}: its verdict is {status or 'missing'}: labels of a map that may be wrong would teach "
-            "what is wrong; mend the drive (docs/verdict.md) and map it again"
+            "what is wrong; fix the drive (docs/verdict.md) and map it again"
         )
     outlines = [_Outline.of(one.id or 0, one.kind, one.corners_map) for one in facts.hd_map.markings]
     outlines += [_Outline.of(one.id or 0, one.kind, one.outline_map) for one in facts.hd_map.symbols]

@@ -26,7 +26,7 @@ from v2hdm.progress import Progress
 _TIDY_S = 30.0  # a worker without its parent may take this long to end, whatever it is in
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _TWICE_DEAD = (
-    "a worker process died twice over the same work (exit code {}), perhaps for want of memory; set fewer "
+    "a worker process died twice over the same work (exit code {}), perhaps for lack of memory; set fewer "
     "workers= (--workers)"
 )
 

@@ -44,8 +44,8 @@ def bad_lengths():
     return {
         "known length 1 is from corner 4 to itself": lengths(second=(1, 4)),
         "the distance of corners 4 and 6 is given twice": lengths(first=(4, 6), second=(6, 4)),
-        "known length 1 names corners 4 and 9999; one is not there": lengths(second=(1, 9999)),
-        "known length 0 names corners -1 and 1; one is not there": lengths(first=(-1, 4)),
+        "known length 1 names corners 4 and 9999; one does not exist": lengths(second=(1, 9999)),
+        "known length 0 names corners -1 and 1; one does not exist": lengths(first=(-1, 4)),
         "known length 0 is -0.5 m: give one above 0": lengths(length_m=(-0.5, 0.7)),
         "known length 1 is nan m: give one above 0": lengths(length_m=(0.5, np.nan)),
         "sigma_m of known length 0 is not above 0 and finite": lengths(sigma_m=(0.0, 0.01)),
@@ -91,8 +91,8 @@ def bad_problems():
         "observation 4 names camera -1": off("camera", 4, -1),
         "camera 1 has no observation": seen_in(problem, seen.camera == 0),
         f"corner {problem.corner_count} has no observation": one_more,
-        "cam_from_vehicle 1 is no rigid transform": off("cam_from_vehicle", (1, 0), mirrored),
-        "map_from_vehicle 2 is no rigid transform: its last row": off("map_from_vehicle", (2, 3, 0), 1.0),
+        "cam_from_vehicle 1 is not a rigid transform": off("cam_from_vehicle", (1, 0), mirrored),
+        "map_from_vehicle 2 is not a rigid transform: its last row": off("map_from_vehicle", (2, 3, 0), 1.0),
         "covariance_px of observation 6 is not symmetric": off("covariance_px", 6, skew),
         "pinhole_px of observation 3 lies 1.11e.06 focal lengths": off("pinhole_px", (3, 0), 1e9),
         "observations.corner holds float64": with_observations(problem, corner=seen.corner.astype(float)),
@@ -106,7 +106,7 @@ def bad_problems():
         "twist_vehicle has shape": replace(problem, twist_vehicle=np.zeros((3, 6))),
         "control point 1 names corner -1": surveyed([0, -1], np.ones((2, 2))),
         "control point 0 is not finite": surveyed([0, 1], [[1.0, 0.0], [1.0, 1.0]]),
-        "there is no observation": replace(problem, observations=rows_of(seen, slice(0))),
+        "there are no observations": replace(problem, observations=rows_of(seen, slice(0))),
     }
 
 

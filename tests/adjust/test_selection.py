@@ -86,7 +86,7 @@ def test_turns_fix_all_offsets():
     for camera in observability(scene.problem, solve(scene.problem)):
         assert camera.unobserved == ()
         assert camera.sigma[:3].max() < 0.015
-        assert "the drive fixes both" in camera.sentence("rear")
+        assert "the drive determines both" in camera.sentence("rear")
 
 
 def test_what_is_said_of_the_centre_holds():

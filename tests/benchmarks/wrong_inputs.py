@@ -160,7 +160,7 @@ def judge(drive: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
 
 def _clause(finding: dict[str, Any]) -> str:
     """The cause that a finding names; the recovery is left out, since it may speak of other causes."""
-    return f"{finding['check']} {re.split('; |: (?:check|mend|see) ', finding['says'])[0]}"
+    return f"{finding['check']} {re.split('; |: (?:check|correct|see) ', finding['says'])[0]}"
 
 
 def clean_fault() -> Fault:

@@ -116,7 +116,7 @@ def test_intrinsics_of_a_chain_need_the_camera_s_name(tmp_path, capsys):
         yaml.safe_dump({"cam0": entry | {"intrinsics": [500.0, 500.0, 640.0, 360.0]}, "cam1": entry})
     )
     assert run(tmp_path, clicked(seed=1), "--intrinsics", chain) == 2
-    assert "holds the cameras cam0, cam1; name one by --camera-name" in capsys.readouterr().err
+    assert "holds the cameras cam0, cam1; choose one with --camera-name" in capsys.readouterr().err
     assert (
         run(tmp_path, clicked(seed=1), "--intrinsics", chain, "--camera-name", "cam1", "--name", "front") == 0
     )
@@ -130,7 +130,7 @@ def test_a_wrong_point_is_a_warning_that_names_it(tmp_path, intrinsics, capsys):
     shown = capsys.readouterr().out
     assert re.search(
         r"WARN point \(front\): point P7 \(line 8\) contradicts the others by \d\d sigmas "
-        r"\(2\d\.\d px, (9\d\.\d cm|1\.0\d m) on the ground\) and counts for nothing: check its pixel", shown
+        r"\(2\d\.\d px, (9\d\.\d cm|1\.0\d m) on the ground\) and gets no weight: check its pixel", shown
     )  # fmt: skip
     assert "verdict: WARN (1 finding, 3 checks passed)" in shown
 
@@ -155,29 +155,29 @@ def test_points_about_on_a_line_fail_and_the_files_say_so(tmp_path, intrinsics, 
     code = run(tmp_path, (px, places), "--intrinsics", intrinsics)
     printed = capsys.readouterr()
     assert code == 3, printed.err
-    assert "points along one line fix no camera" in printed.out
+    assert "points along one line do not determine a camera" in printed.out
     assert read_provenance(tmp_path / "out/calibration_front.yaml").verdict == "FAIL"
 
 
 def test_intrinsics_of_another_lens_fail(tmp_path, intrinsics, capsys):
     px = project(mounting(), PLACES, MATRIX * [[1.12, 1, 1], [1, 1.12, 1], [1, 1, 1]])
     assert run(tmp_path, (px, PLACES), "--intrinsics", intrinsics) == 3
-    assert re.search(r"want the focal length \+1[0-4]\.\d \+- \S+ % longer", capsys.readouterr().out)
+    assert re.search(r"imply a focal length \+1[0-4]\.\d \+- \S+ % longer", capsys.readouterr().out)
 
 
 MISTAKES = {
-    "left and right": (lambda px, places: (px, places * [1, -1]), "y is counted to the right"),
+    "left and right": (lambda px, places: (px, places * [1, -1]), "y counts to the right"),
     "x and y": (lambda px, places: (px, places[:, ::-1]), "x and y are exchanged"),
-    "upward": (lambda px, places: (np.column_stack([px[:, 0], 719 - px[:, 1]]), places), "v is counted"),
+    "upward": (lambda px, places: (np.column_stack([px[:, 0], 719 - px[:, 1]]), places), "v counts"),
     "half the size": (lambda px, places: (px / 2, places), "an image 0.5 times as large"),
     "millimetres": (lambda px, places: (px, 1e3 * places), "x and y look like millimetres; .* that is 2.4"),
     "centimetres": (lambda px, places: (px, 1e2 * places), "x and y look like centimetres"),
     "a line": (lambda px, places: (px, places * [1, 0] + [0, 0.5]), "same place|on a line"),
     "three on a line": (
         lambda px, places: (px[[2, 5, 8, 9]], np.array([[8.0, 0.0], [10.0, 0.0], [12.0, 0.0], [12.0, 3.0]])),
-        "on a line, or all but one do",
+        "all but one, lie about on a line",
     ),
-    "three points": (lambda px, places: (px[:3], places[:3]), "3 points; 4 barely fix"),
+    "three points": (lambda px, places: (px[:3], places[:3]), "3 points; 4 barely suffice"),
     "outside": (lambda px, places: (px + np.array([700, 0]), places), "lies outside the image"),
 }
 
@@ -204,7 +204,7 @@ def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys):
     ("arguments", "words"),
     [
         (["--pixel-sigma", "0", "--survey-sigma", "0"], "are both 0"),
-        (["--name", "a/b"], "--name: the name 'a/b' has a separator of folders; choose another"),
+        (["--name", "a/b"], "--name: the name 'a/b' has a path separator; choose another"),
         (["--image", "half.png"], "the image is 640 x 360, but the intrinsics of 'front' are for 1280 x 720"),
         (["--image", "none.png"], "none.png: image listed but missing"),
     ],
@@ -253,13 +253,13 @@ TABLE = [(10.5, 20.0, 5.0, 1.0), (30.0, 20.5, 5.0, -1.0), (12.0, 12.0, 9.0, 1.5)
 TEXT = "u,v,x,y\n" + "".join(",".join(map(str, row)) + "\n" for row in TABLE)
 
 WRONG_TABLES = {
-    "empty": ("", "holds no point; expected a line of column names"),
+    "empty": ("", "has no point; expected a line of column names"),
     "no header": (TEXT.split("\n", 1)[1], "no column 'u'; the first line must name u, v, x, y"),
-    "millimetres by name": (TEXT.replace("x,y", "x_mm,y_mm"), "no column 'x'; .* it says: u, v, x_mm, y_mm"),
+    "millimetres by name": (TEXT.replace("x,y", "x_mm,y_mm"), "no column 'x'; .* it has: u, v, x_mm, y_mm"),
     "twice": (TEXT.replace("u,v", "u,u"), "more than one column 'u'"),
     "height": (re.sub(r"([05])\n", r"\1,0\n", TEXT.replace("x,y", "x,y,z")), "column 'z' is not"),
-    "nan": (TEXT.replace("30.0", "nan"), "line 3: u: 'nan' is not a finite number; drop or mend"),
-    "words": (TEXT.replace("30.0", "left"), "line 3: u: 'left' is not a number; mend that line"),
+    "nan": (TEXT.replace("30.0", "nan"), "line 3: u: 'nan' is not a finite number; drop or fix"),
+    "words": (TEXT.replace("30.0", "left"), "line 3: u: 'left' is not a number; fix that line"),
     "decimal comma": (
         TEXT.replace(",", ";").replace("10.5", "10,5"),
         "line 2: u: '10,5' is not a number; write a decimal point",
@@ -281,7 +281,10 @@ def test_a_wrong_table_is_one_line_with_the_place(tmp_path, mistake):
     ("change", "expected"),
     [
         (lambda px, places: px.__setitem__(3, (1300.0, 400.0)), r"point P4 .* \(1300, 400\) lies outside"),
-        (lambda px, places: px.__setitem__(3, (-1.0, 400.0)), "lies outside the image of 1280 x 720; mend"),
+        (
+            lambda px, places: px.__setitem__(3, (-1.0, 400.0)),
+            "lies outside the image of 1280 x 720; fix",
+        ),
         (lambda px, places: px.__setitem__(3, px[6]), "P4 .* and point P7 .* have the same pixel"),
         (lambda px, places: places.__setitem__(3, places[6]), "P4 .* have the same place on the ground"),
         (lambda px, places: px.__setitem__(slice(None), px[:, ::-1].copy()), "u and v look exchanged"),

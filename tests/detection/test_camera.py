@@ -148,7 +148,7 @@ def test_a_rough_description_gives_the_camera_that_it_says():
         ({"distortion_model": "fisheye"}, "unknown distortion_model 'fisheye'"),
         ({"distortion": (0.1,)}, "plumb_bob has 5 coefficients, not 1"),
         ({"width": 0}, "must be positive"),
-        ({"rotation": 1.1 * np.eye(3)}, "no rotation"),
+        ({"rotation": 1.1 * np.eye(3)}, "not a rotation"),
         ({"height_m": -0.5}, "under the ground"),
         ({"pitch_deg": -60.0}, "above the horizon"),
     ],

@@ -202,7 +202,7 @@ def test_what_an_unplugged_camera_saw_is_kept(bench, tmp_path, monkeypatch, caps
     monkeypatch.setattr(frames.cv2, "VideoCapture", FakeCapture)
     output = tmp_path / "found.jsonl"
     assert bench.run(0, "--output", output) == 2
-    assert "camera 0: gives no image after 3 frames" in capsys.readouterr().err
+    assert "camera 0: no image after 3 frames" in capsys.readouterr().err
     assert len(lines(output.read_text())) == 3
 
 
@@ -309,7 +309,7 @@ def test_a_grey_image_in_a_folder_is_looked_at_like_the_others(bench, tmp_path):
     [
         ("small", "the image is 320x180, but the calibration of camera 'front' is for 640x360"),
         ("empty", "no images (.jpg"),
-        ("nan", "nan.onnx: the network gives values that are not finite"),
+        ("nan", "nan.onnx: the network's outputs are not finite"),
     ],
 )
 def test_a_mistake_is_one_line_exit_code_2_and_nothing_half_written(bench, tmp_path, capfd, mistake, words):

@@ -99,7 +99,7 @@ def test_a_folder_without_a_mounting_is_seen_from_where_its_lines_meet(tmp_path,
     pitch_deg, info = folder.mounting[1], rough_calibration("c", 1280, 720, 1.6, 5.0, folder.mounting[2]).info
     arguments = ["--mounting", "1.6", f"{pitch_deg + 4:.2f}", f"{folder.mounting[2]:.2f}"]
     assert run(["detect", str(folder.path), *arguments, "--output", str(tmp_path / "out.jsonl")]) == 0
-    said = [text for text in capsys.readouterr().err.splitlines() if "by the lines of" in text]
+    said = [text for text in capsys.readouterr().err.splitlines() if "from the lines of" in text]
     assert len(said) == 1
     found, sigma = (float(word) for word in said[0].split("looks ")[1].split(" deg")[0].split(" +- "))
     assert abs(found - pitch_deg) < 3 * np.hypot(sigma, np.rad2deg(BODY_SIGMA_RAD) / 2)

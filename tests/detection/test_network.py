@@ -45,9 +45,7 @@ def test_the_outputs_cover_images_of_any_size(tmp_path):
 
 def test_a_gpu_that_this_onnxruntime_was_built_without_is_told(monkeypatch):
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: ["CPUExecutionProvider"])
-    with pytest.raises(
-        DetectorError, match=r"detector\.device is cuda, .* install onnxruntime-gpu in its place"
-    ):
+    with pytest.raises(DetectorError, match=r"detector\.device is cuda, .* install onnxruntime-gpu instead"):
         Detector.load(options=DetectorOptions(device="cuda"))
     with pytest.raises(ConfigError, match="choose cpu or cuda"):
         DetectorOptions(device="tpu")
@@ -73,9 +71,15 @@ def test_a_gpu_that_does_not_start_is_told_and_not_left_out_in_silence(monkeypat
         ({"other": 1}, "no usable 'v2hdm' metadata"),
         ({"classes": ["zebra"], "multiple": 16, "strides": STRIDES}, "unknown classes"),
         ({"classes": list(PAINT_CLASSES), "multiple": 15, "strides": STRIDES}, "do not divide"),
-        ({"classes": list(PAINT_CLASSES), "multiple": 16, "strides": STRIDES | {"kinds": 1}}, "no multiple"),
+        (
+            {"classes": list(PAINT_CLASSES), "multiple": 16, "strides": STRIDES | {"kinds": 1}},
+            "not a multiple",
+        ),
         ({"classes": list(PAINT_CLASSES), "multiple": "many", "strides": STRIDES}, "no usable 'v2hdm'"),
-        ({"classes": [PAINT_CLASSES[0]] * 2, "multiple": 16, "strides": STRIDES}, "not one for each channel"),
+        (
+            {"classes": [PAINT_CLASSES[0]] * 2, "multiple": 16, "strides": STRIDES},
+            "do not match the channels",
+        ),
         ({"classes": list(PAINT_CLASSES), "multiple": 10**9, "strides": STRIDES}, "multiple 1000000000"),
         ({"classes": list(PAINT_CLASSES), "multiple": 0, "strides": STRIDES}, "multiple 0"),
         ({"classes": list(PAINT_CLASSES), "multiple": 16, "strides": [2, 4]}, "no usable 'v2hdm'"),
@@ -288,7 +292,7 @@ def test_a_judge_of_another_network_is_refused(folder):
     manifest["files"]["judge.onnx"]["network"] = "0" * 64
     (folder / "manifest.json").write_text(json.dumps(manifest))
     message = refusal(folder)
-    assert "fitted to another network" in message
+    assert "fitted to a network other" in message
     assert "python -m train.ship v2hdm/detection/weights/default.onnx" in message
 
 
@@ -302,8 +306,8 @@ def test_a_missing_or_damaged_manifest_is_refused(folder, content):
 
 
 def test_a_detector_is_not_loaded_from_files_that_do_not_belong_together(monkeypatch):
-    monkeypatch.setattr(weights, "_problem", lambda folder: "judge.onnx: was fitted to another network")
-    with pytest.raises(DetectorError, match="another network"):
+    monkeypatch.setattr(weights, "_problem", lambda folder: "judge.onnx: was fitted to a network other")
+    with pytest.raises(DetectorError, match="a network other"):
         Detector.load()
     Detector(Network(), DetectorOptions())  # as the fits to a new network do, which they come before
 

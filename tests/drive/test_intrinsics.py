@@ -293,24 +293,24 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "double sphere": (kalibr_mistake(("camera_model: pinhole", "camera_model: ds")), "double sphere"),
     "eucm": (kalibr_mistake(("camera_model: pinhole", "camera_model: eucm")), "extended unified"),
-    "fov": (kalibr_mistake(("distortion_model: radtan", "distortion_model: fov")), "'fov', which is beyond"),
+    "fov": (kalibr_mistake(("distortion_model: radtan", "distortion_model: fov")), "'fov' is not supported"),
     "no resolution": (kalibr_mistake(("  resolution: [1280, 720]\n", "")), "missing key 'resolution'"),
     "three intrinsics": (kalibr_mistake(("[905.5, 903.25,", "[905.5,")), "expected 4 numbers"),
     "nan": (kalibr_mistake(("[905.5", "[.nan")), "not finite"),
-    "colmap fov": (colmap_mistake("1 FOV 1280 720 900 900 640 360 0.9"), "COLMAP's FOV is beyond"),
+    "colmap fov": (colmap_mistake("1 FOV 1280 720 900 900 640 360 0.9"), "COLMAP's FOV is not supported"),
     "colmap prism": (
         colmap_mistake("1 THIN_PRISM_FISHEYE 1280 720 900 900 640 360 0 0 0 0 0 0 0 0"),
-        "THIN_PRISM_FISHEYE is beyond",
+        "THIN_PRISM_FISHEYE is not supported",
     ),
     "colmap short": (colmap_mistake("1 OPENCV 1280 720 900 900 640 360 0 0"), "OPENCV has 8 parameters"),
     "colmap binary": (text_mistake("cameras.bin", ""), "model_converter"),
     "thin prism": (
         lambda folder: write_opencv(folder / "a.yml", [*LENSES[8], 0.01, 0, 0, 0]),
-        "thin prism .* beyond our lens",
+        "thin prism .* is not supported",
     ),
     "tilted": (
         lambda folder: write_opencv(folder / "a.yml", [*LENSES[8], 0, 0, 0, 0, 0.1, 0]),
-        "tilted sensor .* beyond our lens",
+        "tilted sensor .* is not supported",
     ),
     "opencv omnidir": (
         lambda folder: write_opencv(folder / "a.yml", LENSES[4], xi=0.9),
@@ -350,7 +350,7 @@ def test_a_lens_beyond_ours_or_a_damaged_file_is_one_line(tmp_path, mistake):
 
 def test_a_file_with_several_cameras_asks_for_the_name(tmp_path):
     path = write_chain(tmp_path)
-    with pytest.raises(DriveError, match="holds the cameras cam0, cam1; name one by --camera-name"):
+    with pytest.raises(DriveError, match="holds the cameras cam0, cam1; choose one with --camera-name"):
         read_intrinsics(path, name_by="--camera-name")
     with pytest.raises(DriveError, match="no camera 'cam7' in this file; it holds: cam0, cam1"):
         read_intrinsics(path, "cam7")
@@ -380,7 +380,7 @@ def test_a_drive_asks_which_camera_of_a_chain_and_names_the_key(tmp_path):
     drive_with(tmp_path, "site-camchain.yaml")
     write_chain(tmp_path)
     with pytest.raises(
-        DriveError, match=r"name one by camera_info: \{file: site-camchain.yaml, camera: NAME\}"
+        DriveError, match=r"choose one with camera_info: \{file: site-camchain.yaml, camera: NAME\}"
     ):
         read_drive(tmp_path)
 

@@ -128,7 +128,7 @@ def test_positions_without_an_rtk_fix_are_left_out_and_counted(tmp_path, caplog)
     check(wide, slice(0, 35), metres=LEVEL_M, radians=1e-6)
     assert wide.noise["position_m"] == pytest.approx(np.sqrt((20 * 0.02**2 + 15 * 0.5**2) / 35))
     (tmp_path / "log.nmea").write_text(nmea_log([5] * 41))
-    with pytest.raises(DriveError, match=r"no position is sure to 0\.1 m \(the best is 0\.5 m\)"):
+    with pytest.raises(DriveError, match=r"no position is known to 0\.1 m \(the best is 0\.5 m\)"):
         read(content, tmp_path)
 
 
@@ -143,11 +143,13 @@ def test_an_nmea_log_is_refused_for_what_it_lacks(tmp_path):
     content: dict[str, Any] = {"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}
     whole = nmea_log().splitlines()
     log.write_text("\n".join(whole[1:]))
-    with pytest.raises(DriveError, match="tells the date: add date"):
+    with pytest.raises(DriveError, match="states the date: add date"):
         read(content, tmp_path)
     check(read(content | {"date": "2024-05-17"}, tmp_path), metres=LEVEL_M, radians=1e-6)
     log.write_text("\n".join(line for line in whole if "HDT" not in line))
-    with pytest.raises(DriveError, match="positions without a heading, and the course over ground is none"):
+    with pytest.raises(
+        DriveError, match="positions without a heading, and the course over ground is not a heading"
+    ):
         read(content, tmp_path)
     log.write_text("\n".join(whole))
     with pytest.raises(DriveError, match="holds an antenna's positions: add lever_arm_m"):
@@ -200,11 +202,11 @@ def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path):
     for changes, message in (
         ({"heading": None}, "true and grid north differ in EPSG:25832: add heading"),
         ({"crs": "EPSG:99999"}, "unknown crs 'EPSG:99999'"),
-        ({"crs": "EPSG:27700"}, "EPSG:27700 .* is of no satellite datum"),
-        ({"crs": "EPSG:5555"}, "count from the sea: add geoid_m"),
-        ({"crs": None}, "heading: only for coordinates with a place on the earth"),
+        ({"crs": "EPSG:27700"}, "EPSG:27700 .* is not on a satellite datum"),
+        ({"crs": "EPSG:5555"}, "are above sea level: add geoid_m"),
+        ({"crs": None}, "heading: only for coordinates on the earth"),
         ({"crs": "EPSG:4258"}, "EPSG:4258 is not projected"),
-        ({"crs": "EPSG:3035"}, "EPSG:3035 does not keep angles"),
+        ({"crs": "EPSG:3035"}, "EPSG:3035 is not conformal"),
         ({"heading": "north"}, "heading: expected one of true, grid"),
         ({"lever_arm": [0, 0, 0]}, "unknown key 'lever_arm'; did you mean 'lever_arm_m'"),
         ({"tum": "a"}, "name one source"),
@@ -245,15 +247,15 @@ def test_a_table_in_the_map_frame_with_angles(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds no pose"),
+        ("", "has no pose"),
         ("stamp_s,x_m,y_m\n1,2\n", "line 2: 2 cells under 3 columns"),
         ("stamp_s,x_m,y_m,yaw_deg\n1,2,x,0\n", "line 2: y_m: 'x' is not a number"),
         ("stamp_s,x_m,y_m,yaw_deg\n1,2,nan,0\n", "line 2: y_m: 'nan' is not a finite"),
-        ("x_m,y_m,yaw_deg\n1,2,0\n", "needs one column of times"),
+        ("x_m,y_m,yaw_deg\n1,2,0\n", "needs one time column"),
         ("stamp_s,stamp_ns,x_m,y_m,yaw_deg\n1,1,2,0,0\n", "has stamp_s, stamp_ns"),
         ("stamp_s,x_m,yaw_deg\n1,2,0\n", "has no column 'y_m'"),
         ("stamp_s,yaw_deg\n1,2\n", "needs positions"),
-        ("stamp_s,x_m,y_m,yaw_deg,heading_deg\n1,2,0,0,0\n", "says heading_deg and yaw_deg"),
+        ("stamp_s,x_m,y_m,yaw_deg,heading_deg\n1,2,0,0,0\n", "has heading_deg and yaw_deg"),
         ("stamp_s,x_m,y_m\n1,2,0\n", "positions without a heading"),
         ("stamp_s,x_m,y_m,yaw_deg\n9,2,0,0\n3,2,0,0\n", "pose 2: its time 3.000 s is 6.000 s before"),
         ("stamp_s,x_m,y_m,qx,qy,qz,qw\n9,2,0,0,0,0,2\n", "pose 1: quaternion of norm 2"),

@@ -93,7 +93,7 @@ def test_a_source_that_does_not_fit_is_named(folder):
     for images, message in (
         ({"video": "front.mkv"}, "add start_s, the time of the first frame"),
         ({"video": "front.mkv", "start_s": "now"}, "start_s: expected a finite number"),
-        ({"video": "front.mkv", "stamps": "times.txt"}, "2 times of 6 frames of .*front.mkv"),
+        ({"video": "front.mkv", "stamps": "times.txt"}, "2 times for 6 frames of .*front.mkv"),
         ({"video": "rear.mkv", "start_s": 1}, "rear.mkv: no such video"),
         ({"video": "text.mp4", "start_s": 1}, "text.mp4: not readable as a video"),
         ({"video": "front.mkv", "start": 1}, "unknown key 'start'; did you mean 'start_s'"),
@@ -103,7 +103,7 @@ def test_a_source_that_does_not_fit_is_named(folder):
         ({"folder": "nowhere"}, "no such folder"),
         ({"folder": "front"}, "no image .* in this folder"),
         ({"list": "a"}, "name one source"),
-        ({"topic": "/image"}, "the drive has no bag; add bag at the top"),
+        ({"topic": "/image"}, "the drive has no bag; add the key bag"),
         (7, "images: expected a text, got 7|expected 'key: value' entries"),
     ):
         with pytest.raises(DriveError, match=message) as caught:

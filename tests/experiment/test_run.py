@@ -196,7 +196,7 @@ def test_a_folder_with_files_of_the_users_is_refused(tmp_path, name):
     mine = tmp_path / experiment(str(tmp_path)).name / name
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
-    with pytest.raises(ConfigError, match="no results of ours"):
+    with pytest.raises(ConfigError, match="did not write"):
         run_experiment(experiment(str(tmp_path)), "", lambda *_: None)
     assert mine.read_text() == "mine"
 

@@ -157,7 +157,7 @@ def change(folder, name):
 def test_a_new_network_is_refused_until_judge_and_lane_score_were_fitted_to_it(folder):
     change(folder, "default.onnx")
     manifest.record(["default.onnx"], "python -m export", folder)
-    with pytest.raises(DetectorError, match=r"judge\.onnx: was fitted to another network .* train\.ship"):
+    with pytest.raises(DetectorError, match=r"judge\.onnx: was fitted to a network other .* train\.ship"):
         check(folder)
     change(folder, "judge.onnx")
     change(folder, "confidence.json")

@@ -97,24 +97,24 @@ YAML_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "zero bytes": (b"\0" * 64, "zero byte"),
     "binary": (bytes(range(1, 256)), "not a UTF-8|special characters"),
     "control letters": ("name: a\x07b\n", "special characters"),
-    "a key twice": ("name: a\nname: b\n", "line 2.*'name' is there twice"),
+    "a key twice": ("name: a\nname: b\n", "line 2.*'name' appears twice"),
     "nested 70 deep": ("name: " + "[" * 70 + "]" * 70, "nested deeper"),
     "nested 3000 deep": ("name: " + "[" * 3000 + "]" * 3000, "nested deeper"),
     "mappings nested 3000 deep": ("name: " + "{a: " * 3000 + "}" * 3000, "nested deeper"),
     "alias bomb": (ALIAS_BOMB, "aliases repeat"),
-    "alias of itself": ("name: &a [*a]\n", "alias of what it is part of"),
+    "alias of itself": ("name: &a [*a]\n", "alias of something that contains it"),
     "unknown alias": ("name: *a\n", "YAML syntax error"),
     "5000 digits": ("name: " + "9" * 5000 + "\n", "5000 digits"),
     "5000 hex digits": ("name: 0x" + "f" * 5000 + "\n", "5002 digits"),
-    "int of letters": ("name: !!int abc\n", "'abc' is not what its tag says"),
-    "float of letters": ("name: !!float abc\n", "'abc' is not what its tag says"),
-    "bool of letters": ("name: !!bool abc\n", "'abc' is not what its tag says"),
+    "int of letters": ("name: !!int abc\n", "'abc' does not match its tag"),
+    "float of letters": ("name: !!float abc\n", "'abc' does not match its tag"),
+    "bool of letters": ("name: !!bool abc\n", "'abc' does not match its tag"),
     "python object": ("name: !!python/object/apply:os.system [true]\n", "the tag"),
     "python name": ("name: !!python/name:os.system\n", "the tag"),
     "own tag": ("name: !secret x\n", "the tag"),
     "binary tag": ("name: !!binary aGk=\n", "the tag"),
-    "half a letter": ('name: "\\ud800"\n', "line 1 .*half a letter"),
-    "half a letter in a key": ('"\\udc00": 1\n', "line 1 .*half a letter"),
+    "half a letter": ('name: "\\ud800"\n', "line 1 .*half a character"),
+    "half a letter in a key": ('"\\udc00": 1\n', "line 1 .*half a character"),
     "set": ("name: !!set {a}\n", "the tag"),
     "key that is a list": ("? [a, b]\n: 1\n", "a key that is a list"),
     "mapping that is a list": ("name: !!map [1]\n", "YAML syntax error"),
@@ -132,10 +132,10 @@ JSON_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "nested 3000 deep": ('{"features": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
     "nested 100000 deep": ("[" * 100000, "nested deeper"),
     "depth hidden in a text": ('{"a": "]]]]]]]", "b": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
-    "a key twice": ('{"v2hdm": {}, "v2hdm": {}}', "'v2hdm' is there twice"),
+    "a key twice": ('{"v2hdm": {}, "v2hdm": {}}', "'v2hdm' appears twice"),
     "5000 digits": ('{"v2hdm": {"origin": ' + "9" * 5000 + '}, "features": []}', "origin"),
-    "half a letter": ('{"v2hdm": {"crs": "\\ud800"}, "features": []}', "half a letter"),
-    "half a letter in a key": ('{"\\uDC00": {}}', "half a letter"),
+    "half a letter": ('{"v2hdm": {"crs": "\\ud800"}, "features": []}', "half a character"),
+    "half a letter in a key": ('{"\\uDC00": {}}', "half a character"),
     "not a number": ('{"v2hdm": {}, "features": [{"properties": {"corners_map": NaN}}]}', "feature 0"),
     "no map": ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
     "features that are a text": ('{"v2hdm": {}, "features": "x"}', "not a map written by v2hdm"),
@@ -150,10 +150,10 @@ BAD_NAMES: dict[str, tuple[object, str]] = {
     "empty": ("", "name is empty"),
     "parent": ("..", "begins with a dot"),
     "hidden": (".front", "begins with a dot"),
-    "escape": ("../../x", "separator of folders"),
-    "absolute": ("/tmp/x", "separator of folders"),
-    "folder": ("a/b", "separator of folders"),
-    "backslash": ("a\\b", "separator of folders"),
+    "escape": ("../../x", "path separator"),
+    "absolute": ("/tmp/x", "path separator"),
+    "folder": ("a/b", "path separator"),
+    "backslash": ("a\\b", "path separator"),
     "newline": ("a\nb", "does not show"),
     "zero byte": ("a\0b", "does not show|special characters|zero byte"),
     "escape sequence": ("a\x1b[31mb", "does not show|special characters"),
@@ -306,8 +306,8 @@ def texts() -> Iterator[Case]:
 
 
 POINTS = {
-    "a cell of 200000 letters": (f"name,u,v,x,y\n{'P' * 200_000},1,2,3,4\n", "is no table"),
-    "an open quote of 200000 letters": ('name,u,v,x,y\n"' + "P" * 200_000, "is no table"),
+    "a cell of 200000 letters": (f"name,u,v,x,y\n{'P' * 200_000},1,2,3,4\n", "is not a table"),
+    "an open quote of 200000 letters": ('name,u,v,x,y\n"' + "P" * 200_000, "is not a table"),
     "one point 3000 times": ("name,u,v,x,y\n" + "P,100,100,8,0\n" * 3000, "have the same pixel"),
     "a name that moves the cursor": ("name,u,v,x,y\n\x1b[2J,-9,2,3,4\n" + "a,1,1,9,1\n" * 5, r"\?\[2J"),
     "no number": ("u,v,x,y\n1,2,3,nan\n", "y"),
@@ -370,7 +370,9 @@ def images() -> Iterator[Case]:
         yield checked(f"image in a drive: {name}", says, write("front/images/000001.jpg", data))
     yield detects("image: damaged inside", "a.jpg", write("a.jpg", damaged_inside()), "damaged")
     deep = picture(".png", depth=np.uint16)
-    yield detects("image: 16 bits", "a.png", write("a.png", deep), "16 bits a channel; convert it to 8 bits")
+    yield detects(
+        "image: 16 bits", "a.png", write("a.png", deep), "16 bits per channel; convert it to 8 bits"
+    )
     yield detects("image: a pipe", "imgs", _imgs(pipe("imgs/b.jpg")), "device")
     yield detects("video: a pipe", "precious.txt", pipe("precious.txt"), "a pipe or a device")
     yield detects("image: a folder", "imgs", _imgs(folder_instead("imgs/b.jpg")), "folder")
@@ -447,7 +449,7 @@ def outputs() -> Iterator[Case]:
     linked = both(imgs, lambda root: (root / "link").symlink_to("imgs/a.jpg"))
     twin = both(imgs, lambda root: os.link(root / "imgs/a.jpg", root / "twin"))
     for name, line, prepare, says in (
-        ("draw into the source", "imgs --draw imgs", imgs, "no results of ours"),
+        ("draw into the source", "imgs --draw imgs", imgs, "that V2HDM did not write"),
         ("output is the source", "imgs/a.jpg --output imgs/a.jpg", imgs, "inputs"),
         ("output is a link to the source", "imgs/a.jpg --output link", linked, "inputs"),
         ("output is the source by another name", "imgs/a.jpg --output twin", twin, "inputs"),
@@ -479,11 +481,11 @@ def outputs() -> Iterator[Case]:
         "a folder with a metrics.json": _folder_with("out", "metrics.json"),
         "a folder with a folder": _folder_with("out/deep", "x"),
     }.items():
-        yield Case(f"result into {name}", CHECK, CHECKED, both(drive(), make), "no results of ours")
+        yield Case(f"result into {name}", CHECK, CHECKED, both(drive(), make), "that V2HDM did not write")
     yield Case("result onto a file", CHECK, CHECKED, both(drive(), write("out", "x")), "is a file")
     within = (*CHECKED[:-1], "precious.txt/x")
     yield Case("result within a file", CHECK, within, drive(), "cannot be written|is a file")
-    yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "no results of ours")
+    yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "that V2HDM did not write")
     through = both(imgs, lambda root: (root / "link").symlink_to("found.jsonl"))
     more = {"code": 0, "leaves": "found.jsonl", "tells": True}
     yield detects("output is a link to what is to be", "imgs/a.jpg --output link", through, "", **more)
@@ -585,9 +587,9 @@ SETTINGS = _plainly(
 ) | {
     "workers=99999999999999999999": "workers is",
     "workers=many": "workers=many",
-    "name=../x": "separator of folders",
+    "name=../x": "path separator",
     "name=..": "begins with a dot",
-    "'name=\"a/b\"'": "separator of folders",
+    "'name=\"a/b\"'": "path separator",
     "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
     "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
     "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
@@ -606,7 +608,7 @@ SIMULATED = _plainly(
     "simulate.route.image_spacing_m=0 simulate.route.speed_mps=nan "
     "simulate.exposure.full_well_electrons=0 simulate.yard.barriers=-5"
 ) | {
-    "simulate.name=../x": "separator of folders",
+    "simulate.name=../x": "path separator",
     "+simulate.cameras.both=${simulate.cameras.front}": "results of all",
 }
 TRAINING = _plainly(

@@ -35,7 +35,10 @@ DAMAGES: dict[str, tuple[Change, str]] = {
         edit("drive.yaml", r"drift_m: 0\.008", "drift_m: 0.02"),
         r"is part of position_m and cannot",
     ),
-    "short drift": (edit("drive.yaml", r"_over_m: 25\.0", "_over_m: 0"), r"an error that fades over no way"),
+    "short drift": (
+        edit("drive.yaml", r"_over_m: 25\.0", "_over_m: 0"),
+        r"an error that fades over 0 m",
+    ),
     "bad latitude": (edit("drive.yaml", r"latitude_deg: 53.5", "latitude_deg: 99"), r"latitude must lie"),
     "missing truth": (edit("drive.yaml", r"^truth: truth", "truth: elsewhere"), r"truth: no such folder"),
     "no camera_info": (remove("front/camera_info.yaml"), r"camera_info.yaml: no such file"),
@@ -63,7 +66,10 @@ DAMAGES: dict[str, tuple[Change, str]] = {
     "bow tie": (front(roi_vehicle=[[0, 0], [1, 1], [1, 0], [0, 1]]), r"polygon is not convex"),
     "sigma": (front(centre_prior={"xyz": [0, 0, 2], "sigma_m": 0}), r"sigma_m: must be positive"),
     "prior typo": (front(centre_prior={"xyz": [0, 0, 2], "sigma": 1}), r"'sigma'; did you mean 'sigma_m'"),
-    "negative read-out": (front(read_out_s=-0.01), r"read_out_s: -0.01 s is no read-out time; give seconds"),
+    "negative read-out": (
+        front(read_out_s=-0.01),
+        r"read_out_s: -0.01 s is not a read-out time; give seconds",
+    ),
     "long read-out": (front(read_out_s=1.0), r"read_out_s: 1 s is no .*, from 0 to 0.6, the time from image"),
     "read-out nan": (front(read_out_s=float("nan")), r"read_out_s: expected a finite number, got nan"),
     "read-out text": (front(read_out_s="fast"), r"read_out_s: expected a finite number"),

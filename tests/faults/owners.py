@@ -223,7 +223,7 @@ SQL: dict[str, tuple[str, str]] = {
     "a text for a geometry": ("UPDATE markings SET geom = 'a'", "is damaged"),
     "a number for a geometry": ("UPDATE markings SET geom = 7", "is damaged"),
     "a short geometry": ("UPDATE markings SET geom = X'47500001'", "is damaged"),
-    "a geometry of zeros": ("UPDATE markings SET geom = zeroblob(200)", "is none that a map has"),
+    "a geometry of zeros": ("UPDATE markings SET geom = zeroblob(200)", "is not one that maps have"),
     "a text for a number": ("UPDATE markings SET sightings = 'many'", "sightings"),
     "a blob for a class": ("UPDATE markings SET class = X'ff00'", "class"),
     "text that is no UTF-8": ("UPDATE markings SET class = CAST(X'ff' AS TEXT)", "UTF-8|class"),
@@ -234,9 +234,9 @@ SQL: dict[str, tuple[str, str]] = {
 }  # fmt: skip
 _POINT = struct.pack("<BIdd", 1, 1, 0.0, 0.0)
 GEOMETRIES: dict[str, tuple[bytes, str]] = {
-    "a point": (_POINT, "is none that a map has"),
+    "a point": (_POINT, "is not one that maps have"),
     "a Multi within a Multi, 200000 deep": (struct.pack("<BII", 1, 6, 1) * 200_000, "several parts"),
-    "collections, 200000 deep": (struct.pack("<BII", 1, 7, 1) * 200_000, "is none that a map has"),
+    "collections, 200000 deep": (struct.pack("<BII", 1, 7, 1) * 200_000, "is not one that maps have"),
     "4 billion polygons": (struct.pack("<BII", 1, 6, 2**32 - 1), "several parts"),
     "4 billion rings": (struct.pack("<BII", 1, 3, 2**32 - 1), "holes"),
     "4 billion points": (struct.pack("<BIII", 1, 3, 1, 2**32 - 1), "is damaged"),
@@ -258,7 +258,7 @@ def geopackages() -> Iterator[Case]:
     for name, (sql, says) in SQL.items():
         yield Case(f"geopackage: {name}", "v2hdm export", line, _executed(sql), says)
     many = "geopackage: one row many times"
-    yield Case(many, "v2hdm export", line, _one_row_many_times, "rows are more than its bytes")
+    yield Case(many, "v2hdm export", line, _one_row_many_times, "more rows than bytes")
     for name, (wkb, says) in GEOMETRIES.items():
         blob = b"GP\0\1" + bytes(4) + wkb
         prepare = _executed(f"UPDATE markings SET geom = X'{blob.hex()}'")

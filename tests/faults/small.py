@@ -44,7 +44,7 @@ ROUTES = [
     *(("x_m", cell, "x_m|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
     *(("stamp_s", cell, "stamp_s|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
     *(("yaw_deg", cell, "yaw_deg|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
-    *(("sigma_m", cell, "no position is sure") for cell in ("inf", "1e300", "0.2")),
+    *(("sigma_m", cell, "no position is known") for cell in ("inf", "1e300", "0.2")),
 ]  # fmt: skip
 
 
@@ -130,7 +130,7 @@ def _points() -> Iterator[Case]:
     columns = rng.uniform(0, INFO.width - 1, 3000), rng.uniform(0, INFO.height - 1, 3000)
     places = rng.uniform(2, 30, 3000), rng.uniform(-10, 10, 3000)
     rows = "".join(f"{u:.2f},{v:.2f},{x:.3f},{y:.3f}\n" for u, v, x, y in zip(*columns, *places, strict=True))
-    yield _calibrated("3000 random points", f"u,v,x,y\n{rows}", "nothing to do with the places")
+    yield _calibrated("3000 random points", f"u,v,x,y\n{rows}", "pixels and places are unrelated")
     for name in ("\x1b]0;x\x07", "\x9b2J", "\u202eP", "\u2028P", "\x08\x08", "\x7f", "P" * 100_000):
         text = f"name,u,v,x,y\n{name},-9,2,3,4\n" + "a,1,1,9,1\n" * 5
         yield _calibrated(f"the name {name[:9]!r}", text, "outside|lies|cells under")
@@ -198,7 +198,7 @@ STAMPS = ("'noon'", "X'ff'")
 
 
 def _bags() -> Iterator[Case]:
-    info, other = "/sensing/front/camera_info", r"message \d+ states another lens than the first"
+    info, other = "/sensing/front/camera_info", r"message \d+ has another lens than the first"
     for name, change in {
         "another focal length": lambda one: replace(one, k=one.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1]),
         "a focal length that is not finite": lambda one: replace(one, k=one.k * np.nan),
@@ -215,7 +215,7 @@ def _bags() -> Iterator[Case]:
                 covariance[at] = value
                 return replace(one, pose=replace(one.pose, covariance=covariance))  # type: ignore
 
-            yield _bag(f"covariance {value} at {at}", "a variance below 0", turn, "/odom")
+            yield _bag(f"covariance {value} at {at}", "a negative variance", turn, "/odom")
     for value in STAMPS:
 
         def prepare(root: Path, value: str = value) -> None:

@@ -132,7 +132,7 @@ def test_a_share_that_cannot_be_is_one_line(given, capsys):
 def test_what_would_be_gone_with_a_worker_is_refused(tmp_path, drive):
     planned = plan([written(tmp_path, "one", drive)], ["output=memory://results"])
     assert not planned.jobs
-    assert "gone with the process" in planned.refused[0].says
+    assert "is temporary, for one process" in planned.refused[0].says
 
 
 def test_the_table_has_a_code_for_the_worst_of_its_rows():

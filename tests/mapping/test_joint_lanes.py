@@ -118,7 +118,7 @@ def test_a_line_that_too_few_images_show_is_named_and_keeps_its_place(highway, i
     assert find_knots(*arguments, options).count
     with caplog.at_level(logging.WARNING):
         drawn_by_one = find_knots(highway.drive, few[:1], *arguments[2:], options)
-    assert "lane lines take no part in the adjustment" in caplog.text
+    assert "lane lines are not in the adjustment" in caplog.text
     assert not drawn_by_one.count
     assert draw_lanes(drawn_by_one, solved[0].bundle.solution, 0.5) == drawn_by_one.lanes
 

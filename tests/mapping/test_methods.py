@@ -114,7 +114,7 @@ def test_a_camera_that_saw_nothing_keeps_its_extrinsic(short_scene):
 
 def test_a_drive_without_a_marking_says_so(scene):
     nothing = [replace(found, markings=()) for found in scene.detections]
-    with pytest.raises(MappingError, match="no marking was found"):
+    with pytest.raises(MappingError, match="no markings were found"):
         run_methods(scene.drive, nothing, ("front",))
 
 

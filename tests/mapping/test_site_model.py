@@ -299,7 +299,7 @@ def test_of_two_markings_on_one_spot_the_likelier_stays():
     counts.images[2] = 4
     classified = verdict(candidates, counts)
     assert [k for k, reason in enumerate(classified.verdict) if reason] == [2]
-    assert classified.verdict[2] == "lies on a better supported marking"
+    assert classified.verdict[2] == "overlaps a better supported marking"
 
 
 def test_a_shift_that_all_markings_share_speaks_against_none():

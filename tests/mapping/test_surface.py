@@ -276,7 +276,7 @@ def test_the_ground_of_a_map_is_the_same_in_files(tmp_path):
 
 def test_a_map_over_a_plane_gets_no_file_of_its_ground_and_is_told_so(tmp_path, caplog):
     assert write_map(HdMap(()), tmp_path, "map", ["opencrg"]) == []
-    assert "map_ground.crg is not written: the map holds no surface" in caplog.text
+    assert "map_ground.crg is not written: the map holds no ground surface" in caplog.text
     assert not list(tmp_path.iterdir())
 
 

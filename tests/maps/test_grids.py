@@ -94,16 +94,16 @@ def test_a_map_in_a_grid_comes_back_as_it_was_and_an_edit_counts_as_drawn(tmp_pa
 @pytest.mark.parametrize(
     ("crs", "origin", "metres", "message"),
     [
-        ("EPSG:25833", HAMBURG, "", r"lies outside of EPSG:25833 .*; give EPSG:25832"),
-        ("EPSG:4258", HAMBURG, "DXF", "DXF holds metres, which EPSG:4258 does not have; give EPSG:25832"),
+        ("EPSG:25833", HAMBURG, "", r"lies outside EPSG:25833 .*; give EPSG:25832"),
+        ("EPSG:4258", HAMBURG, "DXF", "DXF holds metres, but EPSG:4258 is not in metres; give EPSG:25832"),
         (
             "EPSG:2225",
             replace(HAMBURG, latitude_deg=40.0, longitude_deg=-122.0, datum="NAD83"),
             "DXF",
             "metres",
         ),
-        ("EPSG:32632", HAMBURG, "", "of WGS84, the map of ETRS89"),
-        (UTM, None, "", "the map has none; give local"),
+        ("EPSG:32632", HAMBURG, "", "on WGS84, the map on ETRS89"),
+        (UTM, None, "", "which the map lacks; give local"),
         ("EPSG:5555", HAMBURG, "", "give its horizontal part"),
         ("+proj=utm +zone=32 +ellps=GRS80 +units=m", HAMBURG, "", "no satellite datum|no code|is of unknown"),
         ("EPSG:1", HAMBURG, "", "unknown crs"),
@@ -124,7 +124,7 @@ def test_the_command_takes_a_grid_and_refuses_before_it_writes(tmp_path, monkeyp
     write_geojson(street(HAMBURG), tmp_path / "map.geojson")
     monkeypatch.chdir(tmp_path)
     assert run(["export", "map.geojson", "--format", "gpkg", "--crs", "EPSG:25833"]) == 2
-    assert "outside of EPSG:25833" in capsys.readouterr().err
+    assert "outside EPSG:25833" in capsys.readouterr().err
     assert run(["export", "map.geojson", "--format", "lanelet2", "--crs", UTM]) == 2
     assert not list(tmp_path.glob("map*[!n]"))
     assert run(["export", "map.geojson", "--format", "gpkg", "--crs", UTM]) == 0

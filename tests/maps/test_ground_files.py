@@ -148,7 +148,7 @@ def test_the_ground_as_points_has_heights_and_the_paint_where_it_is(result, monk
         (["mosaic.tif", "--format", "gpkg"], "its other format is pcd"),
         (["mosaic.tif", "--format", "pcd", "--crs", "local"], "in the map's own frame"),
         (["broken.tif", "--format", "pcd"], "broken.tif: cannot be read as a GeoTIFF"),
-        (["map.gpkg", "--format", "qgis", "--crs", "local"], "map.gpkg would be written over"),
+        (["map.gpkg", "--format", "qgis", "--crs", "local"], "map.gpkg would be overwritten"),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(result, monkeypatch, capsys, words, message):

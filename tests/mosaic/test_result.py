@@ -96,7 +96,7 @@ def said_of_drive(folder, **values):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda folder: (folder / METRICS).unlink(), "no metrics.json in it"),
+        (lambda folder: (folder / METRICS).unlink(), "has no metrics.json"),
         (lambda folder: (folder / METRICS).write_text("[]"), "metrics.json"),
         (lambda folder: said_of_drive(folder, limit="x"), "is damaged"),
         (lambda folder: said_of_drive(folder, paths=["gone"]), "give its folder with --drive"),

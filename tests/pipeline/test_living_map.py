@@ -102,7 +102,7 @@ def test_a_base_that_nothing_can_be_built_on_is_refused(results, tmp_path):
     naive = tuple(replace(one, covariance_m2=None) for one in hd_map.markings)
     for changed, verdict, told in (
         (hd_map, {"status": "FAIL"}, "the verdict on its drive is FAIL"),
-        (replace(hd_map, markings=naive), None, "does not say how sure its markings are"),
+        (replace(hd_map, markings=naive), None, "states no uncertainty of its markings"),
         (replace(hd_map, markings=()), None, "has no markings"),
     ):
         write_geojson(changed, tmp_path / "map.geojson", verdict)

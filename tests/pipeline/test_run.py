@@ -169,15 +169,15 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(tiny_driv
         cv2.imwrite(str(image), np.full((360, 640, 3), 90, np.uint8))
     outcome = run(run_config(drive, tmp_path / "out"))
     assert outcome.verdict.status is Status.FAIL
-    assert any("no marking was found" in finding.says for finding in outcome.verdict.raised)
+    assert any("no markings were found" in finding.says for finding in outcome.verdict.raised)
     assert not (outcome.folder / "map.geojson").exists()
-    assert "no marking was found" in (outcome.folder / "report.html").read_text()
+    assert "no markings were found" in (outcome.folder / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"name": "../elsewhere"}, "the name '../elsewhere' has a separator"),
+        ({"name": "../elsewhere"}, "the name '../elsewhere' has a path separator"),
         ({"workers": -1}, "workers is -1"),
         ({"mapping": MappingOptions(loss="square")}, "mapping.loss is 'square'"),
         ({"mapping": MappingOptions(model_floor_px=-0.1)}, "mapping.model_floor_px is -0.1"),

@@ -196,5 +196,5 @@ def test_the_table_of_a_customer_holds_every_point_once_and_reads_back(tmp_path)
 
 def test_nothing_within_reach_is_a_table_without_figures():
     table = checked(yard(), point(500.0, 0.0))
-    assert table.headline == "check points: none of 1 has a corner of the map within reach"
+    assert table.headline == "check points: none of 1 has a map corner within reach"
     assert "rmse_m" not in table.figures()

@@ -146,12 +146,12 @@ def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path):
             add("a.jpg", text)
     assert (drawn / "a.jpg").read_bytes() == b"second"
     (drawn / "b.jpg").write_bytes(b"mine")
-    with growing_folder(drawn, "--draw") as add, pytest.raises(ConfigError, match="no file of ours"):
+    with growing_folder(drawn, "--draw") as add, pytest.raises(ConfigError, match="not a file of V2HDM"):
         add("b.jpg", b"ours")
     assert (drawn / "b.jpg").read_bytes() == b"mine"
     photos.mkdir()
     (photos / "a.jpg").write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="no results of ours"), growing_folder(photos, "--draw"):
+    with pytest.raises(ConfigError, match="did not write"), growing_folder(photos, "--draw"):
         pass
 
 
@@ -178,7 +178,10 @@ def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path):
         write_json(folder / "more.json", {"a": 1})
     assert "more.json" in files_of_result(tmp_path / "run")
     (tmp_path / "run" / "mine.json").write_text("mine")
-    with pytest.raises(ConfigError, match="no file of ours"), added_to(tmp_path / "run", "RESULT") as folder:
+    with (
+        pytest.raises(ConfigError, match="not a file of V2HDM"),
+        added_to(tmp_path / "run", "RESULT") as folder,
+    ):
         write_json(folder / "mine.json", {"a": 1})
     assert (tmp_path / "run" / "mine.json").read_text() == "mine"
 
@@ -263,4 +266,4 @@ def test_what_another_command_has_added_stays_its_own_and_what_is_stale_is_named
         with result_folder(tmp_path / "run", made=MADE) as folder:
             (folder / "map").write_text("second")
     assert names(tmp_path / "run") == ["map", "map.csv"]
-    assert "gone with it: mosaic.json" in caplog.text
+    assert "removed with the earlier result: mosaic.json" in caplog.text

@@ -167,7 +167,7 @@ def test_hidden_points_are_those_the_picture_hides():
         ({"cameras": {}}, "cameras"),
         ({"initial_ipm": "guess"}, "initial_ipm"),
         ({"route": RouteConfig(pieces=[])}, "route.pieces"),
-        ({"route": RouteConfig(pieces=[[20.0, 0.0]])}, "route.pieces: 20 m in all; give 25 m"),
+        ({"route": RouteConfig(pieces=[[20.0, 0.0]])}, "route.pieces: 20 m in total; give 25 m"),
         ({"calibration": CalibrationConfig(points_ahead_m=[[4, 0], [6, 0], [8, 0]])}, "points_ahead_m"),
         (
             {"calibration": CalibrationConfig(points_ahead_m=[[1, 9], [4, 1], [8, 1], [9, -2]])},
@@ -253,7 +253,7 @@ def test_own_paint_has_labels_after_those_of_the_shipped_classes():
 @pytest.mark.parametrize(
     ("stencils", "words"),
     [
-        ({"diamond": StencilConfig(shapes_m=[PAD])}, "stencils.diamond: there is a class"),
+        ({"diamond": StencilConfig(shapes_m=[PAD])}, "stencils.diamond: a class of this name"),
         ({"pad": StencilConfig(shapes_m=[])}, "stencils.pad.shapes_m"),
         ({"pad": StencilConfig(shapes_m=[PAD[:2]])}, "stencils.pad.shapes_m"),
         ({"pad": StencilConfig(shapes_m=[[*PAD[:3], [0.0, 0.2]]])}, "convex"),

@@ -101,7 +101,7 @@ def test_a_cache_that_cannot_be_written_is_reported_once_and_work_goes_on(tmp_pa
     cache = StageCache(tmp_path / "cache")
     for value in ([1], [2]):
         assert made(cache, value) == value
-    assert len([one for one in caplog.records if "nothing can be kept" in one.message]) == 1
+    assert len([one for one in caplog.records if "later runs cannot resume" in one.message]) == 1
 
 
 def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path):
@@ -291,7 +291,7 @@ def test_a_file_system_without_locks_is_reported(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(fcntl, "flock", refuse)
     with (tmp_path / "a.lock").open("w") as stream:
         assert take_lock(stream)
-    assert "a.lock: no lock can be held here" in caplog.text
+    assert "a.lock: no lock is possible here" in caplog.text
 
 
 def test_what_killed_runs_have_left_goes(cache):
@@ -437,7 +437,7 @@ def test_a_changed_file_is_read_and_told_of_once(written, caplog):
     (told,) = caplog.records
     assert told.levelno == logging.WARNING
     assert str(written) in told.getMessage()
-    assert "is not as we wrote it" in told.getMessage()
+    assert "has changed since we wrote it" in told.getMessage()
 
 
 def test_a_damaged_list_says_nothing(written, caplog):

@@ -59,7 +59,7 @@ class Failing:
 @pytest.mark.parametrize(
     ("failure", "says"),
     [
-        (OSError("no route\nto host"), "s3://b/a: does not work .no route to host.; check the network"),
+        (OSError("no route\nto host"), "s3://b/a: failed .no route to host.; check the network"),
         (PermissionError("Forbidden"), "Forbidden.; check the credentials"),
         (type("NoCredentialsError", (Exception,), {})("none found"), "none found.; check the cred"),
     ],
@@ -73,16 +73,16 @@ def test_what_fails_is_one_line(failure, says):
 @pytest.mark.parametrize(
     ("url", "says"),
     [
-        ("ssh://host/x", "at no store that we write to; choose a folder or s3://"),
-        ("simplecache::s3://b/x", "at no store"),
-        ("http://host/x", "at no store"),
-        ("s3://", "no place at a store"),
-        ("s3://b//x", "no place at a store"),
-        ("s3://b/../x", "no place at a store"),
-        ("s3://b/x?versionId=3", "no place at a store"),
-        ("s3://b/\x1b[2J", "no place at a store"),
-        ("s3://key:secret@b/x", r"^output= s3://\.\.\.: holds what is no name of a bucket"),
-        ("file:///data/runs", "at no store"),
+        ("ssh://host/x", "not in a supported store; choose a folder or s3://"),
+        ("simplecache::s3://b/x", "not in a supported store"),
+        ("http://host/x", "not in a supported store"),
+        ("s3://", "not a path in a store"),
+        ("s3://b//x", "not a path in a store"),
+        ("s3://b/../x", "not a path in a store"),
+        ("s3://b/x?versionId=3", "not a path in a store"),
+        ("s3://b/\x1b[2J", "not a path in a store"),
+        ("s3://key:secret@b/x", r"^output= s3://\.\.\.: is not a bucket name"),
+        ("file:///data/runs", "not in a supported store"),
     ],
 )
 def test_what_is_no_place_is_refused(url, says):
@@ -120,7 +120,7 @@ def test_a_url_where_only_paths_are_written_is_told_and_not_made_a_folder(tmp_pa
     monkeypatch.chdir(tmp_path)
     for write in (result_folder, whole_file):
         with (
-            pytest.raises(ConfigError, match="no URL is written to here"),
+            pytest.raises(ConfigError, match="URLs are allowed only as"),
             write(Path("s3://bucket/results")),
         ):
             pass

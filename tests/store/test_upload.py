@@ -36,7 +36,7 @@ def test_a_result_is_replaced_whole_and_what_it_no_longer_has_goes(memory):
 
 def test_what_is_not_ours_is_neither_replaced_nor_removed(memory):
     memory.write("run/notes", b"mine")
-    with pytest.raises(ConfigError, match="holds objects that are no results of ours"):
+    with pytest.raises(ConfigError, match="holds objects that are not results of V2HDM"):
         put(memory, map=b"1")
     assert there(memory) == {"notes": b"mine"}
     memory.remove("run/notes")
@@ -121,7 +121,7 @@ def test_a_second_writer_is_refused_until_the_first_has_finished(memory):
     with suppress(Stop):
         upload(stopping(memory, 3), {"map": b"1", "log": b"2"}, "one host", quiet)
     before = there(memory)
-    with pytest.raises(ConfigError, match="is being written by one host, or was when that was stopped"):
+    with pytest.raises(ConfigError, match="is being written by one host, or was when it stopped"):
         put(memory, "other host", map=b"3")
     assert there(memory) == before
     assert put(memory, "one host", map=b"1", log=b"2")

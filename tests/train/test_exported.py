@@ -363,7 +363,7 @@ def test_a_checkpoint_of_before_there_were_own_classes_is_read(tmp_path, shipped
     ("own", "words"),
     [
         ({PAD: {"family": "circle"}}, "family of 'pad'"),
-        ({"diamond": ENTRIES[PAD]}, "is the name of 'diamond' already"),
+        ({"diamond": ENTRIES[PAD]}, "is already the name of 'diamond'"),
         ([PAD], "no usable 'v2hdm' metadata"),
         ({T: ENTRIES[T]}, r"unknown classes \['pad'\]"),
     ],

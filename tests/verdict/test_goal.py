@@ -84,7 +84,7 @@ def test_one_corner_in_twenty_may_miss_the_goal(coarse, status):
     assert (found.limit, found.unit) == (5.0, "cm")
     if status is Status.WARN:
         assert "88 % of the markings meet it" in found.says
-        assert "is each marking's own views: pass them nearer" in found.says
+        assert "is each marking's own views: pass them closer" in found.says
 
 
 def test_the_radius_of_all_corners_holds_for_errors_drawn_from_their_covariances():

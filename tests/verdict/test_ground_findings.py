@@ -134,7 +134,7 @@ def test_poses_that_pull_are_not_told_where_something_else_is():
 
 @pytest.mark.parametrize(
     ("status", "helps"),
-    [(GroundStatus.TOO_LITTLE, "drive further"), (GroundStatus.NO_TEXTURE, "drive by day")],
+    [(GroundStatus.TOO_LITTLE, "drive farther"), (GroundStatus.NO_TEXTURE, "drive by day")],
 )
 def test_ground_that_cannot_be_matched_is_no_fault_and_what_would_help_is_said(status, helps):
     little = replace(estimate(), status=status, shares={Reading.AS_GIVEN: 0.0}, parameters={})

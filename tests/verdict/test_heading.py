@@ -172,7 +172,7 @@ def test_stamps_that_jitter_are_no_lost_fix():
     stamp_s = np.maximum.accumulate(recorded.stamp_s + late_s) + 1e-6 * np.arange(len(late_s))
     told = raised(check_jumps(motion(Trajectory(stamp_s, recorded.map_from_vehicle)), NOISE))
     assert list(told) == ["pose stamps"]
-    assert "as much along the way as across it" in told["pose stamps"]
+    assert "as much along the path as across it" in told["pose stamps"]
 
 
 def test_a_height_that_jumps_is_told_apart():

@@ -285,7 +285,7 @@ ONE_OFF = np.where(np.arange(COUNT)[:, None] == 7, [0.15, 0.0], 0.0)
     [
         (ONE_OFF, Status.WARN, "^P7 lies .*the others where they should"),
         (np.tile([0.15, -0.13], (COUNT, 1)), Status.FAIL, "another datum or origin"),
-        (np.random.default_rng(5).normal(0, 0.05, (COUNT, 2)), Status.FAIL, "the map is worse than it says"),
+        (np.random.default_rng(5).normal(0, 0.05, (COUNT, 2)), Status.FAIL, "the map is worse than stated"),
     ],
     ids=["one point", "all alike", "a worse map"],
 )

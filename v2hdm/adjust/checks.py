@@ -43,7 +43,7 @@ def _check_control(problem: Problem) -> None:
     if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count, 2):
         raise AdjustError(f"control points: {count} corners need as many points_map and sigma_m (x, y)")
     there = (named >= 0) & (named < problem.corner_count)
-    _refuse(~there, "control point {} names corner {}, which is not there", named)
+    _refuse(~there, "control point {} names corner {}, which does not exist", named)
     if len(np.unique(named)) < count:
         raise AdjustError("two control points name the same corner: keep one of them")
     sound = (np.isfinite(control.points_map) & (control.sigma_m > 0)).all(1)
@@ -59,7 +59,7 @@ def _check_lengths(problem: Problem) -> None:
         raise AdjustError(f"known lengths: {count} first corners need as many second, length_m and sigma_m")
     first, second = ends = np.stack([known.first, known.second])
     there = ((ends >= 0) & (ends < problem.corner_count)).all(0)
-    _refuse(~there, "known length {} names corners {} and {}; one is not there", first, second)
+    _refuse(~there, "known length {} names corners {} and {}; one does not exist", first, second)
     _refuse(first == second, "known length {} is from corner {} to itself", first)
     (low, high), times = np.unique(np.sort(ends, axis=0), axis=1, return_counts=True)
     _refuse(times > 1, "the distance of corners {1} and {2} is given twice: keep one of them", low, high)
@@ -72,7 +72,7 @@ def _check_lengths(problem: Problem) -> None:
 def check_model(problem: Problem, options: SolveOptions) -> None:
     """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
     if options.clock_offset and problem.twist_vehicle is None:
-        raise AdjustError("a clock offset needs twist_vehicle: say how the vehicle moves at each frame")
+        raise AdjustError("a clock offset needs twist_vehicle: give the vehicle's motion at each frame")
     if options.read_out or problem.read_out_s is not None:
         needed = {"twist_vehicle": problem.twist_vehicle, "row_share": problem.observations.row_share}
         for name, values in needed.items():
@@ -92,7 +92,7 @@ def check_options(options: SolveOptions) -> None:
     if options.engine == "numba" and not options.on_cpu:
         raise AdjustError("engine=numba computes on the CPU: choose engine=torch, or device=cpu")
     if not 0 < options.gate_probability < 1:
-        raise AdjustError(f"gate_probability is {options.gate_probability}: give a share between 0 and 1")
+        raise AdjustError(f"gate_probability is {options.gate_probability}: give a fraction between 0 and 1")
     for name in ("gap_tolerance", "max_refreshes", "max_evaluations"):
         if not getattr(options, name) > 0:
             raise AdjustError(f"{name} is {getattr(options, name)}: give a number above 0")
@@ -118,7 +118,7 @@ def _check_arrays(problem: Problem) -> None:
     """Every array is one, has its shape and, but for sigmas of centres and what was seen, finite numbers."""
     seen = problem.observations
     if len(seen.camera) == 0:
-        raise AdjustError("there is no observation to adjust: detect and associate markings first")
+        raise AdjustError("there are no observations to adjust: detect and associate markings first")
     sizes = _sizes(problem) | {"observation": len(seen.camera)}
     for of, arrays in _ARRAYS.items():
         owner, prefix = (seen, "observations.") if of == "observation" else (problem, "")
@@ -134,13 +134,13 @@ def _check_arrays(problem: Problem) -> None:
                 raise AdjustError(f"{prefix}{name} holds {values.dtype}: give whole numbers")
             if name not in ("centre_sigma_m", "pinhole_px", "covariance_px"):
                 finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-                _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or correct its source")
+                _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or fix its source")
 
 
 def _check_rigid(name: str, transforms: FloatArray) -> None:
     rotation = transforms[:, :3, :3]
     off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
-    said = f"{name} {{}} is no rigid transform: its "
+    said = f"{name} {{}} is not a rigid transform: its "
     _refuse((off > 1e-6) | (np.linalg.det(rotation) < 0), said + "rotation is not orthonormal")
     _refuse((transforms[:, 3] != [0, 0, 0, 1]).any(1), said + "last row is not 0, 0, 0, 1")
 
@@ -170,7 +170,7 @@ def _fault(problem: Problem, k: int) -> str:
             return f"observation {k} names {name} {index}, but there are only {size}"
     for name in ("pinhole_px", "covariance_px"):
         if not np.isfinite(getattr(seen, name)[k]).all():
-            return f"{name} of observation {k} is not finite: remove it or correct its source"
+            return f"{name} of observation {k} is not finite: remove it or fix its source"
     (xx, xy), (yx, yy) = seen.covariance_px[k].astype(np.float64)
     intrinsic = problem.intrinsic[seen.camera[k]]
     aside = np.abs((seen.pinhole_px[k] - intrinsic[2:]) / intrinsic[:2]).max()
@@ -201,7 +201,7 @@ def _check_priors(problem: Problem) -> None:
     if not problem.read_out_sigma_s > 0:
         raise AdjustError(f"read_out_sigma_s is {problem.read_out_sigma_s}: give a number of seconds above 0")
     if problem.read_out_s is not None:
-        said = "read_out_s of camera {} is {} s: give one of 0 (all rows at once) or above"
+        said = "read_out_s of camera {} is {} s: give 0 (all rows at once) or more"
         _refuse(problem.read_out_s < 0, said, problem.read_out_s)
     _check_visits(problem)
     for one in problem.pose_sigmas:
@@ -218,8 +218,8 @@ def _check_priors(problem: Problem) -> None:
 def _check_visits(problem: Problem) -> None:
     visit = problem.visit_of_frame
     if visit.shape != (len(problem.map_from_vehicle),) or (np.diff(visit, prepend=0) < 0).any():
-        raise AdjustError("visit must number each frame's visit, from 0 and rising along the frames")
+        raise AdjustError("visit must number each frame's session, from 0 and rising along the frames")
     if visit.max(initial=0) >= len(problem.pose_sigmas):
         raise AdjustError(
-            f"visit {visit.max()} has no pose_sigma: give one for all visits, or one for each of them"
+            f"visit {visit.max()} has no pose_sigma: give one for all sessions, or one for each"
         )

@@ -23,7 +23,7 @@ CORNER_FLOOR = 1e-10  # information, 1 / m^2, that keeps a corner factorable whi
 
 PIVOT_FLOOR = 1e-12  # least pivot of a corner's second coordinate, as a share of its own information
 
-INSEPARABLE = "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
+INSEPARABLE = "corners joined by known lengths cannot be solved for together: increase their sigma_m"
 """The error of a block that has no factor."""
 
 

@@ -119,7 +119,7 @@ class Selection:
     def sentence(self) -> str:
         """One sentence on the choice."""
         if not self.scores:
-            return f"pose model '{self.name}', since too few observations repeat to choose by them"
+            return f"pose model '{self.name}', since too few observations repeat to choose"
         scores = ", ".join(f"{name} {score:.2f}" for name, score in self.scores.items())
         return f"pose model '{self.name}' predicts held-out observations best (mean loss: {scores})"
 

@@ -216,10 +216,10 @@ class Observability:
         rotation = f"rotation known to {turns.max():.3f} deg"
         if not self.unobserved:
             centre = f"centre known to {100 * self.sigma[:3].max():.1f} cm"
-            return f"{camera}: {centre}, {rotation}; the drive fixes both"
+            return f"{camera}: {centre}, {rotation}; the drive determines both"
         worst = 100 * max(self.sigma[AXES.index(axis)] for axis in self.unobserved)
         level = [axis for axis in self.unobserved if axis != "up"]
-        hint = "one turn on the route would fix them" if level else "longer sightings would fix it"
+        hint = "a turn on the route would determine them" if level else "longer tracks would determine it"
         offsets = " and ".join(self.unobserved)
         return f"{camera}: {rotation}; the {offsets} offset ({worst:.1f} cm) rests on the survey: {hint}"
 

@@ -163,7 +163,7 @@ def collect_sightings(
         if not len(marking.outline_px)
     ]
     nothing = (
-        f"no marking was found in the images of {', '.join(cameras)} of drive {drive.name}; check "
+        f"no markings were found in the images of {', '.join(cameras)} of drive {drive.name}; check "
         "that the detector knows this kind of paint and that the images show it within range."
     )
     if not rows:

@@ -378,7 +378,7 @@ class Surface:
             begin_m, step_m, datum_m = (float(one) for one in (*content["knots"][:2], content["datum_m"]))
             along = int(content["knots"][2])
         except (IndexError, KeyError, OverflowError, TypeError, ValueError):
-            raise ValueError("not a ground: numbers are missing") from None
+            raise ValueError("not a ground surface: numbers are missing") from None
         places, none = len(station), np.zeros((0, 2))
         shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
         expected = ((places, 2), (places, 2), (places,), (2,), (_SHAPE + along * _ACROSS,))
@@ -386,7 +386,7 @@ class Surface:
         arrays = (numbers, points, ahead, sense, station, ends, parameters)
         is_sound = shapes == expected and places and all(np.isfinite(one).all() for one in arrays)
         if not is_sound or step_m <= 0 or (np.diff(station) <= 0).any() or station[-1] > ends[-1, 1]:
-            raise ValueError("not a ground: its numbers do not belong together")
+            raise ValueError("not a ground surface: its numbers are inconsistent")
         paths = Paths(np.zeros(0, np.int64), points, ahead, sense, station, none, none, none, ends)
         unknown = np.zeros((len(parameters), len(parameters)))
         knots = (begin_m, step_m, along)
@@ -419,7 +419,7 @@ class Surface:
         ):
             height_cm = 100 * self.seen_height_m(at + away, frame)
             told.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
-        return f"the ground around the vehicle is no plane: {', '.join(told)}"
+        return f"the ground around the vehicle is not a plane: {', '.join(told)}"
 
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded

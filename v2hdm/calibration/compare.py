@@ -98,7 +98,7 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
     first, second = before.info, after.info
     who = f"camera '{first.name}'"
     if first.name != second.name:
-        raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
+        raise MapFileError(f"{who} and '{second.name}': two different cameras; give two calibrations of one")
     kinds = [(info.width, info.height, info.distortion_model) for info in (first, second)]
     if kinds[0] != kinds[1]:
         raise MapFileError(f"{who}: image sizes or lens models differ; calibrate with the same intrinsics")
@@ -112,6 +112,6 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
         covariance = calibration.covariance
         if covariance is None or np.linalg.eigvalsh(covariance).min() <= 0:
             raise MapFileError(
-                f"{who}: the {which} calibration has no covariance, so that no movement can be told from its "
-                "error; take one that v2hdm map or v2hdm calibrate ground wrote"
+                f"{who}: the {which} calibration has no covariance to compare a movement with; "
+                "take one that v2hdm map or v2hdm calibrate ground wrote"
             )

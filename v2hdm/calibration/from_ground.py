@@ -28,8 +28,8 @@ _NAMES = {
 
 _WHY = {
     GroundStatus.NO_MATCH: "the ground does not match between images: check poses, clock and guess",
-    GroundStatus.NO_TEXTURE: "the ground is too dark or too even to be found again: drive in better light",
-    GroundStatus.TOO_LITTLE: "too little ground is seen by two images: drive further, or widen roi_vehicle",
+    GroundStatus.NO_TEXTURE: "the ground is too dark or too smooth to match: drive in better light",
+    GroundStatus.TOO_LITTLE: "too little ground appears in two images: drive farther, or enlarge roi_vehicle",
 }
 
 
@@ -86,7 +86,7 @@ def _lines(estimate: GroundEstimate) -> Iterator[str]:
     calibration = estimate.calibration
     if calibration is None or calibration.covariance is None:
         reading = estimate.reading
-        other = "" if reading is Reading.AS_GIVEN else f"; it does with the poses read as: {reading.value}"
+        other = "" if reading is Reading.AS_GIVEN else f"; it does if the poses are read as:  {reading.value}"
         yield f"{estimate.camera}: {_WHY[estimate.status]}{other}"
         return
     angles, place = mounting_words(calibration.cam_from_vehicle, calibration.covariance)
@@ -98,7 +98,7 @@ def _lines(estimate: GroundEstimate) -> Iterator[str]:
             value, sigma = factor * parameter.value, factor * parameter.sigma
             found.append(f"{name} {value:+.2g} +- {sigma:.2g} {unit}".rstrip())
     if found:
-        yield f"  beside it: {', '.join(found)}"
+        yield f"  also: {', '.join(found)}"
     for parameter in estimate.parameters.values():
         if not parameter.observable:
             yield f"  cannot tell {_NAMES[parameter.name][0]}: {parameter.why_not}"

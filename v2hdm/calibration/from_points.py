@@ -53,7 +53,7 @@ _HEIGHT_M, _LOG_HEIGHT = 2.0, 0.7
 _SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)  # usual ratios of the sizes of one camera's images
 _STARTS, _ROUNDS = 1, 6  # enough to tell a reading that explains the points from one that does not
 _TOLD = 300  # points, at most, that readings are compared by
-_UNRELATED = "the pixels have nothing to do with the places; check which pixel belongs to which place"
+_UNRELATED = "pixels and places are unrelated; check which pixel belongs to which place"
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def calibrate_from_points(
         if not (np.isfinite(value) and value >= 0):
             raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
     if pixel_sigma == survey_sigma == 0:
-        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
+        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: no measurement is without error")
     table = points if isinstance(points, SurveyedPoints) else read_points(Path(points))
     check_points(table, info)
     fits = solve(table, info, Noise(pixel_sigma, survey_sigma))
@@ -136,8 +136,8 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
             raise DriveError(f"{points.path}: the points fit no mounting of this camera: {cause}")
     if not fits or not np.isfinite(fits[0].covariance).all() or _height_m(fits[0]) <= 0:
         raise DriveError(
-            f"{points.path}: the points fix no camera: they lie about on a line, or all but one do; "
-            "survey some to the left and to the right of it"
+            f"{points.path}: the points do not determine a camera: all, or all but one, lie about on a line; "
+            "survey some to its left and right"
         )
     height = _height_m(fits[0])
 
@@ -147,7 +147,7 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     unit = max(UNITS, key=lambda unit: log_odds(UNITS[unit], _MISREAD))
     if log_odds(UNITS[unit], _MISREAD) > log_odds(1.0, 1.0):
         raise DriveError(
-            f"{points.path}: the camera comes out {height:.4g} m above the ground: x and y look like {unit}; "
+            f"{points.path}: the camera would be {height:.4g} m above the ground: x and y look like {unit}; "
             f"write metres, in which that is {height * UNITS[unit]:.2f} m"
         )
     return fits
@@ -200,17 +200,17 @@ def _readings(
     px: FloatArray, ground: FloatArray, info: CameraInfo
 ) -> Iterator[tuple[str, FloatArray, FloatArray, float]]:
     """Causes, the pixels and places without them, and the scale of these pixels."""
-    mirrored = "y is counted to the right, or x backward; write y positive to the left, x forward"
+    mirrored = "y counts to the right, or x backward; write y positive to the left, x forward"
     yield mirrored, px, ground * [1.0, -1.0], 1.0
     yield "x and y are exchanged; x is forward, y to the left", px, ground[:, ::-1].copy(), 1.0
     swapped = px[:, ::-1].copy()
     yield "u and v are exchanged; u counts columns to the right, v rows down", swapped, ground, 1.0
     upward = np.column_stack([px[:, 0], info.height - 1 - px[:, 1]])
-    counted = "v is counted upward from the image's lower edge; count it down from the upper one"
+    counted = "v counts upward from the image's lower edge; count it down from the upper one"
     yield counted, upward, ground, 1.0
     for scale in _SCALES:
         size = f"the pixels are of an image {1 / scale:.3g} times as large as that of the intrinsics"
-        yield f"{size}; give both for one size", (px + 0.5) * scale - 0.5, ground, scale
+        yield f"{size}; give both at the same size", (px + 0.5) * scale - 0.5, ground, scale
 
 
 _COLUMNS = (
@@ -229,7 +229,7 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
     write_camera_info(info, folder / info.name / "camera_info.yaml")
     entry = dump_yaml({"cameras": {info.name: found.camera_entry(f"{info.name}/camera_info.yaml")}})
     (folder / ENTRY_FILE).write_text(
-        "# For drive.yaml. images: name the list of your images (docs/drive-format.md).\n" + entry,
+        "# For drive.yaml. Under images, name the list of your images (docs/drive-format.md).\n" + entry,
         encoding="utf-8",
     )
     points, off, rows = found.points, found.residuals, []

@@ -56,7 +56,7 @@ def read_points(path: Path) -> SurveyedPoints:
         rows.append([parse_number(row[column], f"{path}: line {number}: {column}") for column in COLUMNS])
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     if len(table) < LEAST_POINTS:
-        raise DriveError(f"{path}: {len(table)} points; {LEAST_POINTS} barely fix a camera: survey more")
+        raise DriveError(f"{path}: {len(table)} points; {LEAST_POINTS} barely suffice: survey more")
     return SurveyedPoints(path, tuple(names), tuple(labels), table[:, :2], table[:, 2:])
 
 
@@ -71,7 +71,7 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
     if outside.any():
         k = int(np.argmax(outside))
         u, v = points.points_px[k]
-        hint = "mend it, or name the intrinsics of this image"
+        hint = "fix it, or give the intrinsics for this image"
         if inside(points.points_px[:, ::-1]).all():
             hint = "u and v look exchanged: u counts columns to the right, v rows down"
         raise DriveError(
@@ -84,7 +84,7 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
         if len(again):
             a, b = first[same.ravel()[again[0]]], again[0]
             raise DriveError(
-                f"{points.path}: {points.names[a]} and {points.names[b]} have the same {what}; drop or mend "
+                f"{points.path}: {points.names[a]} and {points.names[b]} have the same {what}; drop or fix "
                 "one of them"
             )
 
@@ -96,7 +96,7 @@ def _columns(header: list[str], path: Path) -> list[str]:
         if columns.count(column) != 1:
             raise DriveError(
                 f"{path}: {'no' if column not in columns else 'more than one'} column '{column}'; the first "
-                f"line must name {', '.join(COLUMNS)} (pixel right and down, m forward and left); it says: "
+                f"line must name {', '.join(COLUMNS)} (pixel right and down, m forward and left); it has: "
                 f"{', '.join(header)}"
             )
     for name in columns:
@@ -274,11 +274,11 @@ def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals)
     fit, about = fits[0], fits[0].seen.info.name
     yield from _wrong_points(points, fits, residuals, about)
     spread = scatter(fit, CHANCE)
-    says = f"the points scatter {spread.ratio:.2g} times as much as --pixel-sigma and --survey-sigma say"
+    says = f"the points scatter {spread.ratio:.2g} times as much as --pixel-sigma and --survey-sigma state"
     yield judge(
         "scatter", about, spread.ratio, spread.limit, "",
         fine=says,
-        wrong=f"{says}, and the sigmas have grown by that: measure again, or state the errors as they are",
+        wrong=f"{says}, and the sigmas were increased by that: measure again, or state the actual errors",
         status=Status.WARN,
     )  # fmt: skip
     yield _intrinsics(fit, about)
@@ -287,7 +287,7 @@ def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals)
         "known ground", about, min(worst, 1e6), _WELL_KNOWN_M, "m",
         fine=f"the IPM is known to {100 * worst:.1f} cm or better around the points",
         wrong=f"the IPM is known to {worst:.2g} m only around the points: survey more of them, near and far, "
-        "left and right; points along one line fix no camera",
+        "left and right; points along one line do not determine a camera",
     )  # fmt: skip
 
 
@@ -298,7 +298,7 @@ def _wrong_points(
     named = np.flatnonzero(~fit.is_right | (residuals.probability < CHANCE / total)).tolist()
     for k in named:
         how_far = _how_far(residuals.off_px[k], residuals.off_m[k])
-        share = "counts for nothing" if not fit.is_right[k] else "still counts"
+        share = "gets no weight" if not fit.is_right[k] else "still has weight"
         says = (
             f"{points.names[k]} contradicts the others by {residuals.sigmas[k]:.0f} sigmas "
             f"({how_far}) and {share}: check its pixel and its place"
@@ -317,7 +317,7 @@ def _wrong_points(
     if rivals and named:
         other = [points.names[k] for k in np.flatnonzero(~rivals[0].is_right)]
         says = (
-            "which point is wrong cannot be told: another mounting explains the points as well, without "
+            "the wrong point cannot be found: another mounting explains the points equally well, without "
             f"{' and '.join(other) or 'leaving one out'}; survey more points"
         )
         yield Finding("rival", Status.FAIL, None, None, "", says, about)
@@ -328,15 +328,15 @@ def _intrinsics(fit: Fit, about: str) -> Finding:
     focal, sigma = tested.focal
     far = abs(focal) > _FOCAL_OFF
     recovery = (
-        "were the points clicked in an image of another size, or is this another camera's file?"
+        "were the pixels read from an image of another size, or is this another camera's file?"
         if far
-        else "calibrate the lens again, or check that the images were not resized"
+        else "recalibrate the lens, or check that the images were not resized"
     )
     size = f"{100 * focal:+.1f} +- {100 * sigma:.1f} %"
     return judge(
         "intrinsics", about, -np.log10(max(tested.probability, 1e-99)), -np.log10(CHANCE), "",
         fine=f"the points agree with the intrinsics (focal length {size})",
-        wrong=f"the points contradict the intrinsics: they want the focal length {size} longer; {recovery}",
+        wrong=f"the points contradict the intrinsics: they imply a focal length {size} longer; {recovery}",
         status=Status.FAIL if far else Status.WARN,
     )  # fmt: skip
 

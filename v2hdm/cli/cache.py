@@ -1,4 +1,4 @@
-"""``v2hdm cache list`` says what is kept; ``prune`` makes room (docs/cache.md)."""
+"""``v2hdm cache list`` lists the entries; ``prune`` makes room (docs/cache.md)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def run(arguments: Sequence[str]) -> None:
     """List or prune a cache."""
     parser = parser_of("cache")
     actions = parser.add_subparsers(dest="what", required=True)
-    shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
-    pruned = actions.add_parser("prune", help="remove what was unused for longest, and what killed runs left")
-    pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
+    shown = actions.add_parser("list", help="list entries, their size and last use")
+    pruned = actions.add_parser("prune", help="remove least recently used entries, and leftovers")
+    pruned.add_argument("--gb", type=float, required=True, help="size to keep, GB; 0 empties the cache")
     for action in (shown, pruned):
         action.add_argument("--cache", default=Path("cache"), type=Path, help="the folder (default: cache)")
     parsed = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""``v2hdm calibrate points``, ``ground`` and ``compare``, which docs/calibration.md describes."""
+"""``v2hdm calibrate points``, ``ground`` and ``compare``; see docs/calibration.md."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _SIGMA = "standard deviation of {}, per coordinate (default: %(default)g {})"
 
 
 def from_points(arguments: Sequence[str]) -> int:
-    """Mounting and IPM of a camera, each with its sigma; 0 for PASS and WARN, 3 for FAIL."""
+    """Estimate a camera's mounting and IPM with their sigmas; 0 for PASS and WARN, 3 for FAIL."""
     parser = parser_of("calibrate points")
-    columns = "CSV with the columns u, v (px), x, y (m, forward and left) and perhaps name"
+    columns = "CSV with the columns u, v (px), x, y (m, forward and left) and optionally name"
     parser.add_argument("points", type=Path, help=columns)
     written = "the camera's intrinsics, as written by ROS, Kalibr, OpenCV or COLMAP, or by this program"
     parser.add_argument("--intrinsics", type=Path, required=True, metavar="FILE", help=written)
-    parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
-    parser.add_argument("--name", help="what to call the camera (default: as the intrinsics call it)")
-    parser.add_argument("--image", type=Path, help="the image that was clicked in, for the picture")
-    for option, default, unit, of in (("pixel", 0.5, "PX", "clicking"), ("survey", 0.01, "M", "surveying")):
+    parser.add_argument("--camera-name", metavar="NAME", help="the camera to use if the file has several")
+    parser.add_argument("--name", help="name of the camera (default: that in the intrinsics)")
+    parser.add_argument("--image", type=Path, help="image that the pixels were read from, for the picture")
+    for option, default, unit, of in (("pixel", 0.5, "PX", "a pixel"), ("survey", 0.01, "M", "a survey")):
         meaning = _SIGMA.format(of, unit.lower())
         parser.add_argument(f"--{option}-sigma", type=float, default=default, metavar=unit, help=meaning)
-    parser.add_argument("--output", type=Path, help="folder of results (default: outputs/<camera>-calibrate)")
+    parser.add_argument("--output", type=Path, help="folder (default: outputs/<camera>-calibrate)")
     parsed = parser.parse_args(arguments)
     from dataclasses import replace
 
@@ -48,7 +48,7 @@ def from_points(arguments: Sequence[str]) -> int:
     if image is not None and image.shape[:2] != (info.height, info.width):
         raise DriveError(
             f"{parsed.image}: the image is {image.shape[1]} x {image.shape[0]}, but the intrinsics of "
-            f"'{info.name}' are for {info.width} x {info.height}; give both for one size"
+            f"'{info.name}' are for {info.width} x {info.height}; give both at the same size"
         )
     sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
     found = calibrate_from_points(points, info, **sigmas)
@@ -62,7 +62,7 @@ def from_points(arguments: Sequence[str]) -> int:
 
 
 def from_ground(arguments: Sequence[str]) -> int:
-    """Estimate mountings, a line for each camera, without torch; 0 for PASS and WARN, 3 for FAIL."""
+    """Estimate mountings, one line per camera, without torch; 0 for PASS and WARN, 3 for FAIL."""
     parser = parser_of("calibrate ground")
     add_drive(parser, "extrinsic")
     parsed = parser.parse_args(arguments)
@@ -82,10 +82,10 @@ _LEAST = 1e-12  # smaller probabilities are all the same
 
 
 def compare(arguments: Sequence[str]) -> int:
-    """Compare two calibrations of each camera; 0 where none has moved, 3 where one has."""
+    """Compare two calibrations of each camera; 0 if none has moved, 3 if one has."""
     parser = parser_of("calibrate compare")
     parser.add_argument("before", type=Path, help="result folder or calibration file of the earlier drive")
-    parser.add_argument("after", type=Path, help="the same of the later drive")
+    parser.add_argument("after", type=Path, help="the same from the later drive")
     parser.add_argument("--json", action="store_true", help="print one JSON list instead of lines")
     parsed = parser.parse_args(arguments)
     from v2hdm.calibration.compare import compare_calibrations, turned_alike
@@ -100,8 +100,8 @@ def compare(arguments: Sequence[str]) -> int:
             print(_line(one))
         if turned_alike(movements):
             print(
-                "all cameras have turned alike: rather than each of them, the vehicle's heading, "
-                "or the frame of the poses, has changed"
+                "all cameras have turned alike: more likely the vehicle's heading, or the frame of the "
+                "poses, has changed"
             )
     for name in sorted(before.keys() ^ after.keys()):
         print(f"{name}: only in one of the two; not compared", file=sys.stderr)
@@ -120,7 +120,7 @@ def _line(one: Movement) -> str:
     ]
     least_mm, least_deg = 1e3 * one.detectable[:3].max(), degrees(one.detectable[3:].max())
     found = (
-        f"MOVED (by chance in {max(one.probability, _LEAST):.1g} of such pairs at most)"
+        f"MOVED (by chance in at most {max(one.probability, _LEAST):.1g} of such pairs)"
         if one.moved
         else f"not moved (a shift of {least_mm:.0f} mm or a turn of {least_deg:.2f} deg would have shown)"
     )

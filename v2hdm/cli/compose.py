@@ -106,7 +106,7 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
     What its own ``defaults`` name is looked for beside it, in a folder ``run``, and among the shipped ones.
     """
     if not isinstance(read_yaml(path, ConfigError), dict):  # OmegaConf would expand whatever aliases repeat
-        raise ConfigError(f"{path}: expected 'key: value' entries; write it as conf/run/*.yaml are")
+        raise ConfigError(f"{path}: expected 'key: value' entries, as in conf/run/*.yaml")
     _refuse_headless(path)
     searched = [path.resolve().parent.parent] if path.resolve().parent.name == "run" else []
     with tempfile.TemporaryDirectory(prefix="v2hdm-") as folder:
@@ -175,7 +175,7 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     if "missing EQUAL" in message:
         bare = [one for one in overrides if "=" not in one and not one.startswith(("-", "~"))]
         named = " ".join(bare[:1]) or "an argument"
-        return ConfigError(f"configuration: '{named}' is no key=value; write drive.path={named}, see --help")
+        return ConfigError(f"configuration: '{named}' is not key=value; write drive.path={named}, see --help")
     # Of a long command line only what the message is about: the override that has the key it names.
     about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
     where = f" (in {' '.join(about or overrides)})" if 0 < len(about or overrides) <= _FEW_OVERRIDES else ""
@@ -194,7 +194,7 @@ _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous
 
 def _advice(message: str, schema: type[Any]) -> str:
     if _UNQUOTED.search(message):
-        return "a value with signs or letters of its own wants quotes: \"drive.path='müll (1)'\""
+        return "a value with special characters needs quotes: \"drive.path='müll (1)'\""
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)
     if whole:  # OmegaConf turns whole numbers into fractions, but not inside of lists
         return f"write {whole.group(1)}.0"
@@ -213,12 +213,12 @@ def _advice(message: str, schema: type[Any]) -> str:
 _USAGE = """\
 Usage: {command} [key=value ...] [--config-dir FOLDER]
 
-  +run=NAME           a run: what conf/run/NAME.yaml or FOLDER/run/NAME.yaml sets
-  key=value           sets a key; null is nothing, lists are [1.0, 2.0], texts with blanks want quotes
-  +key.name=value     adds an entry to a key that is a mapping
-  --config-dir FOLDER adds a folder of your own; its runs lie in FOLDER/run and begin with
+  +run=NAME           use the settings in conf/run/NAME.yaml or FOLDER/run/NAME.yaml
+  key=value           set a key; null means none, lists are [1.0, 2.0], texts with spaces need quotes
+  +key.name=value     add an entry to a key that is a mapping
+  --config-dir FOLDER add a folder of your own; its runs are in FOLDER/run and begin with
                       '# @package _global_'
-  --cfg job           only prints the configuration
+  --cfg job           only print the configuration
 """
 _OFTEN = {
     "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",

@@ -34,34 +34,34 @@ def run(arguments: Sequence[str]) -> None:
         "--camera",
         type=Path,
         metavar="FILE",
-        help="the camera's calibration: gives metres; or its intrinsics, by Kalibr, OpenCV, ROS, COLMAP",
+        help="the camera's calibration, for metres; or its intrinsics from Kalibr, OpenCV, ROS or COLMAP",
     )
-    parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
+    parser.add_argument("--camera-name", metavar="NAME", help="the camera to use if the file has several")
     parser.add_argument(
         "--mounting",
         type=float,
         nargs=3,
         metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
-        help="without a calibration: about how high the camera is, how far it looks down, its horizontal "
-        "field of view (default: 1.6 5 60, of which the images correct the second); intrinsics of --camera "
-        "overrule the last",
+        help="without a calibration: approximate camera height, downward pitch and horizontal field of view "
+        "(default: 1.6 5 60; the images correct the pitch); intrinsics from --camera override the field of "
+        "view",
     )
     parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
-    parser.add_argument("--model", help="ONNX file of the detector (default: the one that is shipped)")
+    parser.add_argument("--model", help="ONNX file of the detector (default: the shipped one)")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network (default: 1)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     parser.add_argument(
         "--live",
         action="store_true",
-        help="look at the newest image of a camera, or of a folder that grows, and drop those before it",
+        help="process the newest image of a camera or growing folder, and drop older ones",
     )
     parser.add_argument("--output", type=Path, help="file for the JSON lines (default: stdout)")
-    parser.add_argument("--draw", type=Path, metavar="DIR", help="folder of the images with detections drawn")
+    parser.add_argument("--draw", type=Path, metavar="DIR", help="folder for images with detections drawn")
     _detect(parser.parse_args(arguments))
 
 
 def _detect(parsed: argparse.Namespace) -> None:
-    """Detect; what is live is watched until Ctrl-C, which any other source raises on without a file."""
+    """Detect; a live source runs until Ctrl-C, which interrupts any other source without writing a file."""
     import cv2
 
     from v2hdm.detection.options import DetectorOptions
@@ -113,7 +113,7 @@ def _detect(parsed: argparse.Namespace) -> None:
             failure = error  # hours of a camera that was unplugged are kept
     _report(stopwatch, age_s)
     if parsed.live and stopwatch.images:
-        print(f"{dropped} images dropped, since newer ones had come", file=sys.stderr)
+        print(f"{dropped} images dropped for newer ones", file=sys.stderr)
     unknown = unknown_network(parsed.model) if parsed.model is not None else None
     if unknown is not None:
         print(unknown, file=sys.stderr)
@@ -148,7 +148,7 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
         if output.is_file():
             with output.open("rb") as earlier:
                 if earlier.read(len(_FIRST)) not in (b"", _FIRST):
-                    raise ConfigError(f"{output}: is there and holds no detections; give another --output")
+                    raise ConfigError(f"{output}: exists and holds no detections; give another --output")
         is_special = output.exists() and not output.is_file()  # a pipe, or /dev/null
         place = nullcontext(output) if is_special else whole_file(output.resolve())
         with place as partial, partial.open("w", encoding="utf-8") as stream:

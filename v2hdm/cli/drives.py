@@ -1,4 +1,4 @@
-"""``v2hdm check`` and ``localize``: what a drive is like, before it is mapped or in a map."""
+"""``v2hdm check`` and ``localize``: examine a drive before it is mapped, or in a map."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ def check(arguments: Sequence[str]) -> int:
     """One line per finding, a verdict and pictures, without torch; 0 for PASS and WARN, 3 for FAIL."""
     parser = parser_of("check")
     add_drive(parser, "check")
-    parser.add_argument("--no-ground", dest="ground", action="store_false", help="match no ground: faster")
-    parser.add_argument("--list-topics", action="store_true", help="only list a bag's topics and drive.yaml")
-    written, wanted = "write a bag's, video's or image folder's drive.yaml", "with --write: what it asks for"
+    parser.add_argument("--no-ground", dest="ground", action="store_false", help="skip bare ground: faster")
+    parser.add_argument("--list-topics", action="store_true", help="only print a bag's topics and drive.yaml")
+    written, wanted = (
+        "write a drive.yaml for a bag, video or image folder",
+        "with --write: values that it asks for",
+    )
     parser.add_argument("--write", type=Path, metavar="DIR", help=written)
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=wanted)
-    parser.add_argument("--all", action="store_true", help="also print the checks that passed")
+    parser.add_argument("--all", action="store_true", help="also print passed checks")
     parsed = parser.parse_args(arguments)
     if parsed.list_topics:
         from v2hdm.io.drive import ReadOptions
@@ -39,7 +42,7 @@ def check(arguments: Sequence[str]) -> int:
 
         if missing := draft_drive(parsed.drive, parsed.write, parsed.set):
             asked = [f"  --set {key}=... {why}" for key, why in missing.items()]
-            print(f"error: {parsed.drive}: nothing written, say this too:", *asked, sep="\n", file=sys.stderr)
+            print(f"error: {parsed.drive}: nothing written; also give:", *asked, sep="\n", file=sys.stderr)
             return EXIT_USER_ERROR
         print(f"{parsed.write / 'drive.yaml'} written", file=sys.stderr)
         parsed.drive = parsed.write
@@ -68,7 +71,7 @@ def _recording_of(drive: Path) -> Path:
 
 
 def localize_drive(arguments: Sequence[str]) -> int:
-    """Localise a drive in a map; 3 where the map does not explain the drive.
+    """Localise a drive in a map; 3 if the map does not explain the drive.
 
     Only the first recorded pose is used; the others show how far off it is.
     """

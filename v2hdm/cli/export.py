@@ -28,13 +28,13 @@ def run(arguments: Sequence[str]) -> None:
         action="append",
         required=True,
         metavar="NAME",
-        help="of a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; of mosaic.tif: pcd; "
-        "of a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated",
+        help="for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; for mosaic.tif: pcd; "
+        "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated",
     )
-    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of files (default: that of MAP)")
-    ways = "of lanelet2: Local, MGRS, or LocalCartesian (default for a map with an origin, else Local)"
+    parser.add_argument("--output", type=Path, metavar="DIR", help="output folder (default: that of MAP)")
+    ways = "for lanelet2: Local, MGRS, or LocalCartesian (default with an origin, else Local)"
     parser.add_argument("--projector", metavar="NAME", help=ways)
-    system = "system of a map's coordinates, such as EPSG:25832, or local for the drive's own frame"
+    system = "coordinate system of the output, such as EPSG:25832, or local for the drive's own frame"
     parser.add_argument("--crs", metavar="NAME", help=system)
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
@@ -70,7 +70,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
 
     if ground := [one for one in parsed.format if one in GROUND_FORMATS]:
         raise ConfigError(
-            f"--format {ground[0]}: a map's file does not hold the ground; have the run write it, with "
+            f"--format {ground[0]}: a map file does not hold the ground; let the run write it with "
             f"'export=[geojson,{ground[0]}]'"
         )
     check_formats(parsed.format, "--format")
@@ -83,7 +83,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     kept = ["gpkg"] if has_data else []
     files = [folder / FORMATS[one].file.format(name=name) for one in chosen if one not in kept]
     if parsed.source.resolve() in [file.resolve() for file in files]:
-        raise ConfigError(f"{parsed.source} would be written over: set another --output or --format")
+        raise ConfigError(f"{parsed.source} would be overwritten: set another --output or --format")
     for file in files:
         check(file)
     return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept)
@@ -97,7 +97,7 @@ def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list
 
     _refuse_crs(parsed, "a point cloud is in the map's own frame")
     if parsed.format != ["pcd"]:
-        raise ConfigError("--format: a mosaic is a GeoTIFF already; its other format is pcd")
+        raise ConfigError("--format: a mosaic is already a GeoTIFF; its other format is pcd")
     driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")))
 
     def height_m(places: FloatArray) -> FloatArray:
@@ -117,11 +117,11 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path, *_: object) ->
     from v2hdm.io.calibration.reading import read_calibration, read_provenance
     from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration_as
 
-    _refuse_crs(parsed, "a calibration has no place on the earth")
+    _refuse_crs(parsed, "a calibration has no position on the earth")
     unknown = [name for name in parsed.format if name not in CALIBRATION_FORMATS]
     if unknown:
         known = ", ".join(CALIBRATION_FORMATS)
-        raise ConfigError(f"--format: unknown format '{unknown[0]}' of a calibration; choose from: {known}")
+        raise ConfigError(f"--format: unknown format '{unknown[0]}' for a calibration; choose from: {known}")
     calibration, about = read_calibration(parsed.source), read_provenance(parsed.source)
     camera = calibration.info.name
     return [write_calibration_as(name, calibration, about, folder, camera) for name in parsed.format]

@@ -1,4 +1,4 @@
-"""``v2hdm NAME``: find a command, run it, and make of a user's mistake or Ctrl-C one line and exit code 2.
+"""``v2hdm NAME``: find a command and run it; a user's mistake or Ctrl-C becomes one line and exit code 2.
 
 Nothing heavy is imported here, and commands import within their work, so that ``--help`` answers at once and
 Ctrl-C is one line while torch is still being loaded, too.
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from v2hdm.verdict import Verdict
 
 _NOTHING = "interrupted; nothing was written"
-_GO_ON = "the same command goes on from there"
+_GO_ON = "the same command resumes from there"
 
 
 @dataclass(frozen=True)
 class Command:
-    """One command: its name as users type it, a sentence, the extra that it needs, and what Ctrl-C leaves."""
+    """A command: its name as typed, a sentence, the extra that it needs, and the message after Ctrl-C."""
 
     name: str
     says: str
@@ -87,14 +87,14 @@ class Command:
 _SAYS = {
     "map": "Turn a drive into a map, calibrations and a verdict.",
     "detect": "Find markings and lanes in images, one JSON object per image.",
-    "check": "Say in seconds what is wrong with a drive.",
+    "check": "Find in seconds what is wrong with a drive.",
     "calibrate points": "Calibrate a camera from surveyed ground points and their pixels.",
     "calibrate ground": "Estimate each camera's mounting from bare ground, without markings.",
     "calibrate compare": "Say whether a camera has moved between two results.",
     "localize": "Find the vehicle's poses from the markings of a map.",
-    "report": "Make the report.html of a result again.",
-    "view": "Look at a result in the browser, and correct its markings for the next run.",
-    "labels": "Label a result's markings in every image of its drive, to train from.",
+    "report": "Write the report.html of a result again.",
+    "view": "View a result in the browser, and correct its markings for the next run.",
+    "labels": "Label a result's markings in every image of its drive, for training.",
     "mosaic": "Show the ground of a result from above, before and after the optimisation.",
     "export": "Convert a map or a calibration to other formats.",
     "experiment": "Compare all methods on both ports, as the paper does.",
@@ -103,13 +103,13 @@ _SAYS = {
 }
 _EXTRAS = {"detect": None, "export": None, "cache": None}
 _INTERRUPTED = {
-    "map": "interrupted; what was found so far is kept in the cache, no result was written",
+    "map": "interrupted; finished stages are kept in the cache, no result was written",
     "detect": "interrupted before the last image; no --output was written",
-    "report": "interrupted; the report is as it was",
-    "mosaic": "interrupted; files that stand in the result folder are whole",
-    "export": "interrupted; files that were named are whole",
+    "report": "interrupted; the report is unchanged",
+    "mosaic": "interrupted; files in the result folder are complete",
+    "export": "interrupted; the files listed are complete",
     "experiment": f"interrupted; finished drives and detections are kept, {_GO_ON}",
-    "cache": "interrupted; what was removed so far is made anew when it is needed",
+    "cache": "interrupted; entries removed so far are recomputed when needed",
     "fleet": f"interrupted; finished drives are kept, {_GO_ON}",
 }
 COMMANDS = {
@@ -166,7 +166,7 @@ def script() -> int:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run a command line in this process; 0, 2 where a user must mend something, 3 for a verdict FAIL."""
+    """Run a command line in this process; 0, 2 for an error that the user can fix, 3 for verdict FAIL."""
     words = list(arguments)
     name = next((one for one in (" ".join(words[:2]), *words[:1]) if one in COMMANDS), "")
     given = words[len(name.split()) :]
@@ -188,7 +188,7 @@ _LIST = Command("v2hdm", "List the commands.", None, "interrupted")
 def _list(names: Sequence[str]) -> str:
     width = max(map(len, names))
     lines = [f"  {name:{width}}  {COMMANDS[name].says}" for name in names]
-    return "\n".join(["Usage: v2hdm COMMAND ...; v2hdm COMMAND --help explains one.", "", *lines])
+    return "\n".join(["Usage: v2hdm COMMAND ...; v2hdm COMMAND --help explains a command.", "", *lines])
 
 
 def parser_of(name: str) -> argparse.ArgumentParser:
@@ -200,8 +200,8 @@ def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     """Add the arguments of commands that read a drive; ``result`` ends the name of the default folder."""
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
     parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
-    parser.add_argument("--format", default="auto", help="of the drive, as folder or kitti (default: auto)")
-    parser.add_argument("--output", type=Path, metavar="DIR", help=f"results (outputs/<drive>-{result})")
+    parser.add_argument("--format", default="auto", help="drive format: folder or kitti (default: auto)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help=f"default: outputs/<drive>-{result}")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
 
 

@@ -14,8 +14,8 @@ def report(arguments: Sequence[str]) -> None:
     """Write ``report.html`` again: after an update, or where check points or a mosaic were added."""
     parser = parser_of("report")
     parser.add_argument("folder", type=Path, help="result folder of v2hdm map")
-    parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
-    under = "under the map: a GeoTIFF, such as an aerial picture, or a folder of XYZ tiles"
+    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    under = "picture under the map: a GeoTIFF, such as an aerial photograph, or a folder of XYZ tiles"
     parser.add_argument("--background", type=Path, metavar="PATH", help=under)
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
@@ -32,8 +32,8 @@ def view(arguments: Sequence[str]) -> None:
     """Serve the report, to correct markings in, until Ctrl-C; every correction is written at once."""
     parser = parser_of("view")
     parser.add_argument("result", type=Path, help="result folder of v2hdm map")
-    parser.add_argument("--drive", type=Path, help="the drive that it mapped (default: where it was then)")
-    parser.add_argument("--corrections", type=Path, metavar="FILE", help="(RESULT.corrections.yaml)")
+    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    parser.add_argument("--corrections", type=Path, metavar="FILE", help="default: RESULT.corrections.yaml")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
     from v2hdm.report.view import file_beside, server_of
@@ -54,9 +54,9 @@ def labels(arguments: Sequence[str]) -> None:
     """Write ``instances.json``, the map in every image of its drive, in COCO's format."""
     parser = parser_of("labels")
     parser.add_argument("result", type=Path, help="result folder of v2hdm map")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="labels (outputs/<drive>-labels)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: outputs/<drive>-labels)")
     parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
-    parser.add_argument("--range", type=float, metavar="M", default=16.0, help="farthest label (16)")
+    parser.add_argument("--range", type=float, metavar="M", default=16.0, help="range (default: 16)")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import single_drive_of
     from v2hdm.labels import FILE, write_labels
@@ -67,8 +67,8 @@ def labels(arguments: Sequence[str]) -> None:
     with result_of(folder, made, {"result": str(parsed.result), "range_m": parsed.range}) as unfinished:
         found = write_labels(parsed.result, drive, unfinished, parsed.range, steps_of("label images"))
     print(
-        f"{found['shown']} labels in {found['images']} images, {found['unsure']} of unsure visibility; "
-        f"{found['hidden']} markings are hidden where they would be\n"
+        f"{found['shown']} labels in {found['images']} images, {found['unsure']} of uncertain visibility; "
+        f"{found['hidden']} markings are hidden there\n"
         f"labels in {folder}: python -m train labels=map data.coco={folder / FILE} "
         f"data.coco_images={drive.root}"
     )
@@ -79,7 +79,7 @@ def mosaic(arguments: Sequence[str]) -> None:
     parser = parser_of("mosaic")
     parser.add_argument("result", type=Path, help="result folder of v2hdm map")
     parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
-    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="side of a pixel (0.02)")
+    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="pixel (default: 0.02)")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it
@@ -96,7 +96,7 @@ def mosaic(arguments: Sequence[str]) -> None:
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm map")
     drive = single_drive_of(parsed.result, parsed.drive, "a mosaic is")
     with added_to(parsed.result, "RESULT") as folder:
-        steps = steps_of("put images on the ground")
+        steps = steps_of("project images onto the ground")
         write_mosaic(folder, drive, parsed.resolution, parsed.device, steps)
         write_page(folder, drive)
     print(f"mosaic in {parsed.result}, and under the map of its report.html")

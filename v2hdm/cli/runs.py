@@ -58,7 +58,7 @@ def _map(job: Job) -> int:
     return exit_code(result.verdict)
 
 
-_PORTS = "name ports (+run@ports.port1=port1) or set what is missing on the command line"
+_PORTS = "name ports (+run@ports.port1=port1) or set the missing keys on the command line"
 
 
 def experiment(arguments: Sequence[str]) -> int:
@@ -85,18 +85,18 @@ def fleet(arguments: Sequence[str]) -> int:
     """
     parser = parser_of("fleet")
     parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
-    parser.add_argument("--workers", type=int, default=0, help="cores of this machine; 0 (default): all")
+    parser.add_argument("--workers", type=int, default=0, help="cores to use (default: all)")
     parser.add_argument(
         "--table",
         type=Path,
         default=Path("outputs/fleet"),
         metavar="FOLDER",
-        help="takes the table of verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
+        help="folder for the verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
     )
     parser.add_argument(
-        "--share", metavar="K/N", help="map every N-th drive, from the K-th on; its table is FOLDER-K-of-N"
+        "--share", metavar="K/N", help="map every N-th drive, starting with the K-th; table in FOLDER-K-of-N"
     )
-    parser.add_argument("--again", action="store_true", help="do what is finished again")
+    parser.add_argument("--again", action="store_true", help="map finished drives again")
     parsed = parser.parse_intermixed_args(arguments)
     from v2hdm.fleet import FleetOptions, fleet_on_terminal
     from v2hdm.fleet import exit_code as code_of
@@ -106,7 +106,7 @@ def fleet(arguments: Sequence[str]) -> int:
     overrides = [one for one in parsed.drives if "=" in one and not Path(one).exists()]
     files = [Path(one) for one in dict.fromkeys(parsed.drives) if one not in overrides]
     if not files:
-        raise ConfigError("no drive is named: give run files, as in v2hdm fleet drives/*.yaml")
+        raise ConfigError("no drives given: name run files, as in v2hdm fleet drives/*.yaml")
     table, share = parsed.table, (1, 1)
     if parsed.share is not None:
         share = _share(parsed.share)
@@ -119,5 +119,5 @@ def _share(given: str) -> tuple[int, int]:
     numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", given, re.ASCII)
     k, n = (int(one) for one in numbers.groups()) if numbers else (0, 0)
     if not 1 <= k <= n:
-        raise ConfigError(f"--share {given}: say which share of how many, from 1/4 to 4/4")
+        raise ConfigError(f"--share {given}: give K/N, such as 1/4 to 4/4")
     return k, n

@@ -72,7 +72,7 @@ def read_image(image: Image, camera: Camera) -> np.ndarray:
     if pixels.shape[:2] != expected:
         raise DriveError(
             f"{image.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but the camera_info of camera "
-            f"'{image.camera}' says {expected[1]}x{expected[0]}; mend the camera_info or the image list"
+            f"'{image.camera}' says {expected[1]}x{expected[0]}; fix the camera_info or the image list"
         )
     return pixels
 

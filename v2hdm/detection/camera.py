@@ -311,7 +311,7 @@ def camera_from_calibration(
         below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
         lowest = apply_in_front(ground_from_pinhole_px(info.intrinsic, cam_from_vehicle), below_px)[0]
         if not np.isfinite(lowest).all():
-            problem = "the image's lowest row is above the horizon; mend cam_from_vehicle"
+            problem = "the image's bottom row is above the horizon; fix cam_from_vehicle"
     if problem:
         raise MapFileError(f"calibration of camera '{info.name}': {problem}")
     ipm = ipm_from_extrinsic(info, cam_from_vehicle)
@@ -354,14 +354,14 @@ def _problem(calibration: Calibration) -> str | None:
         known = ", ".join(DISTORTION_COEFFICIENTS)
         return f"unknown distortion_model '{info.distortion_model}'; known are {known}"
     if len(info.distortion) != count:
-        return f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; mend them"
+        return f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; fix them"
     if info.width < 1 or info.height < 1 or min(info.intrinsic[0, 0], info.intrinsic[1, 1]) <= 0:
-        return "image size and focal lengths must be positive; mend them"
+        return "image size and focal lengths must be positive; fix them"
     if np.abs(cam_from_vehicle).max() > _FARTHEST_MOUNT_M:
-        return f"cam_from_vehicle puts the camera beyond {_FARTHEST_MOUNT_M:g} m from the vehicle; mend it"
+        return f"cam_from_vehicle puts the camera beyond {_FARTHEST_MOUNT_M:g} m from the vehicle; fix it"
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ROTATION_TOLERANCE
     if not rigid or np.linalg.det(rotation) < 0 or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1]):
-        return "cam_from_vehicle is no rotation and translation; write it again with `python -m v2hdm.map`"
+        return "cam_from_vehicle is not a rotation and translation; write it again with `python -m v2hdm.map`"
     if camera_centre(cam_from_vehicle)[2] <= 0:
-        return "cam_from_vehicle puts the camera on or under the ground; mend it"
+        return "cam_from_vehicle puts the camera on or under the ground; fix it"
     return None

@@ -170,9 +170,9 @@ def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetect
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
     expected, problem = (camera.info.height, camera.info.width, 3), None
     if not isinstance(image_bgr, np.ndarray):
-        problem = f"no image but {shown(image_bgr)}; cv2.imread gives None where there is no file"
+        problem = f"not an image but {shown(image_bgr)}; cv2.imread gives None if the file is missing"
     elif image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
         problem = f"an image {image_bgr.shape} {image_bgr.dtype}, its camera_info says {expected} uint8; "
-        problem += "mend the camera_info or pick the images that belong to it"
+        problem += "fix the camera_info or pick the images that belong to it"
     if problem:
         raise DetectorError(f"camera '{camera.info.name}': got {problem}")

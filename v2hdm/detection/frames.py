@@ -36,7 +36,7 @@ def read_bgr(path: Path) -> np.ndarray:
     pixels = read_pixels(path, _AS_STORED)
     if pixels.dtype != np.uint8:
         raise DriveError(
-            f"{path}: the image has {8 * pixels.dtype.itemsize} bits a channel; convert it to 8 bits"
+            f"{path}: the image has {8 * pixels.dtype.itemsize} bits per channel; convert it to 8 bits"
         )
     if pixels.ndim == 2:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
@@ -81,21 +81,23 @@ def video_frames(path: Path) -> Iterator[Frame]:
     refused = f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
     with _capture(str(path), refused) as capture:
         if turned := int(capture.get(cv2.CAP_PROP_ORIENTATION_META)):
-            _log.warning("%s: its frames are turned by %d degrees, as it says; calibrate those", path, turned)
+            _log.warning(
+                "%s: frames are rotated by %d degrees (metadata); calibrate the rotated ones", path, turned
+            )
         promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         count = 0
         for count, pixels in enumerate(_pixels(capture), start=1):
             stamp_s, name = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, f"{path.stem}_{count - 1:06d}"
             yield Frame(str(path), name, count - 1, stamp_s, pixels)
         if not count:
-            raise DriveError(f"{path}: the video has no frame that can be read; copy or convert it again")
+            raise DriveError(f"{path}: the video has no readable frame; copy or convert it again")
         if count < promised:
             _log.warning("%s: the video ends after %d of %d frames; is it cut off?", path, count, promised)
 
 
 def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
     """Frames of a live camera by its index, perhaps of ``size``; raises DriveError where it gives no more."""
-    refused = f"camera {number}: does not open; is it plugged in and used by no one else?"
+    refused = f"camera {number}: cannot be opened; is it plugged in, and not in use?"
     with _capture(min(number, _MOST_CAMERAS), refused) as capture:
         if size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
@@ -104,7 +106,7 @@ def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[
         for count, pixels in enumerate(_pixels(capture), start=1):
             name = f"camera{number}_{count - 1:06d}"
             yield Frame(f"camera {number}", name, count - 1, time.time(), pixels)
-        raise DriveError(f"camera {number}: gives no image after {count} frames; check its cable")
+        raise DriveError(f"camera {number}: no image after {count} frames; check its cable")
 
 
 class NewestFrames(Iterator[Frame]):

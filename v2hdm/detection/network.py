@@ -166,13 +166,13 @@ class Network:
             expected = (1, count, padded.shape[0] // stride, padded.shape[1] // stride)
             if output.shape != expected:
                 raise DetectorError(
-                    f"{self.path}: {name} is {output.shape} where {expected} was promised; export it again"
+                    f"{self.path}: {name} is {output.shape} instead of {expected}; export it again"
                 )
             found.append(np.asarray(output[0, :, : -(-height // stride), : -(-width // stride)]))
         # A sum meets every value: not-a-number among the weights of an output spreads over all of it.
         if not all(np.isfinite(output[0].sum()) for output in found):
             raise DetectorError(
-                f"{self.path}: the network gives values that are not finite; export an earlier checkpoint"
+                f"{self.path}: the network's outputs are not finite; export an earlier checkpoint"
             )
         paint, kinds, lanes = found
         return RawOutput(paint[0], kinds, lanes)
@@ -272,7 +272,7 @@ def check_device(device: str) -> None:
     if provider not in onnxruntime.get_available_providers():
         raise DetectorError(
             f"detector.device is {device}, but this onnxruntime has no {provider}: install onnxruntime-gpu "
-            "in its place, or set detector.device=cpu"
+            "instead, or set detector.device=cpu"
         )
 
 
@@ -333,13 +333,13 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
     elif len(set(info.classes)) < len(info.classes) or any(
         isinstance(count, int) and count != len(info.classes) for count in channels
     ):
-        problem = f"its {len(info.classes)} classes are not one for each channel of kinds; export it again"
+        problem = f"its {len(info.classes)} classes do not match the channels of kinds; export it again"
     elif not 0 < info.multiple <= _MOST_MULTIPLE or min(info.strides) < 1:
-        problem = f"multiple {info.multiple} and strides {info.strides} are none; export it again"
+        problem = f"multiple {info.multiple} and strides {info.strides} are invalid; export it again"
     elif any(info.multiple % stride for stride in info.strides):
         problem = f"strides {info.strides} do not divide multiple {info.multiple}; export it again"
     elif info.kind_stride % info.paint_stride:
-        problem = f"the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "
+        problem = f"the stride of kinds, {info.kind_stride}, is not a multiple of that of paint, "
         problem += f"{info.paint_stride}; export it again"
     elif names != (["image"], _OUTPUTS):
         problem = f"inputs and outputs are {names}, not ['image'] and {_OUTPUTS}; export it again"

@@ -23,17 +23,16 @@ class DetectorOptions:
     """Settings of :class:`v2hdm.detection.detector.Detector`.
 
     Attributes:
-        model: path of the ONNX file; None takes the one that is shipped.
-        device: what the network runs on, ``cpu`` or ``cuda``; the rest of the detector runs on the CPU.
-        threads: threads of one onnxruntime session. Throughput comes from worker processes.
-        blur_px: standard deviation of the image's point spread, pixel aperture included, in px;
-            None measures it on the near markings. It decides the far corners' bias: 0.6 to 1.2 px
-            per px of error.
+        model: path of the ONNX file; None for the shipped one.
+        device: device of the network, ``cpu`` or ``cuda``; the rest of the detector runs on the CPU.
+        threads: number of threads of one onnxruntime session. Throughput comes from worker processes.
+        blur_px: standard deviation of the image's point spread, including the pixel aperture, px; None
+            measures it on near markings. Each px of error biases far corners by 0.6 to 1.2 px.
         max_range_m: markings and lane points farther from the camera on the ground are dropped.
-        min_score: least mean class probability of a blob.
-        min_confidence: least probability, by all evidence, that a quadrilateral is a whole marking.
-        mirrored: ask the network of the mirror image, too, and take the mean: fewer errors for more time.
-        border_px: corners nearer to the image border are no points.
+        min_score: minimum mean class probability of a blob.
+        min_confidence: minimum probability, given all evidence, that a quadrilateral is a whole marking.
+        mirrored: also run the network on the mirror image and average: fewer errors for more time.
+        border_px: corners closer to the image border are not used.
         lane_step_m: spacing of lane points on the ground.
     """
 
@@ -50,11 +49,11 @@ class DetectorOptions:
 
     @classmethod
     def for_mapping(cls) -> DetectorOptions:
-        """Defaults of the mapping, which weighs corners by their covariance and sees each many times."""
+        """Defaults for mapping, which weighs corners by covariance and observes each one many times."""
         return cls(min_confidence=0.3, mirrored=True)
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where a value is out of range."""
+        """Raise ConfigError if a value is out of range."""
         check_settings(self, _RANGES, "detector.")
         if self.device not in DEVICES:
             raise ConfigError(f"detector.device is {shown(self.device)}: choose {' or '.join(DEVICES)}")

@@ -20,7 +20,7 @@ OURS = "ours"
 PAPER = "paper"
 RECIPES: Mapping[str, str] = {
     OURS: "the settings as configured",
-    PAPER: "mapping.pose_model=paper mapping.loss=none: poses at their word, plain least squares",
+    PAPER: "mapping.pose_model=paper mapping.loss=none: recorded poses taken as exact, plain least squares",
     INCREMENTAL: "mode=incremental: marking by marking, as on the vehicle",
 }
 """Ways to map a drive, by name; the first is always run."""
@@ -30,8 +30,8 @@ RECIPES: Mapping[str, str] = {
 class Site:
     """One port of the experiment, as ``conf/run/port1.yaml`` describes it.
 
-    ``simulate`` is rendered once with every seed. Without it ``drive`` is read, and mapped once. A ``mosaic``
-    is made by a run alone.
+    ``simulate`` is rendered once per seed. Without it ``drive`` is read, and mapped once. ``mosaic`` has no
+    effect: only ``v2hdm map`` makes one.
     """
 
     name: str | None = None
@@ -45,15 +45,15 @@ class ExperimentConfig:
     """Everything about one experiment.
 
     Attributes:
-        ports: what is driven through, by name.
-        seeds: of the rendered ports; each seed is another port, another drive and another calibration.
-        recipes: beside ``ours``: ``paper`` and ``incremental`` (:data:`RECIPES`).
+        ports: the ports and drives to map, by name.
+        seeds: seeds of the rendered ports; each gives a different port, drive and calibration.
+        recipes: recipes to run, besides ``ours``: ``paper`` and ``incremental`` (:data:`RECIPES`).
         detector: settings of the detector.
         mapping: settings of the mapping.
-        name: names the results, ``<output>/<name>/``.
-        output: folder that takes the results.
-        cache: folder that keeps rendered drives, and what each stage has found.
-        workers: processes, each of which takes one drive at a time; 0 takes one per core.
+        name: name of the results folder, ``<output>/<name>/``.
+        output: folder for the results.
+        cache: folder for rendered drives and the results of each stage.
+        workers: number of processes, each of which maps one drive at a time; 0 for one per core.
     """
 
     ports: dict[str, Site] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class ExperimentConfig:
 
 @dataclass(frozen=True)
 class Job:
-    """One drive of the experiment: a port under one seed, None if it is read; ``options`` by recipe."""
+    """One drive of the experiment: a port under one seed (None if it is read), and ``options`` by recipe."""
 
     port: str
     seed: int | None
@@ -80,12 +80,12 @@ class Job:
 
     @property
     def title(self) -> str:
-        """The drive in words."""
+        """The drive's name and seed, for messages."""
         return self.port if self.seed is None else f"{self.port} seed {self.seed}"
 
 
 def jobs(config: ExperimentConfig) -> list[Job]:
-    """The drives of an experiment, seed by seed, so that what is finished first compares all ports."""
+    """The drives of an experiment, seed by seed, so that the first results compare all ports."""
     _check(config)
     changed: dict[str, dict[str, Any]] = {
         OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}
@@ -107,11 +107,11 @@ def _check(config: ExperimentConfig) -> None:
         refuse_url(Path(place))
     for key in (config.name, *config.ports):
         if not key.strip(".") or "/" in key:
-            raise ConfigError(f"name is {key!r}: give the name of a folder, without '/'")
+            raise ConfigError(f"name is {key!r}: give a folder name without '/'")
     if not config.ports:
         raise ConfigError("ports is empty: name one, as in +run@ports.port1=port1")
     if not config.seeds or len(set(config.seeds)) < len(config.seeds) or min(config.seeds) < 0:
-        raise ConfigError(f"seeds is {config.seeds}: give different whole numbers, zero or greater")
+        raise ConfigError(f"seeds is {config.seeds}: give different whole numbers, 0 or more")
     if config.workers < 0:
         raise ConfigError(f"workers is {config.workers}: set 0 for one per core, or a positive number")
     for recipe in config.recipes:

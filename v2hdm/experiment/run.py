@@ -66,8 +66,8 @@ def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     tested = claims(measured)
     for claim in tested:
         if not claim.holds:
-            difference = f"{claim.where}: {claim.text} is {claim.figure}, asked {claim.limit}"
+            difference = f"{claim.where}: {claim.text} is {claim.figure}, expected {claim.limit}"
             plain(console, f"disagrees with the paper: {difference}")
     agree = sum(claim.holds for claim in tested)
     plain(console, f"{agree} of {len(tested)} figures agree with the paper's claims")
-    plain(console, f"results in {folder}: begin with experiment.md and figures.md")
+    plain(console, f"results in {folder}: start with experiment.md and figures.md")

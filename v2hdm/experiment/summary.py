@@ -270,7 +270,7 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
         site.set_title(f"{measured.title}: ENI against ONI, {cameras}")
         x, y = _crowd(true.mean(axis=1)).tolist()
         detail.set(xlim=(x - _CLOSE_UP_M, x + _CLOSE_UP_M), ylim=(y - _CLOSE_UP_M, y + _CLOSE_UP_M))
-        detail.set_title("Where most markings stand together")
+        detail.set_title("Where markings are densest")
     said: dict[str, Any] = {"drive": measured.title, "cameras": cameras, "markings": len(common)}
     for method, corners in moved.items():
         rmse_cm = 100 * np.sqrt(((corners - true) ** 2).sum(axis=2).mean())
@@ -353,5 +353,5 @@ def _draw_boxes(axes: Axes, found: Matched) -> int:
     top = float(np.percentile(error_cm, _TOP_PERCENTILE))
     axes.set(xlim=(0, len(number) + 1), ylim=(0, 1.05 * top), axisbelow=True)
     axes.grid(axis="y", color=style.GRID)
-    axes.set(xlabel="marking, in the order of the route", ylabel="corner error (cm)")
+    axes.set(xlabel="marking, in route order", ylabel="corner error (cm)")
     return int((error_cm > 1.05 * top).sum())

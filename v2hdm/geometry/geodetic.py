@@ -53,12 +53,12 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     """
     system = _system(crs, where, error)
     if not system.is_projected:
-        advice = "give latitude and longitude as such, or a projected one"
+        advice = "give latitude and longitude, or a projected system"
         raise error(f"{where}: {crs} is not projected; {advice}")
     lon, lat = _inverse_of(crs).transform(points[:, 0], points[:, 1])
     geodetic = np.column_stack([lat, lon, points[:, 2]])
     if not np.isfinite(geodetic).all():
-        raise error(f"{where}: some points lie outside of {crs}; check it and the order easting, northing")
+        raise error(f"{where}: some points lie outside {crs}; check it and the order easting, northing")
     return geodetic
 
 
@@ -96,26 +96,26 @@ class Grid:
             return cls(crs, origin)
         system, datum = _system(crs, where, error), datum_of(crs, where, error)
         if origin is None:
-            raise error(f"{where}: {crs} needs a place on the earth, and the map has none; give {LOCAL}")
+            raise error(f"{where}: {crs} needs an origin on the earth, which the map lacks; give {LOCAL}")
         fit = utm_of(origin)
         if (code := system.to_authority(min_confidence=100)) is None:
-            raise error(f"{where}: '{crs}' has no code by which other programs know it; give {fit}")
+            raise error(f"{where}: '{crs}' has no code that other programs know; give {fit}")
         if system.is_compound or not (system.is_projected or system.is_geographic):
-            raise error(f"{where}: {crs} has heights or axes of its own; give its horizontal part")
+            raise error(f"{where}: {crs} has a vertical part or unusual axes; give its horizontal part")
         if datum.replace(" ", "") != origin.datum.replace(" ", ""):
             raise error(
-                f"{where}: {crs} is of {datum}, the map of {origin.datum}, which differ by decimetres; give "
+                f"{where}: {crs} is on {datum}, the map on {origin.datum}, which differ by decimetres; give "
                 f"{fit}, or state the datum of the drive's poses (drive.yaml, origin, datum)"
             )
         bare = system.is_geographic or system.axis_info[0].unit_conversion_factor != 1.0
         if metres and bare:
-            raise error(f"{where}: {metres} holds metres, which {crs} does not have; give {fit}")
+            raise error(f"{where}: {metres} holds metres, but {crs} is not in metres; give {fit}")
         west, south, east, north = system.area_of_use.bounds if system.area_of_use else (-180, -90, 180, 90)
         width_deg = (east - west) % 360 or 360
         inside = (origin.longitude_deg - west + _BESIDE_DEG) % 360 <= width_deg + 2 * _BESIDE_DEG
         if not inside or not south - _BESIDE_DEG <= origin.latitude_deg <= north + _BESIDE_DEG:
             at = f"latitude {origin.latitude_deg:.2f}, longitude {origin.longitude_deg:.2f}"
-            raise error(f"{where}: the site, at {at}, lies outside of {crs} ({system.name}); give {fit}")
+            raise error(f"{where}: the site, at {at}, lies outside {crs} ({system.name}); give {fit}")
         return cls(":".join(code), origin)
 
     @property
@@ -188,7 +188,7 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
     pyproj = need("pyproj", "map", f"{where}: crs", error)
     factors = pyproj.Proj(_horizontal(crs)).get_factors(here[:, 1], here[:, 0])
     if np.max(factors.angular_distortion) > _CONFORMAL_DEG:
-        raise error(f"{where}: {crs} does not keep angles; give headings from true north (heading: true)")
+        raise error(f"{where}: {crs} is not conformal; give headings from true north (heading: true)")
     return np.asarray(np.radians(factors.meridian_convergence))
 
 
@@ -221,8 +221,8 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
         or abs(ellipsoid.semi_minor_metre - _SEMI_MAJOR_M * (1 - _FLATTENING)) > _SAME_ELLIPSOID_M
     ):
         raise error(
-            f"{where}: {crs} ({system.name}) is of no satellite datum; convert the coordinates to one with "
-            "your survey office's transformation (in Europe ETRS89, such as EPSG:25832)"
+            f"{where}: {crs} ({system.name}) is not on a satellite datum; convert the coordinates to one "
+            "with your survey office's transformation (in Europe ETRS89, such as EPSG:25832)"
         )
     return system
 

@@ -237,7 +237,7 @@ def with_clock_offsets(
         if not own:
             raise DriveError(
                 f"{root}: {1e3 * offset_s[name]:.0f} ms after their stamps, no image of '{name}' "
-                "has a pose; record poses for as long as images"
+                "has a pose; record poses as long as images"
             )
         images += own
     return replace(drive, images=tuple(sorted(images, key=in_order)))

@@ -33,14 +33,14 @@ and a bent lens looks like a bent road."""
 # Axis of the centre, and how far from its survey it may be, m.
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
 _STRAIGHT = "the vehicle drives straight: drive a turn"
-_FEW = "too few matches: drive further"
+_FEW = "too few matches: drive farther"
 # Standard deviation above which a value says nothing, a third of the smallest fault worth reporting, and
 # which drive would make it smaller.
 _OBSERVABLE = {
     "clock_s": (0.015, "speed and direction hardly change: drive a turn"),
     "focal_scale": (0.01, "the camera looks too level and the vehicle drives straight: drive a turn"),
     "distortion_k1": (
-        0.03, "too little ground is matched away from the image's middle: drive on rougher ground",
+        0.03, "too little ground is matched away from the image centre: drive on rougher ground",
     ),
     "grade": (0.001, _FEW),
     "up_m": (0.03, _FEW),

@@ -45,7 +45,7 @@ def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, wher
     """Refuse poses off the earth, or far from the map's ``origin`` on it."""
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
-        raise DriveError(f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend it")
+        raise DriveError(f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; fix it")
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
@@ -62,7 +62,7 @@ def check_geodetic(geodetic: FloatArray, where: str) -> None:
         latitude, longitude, height_m = geodetic[row]
         raise DriveError(
             f"{where}: position {row + 1}: latitude {latitude:g}, longitude {longitude:g}, height "
-            f"{height_m:g} m: latitude must lie within +-90 and longitude within +-180 degrees; mend them"
+            f"{height_m:g} m: latitude must lie within +-90 and longitude within +-180 degrees; fix them"
         )
 
 
@@ -72,7 +72,7 @@ def read_tum(path: Path) -> Trajectory:
     for number, line in _content_lines(path, "holds no pose", _COLUMNS):
         where, parts = f"{path}: line {number}", line.replace(",", " ").split()
         if len(parts) != 8:
-            raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
+            raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; fix that line")
         rows[number] = [parse_number(part, where) for part in parts]
     numbers, table = list(rows), np.array(list(rows.values()))
     _check_rising(table[:, 0], numbers, path)
@@ -97,7 +97,7 @@ def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
     for number, line in _content_lines(path, "lists no image", "timestamp filename"):
         where, parts = f"{path}: line {number}", line.split(maxsplit=1)
         if len(parts) != 2:
-            raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
+            raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; fix that line")
         stamps[number] = parse_number(parts[0], where)
         names.append(parts[1])
     stamp_s = np.array(list(stamps.values()))
@@ -126,9 +126,9 @@ def parse_number(text: str, where: str) -> float:
         value = float(text)
     except ValueError:
         comma = "; write a decimal point" if "," in text else ""
-        raise DriveError(f"{where}: '{text}' is not a number{comma}; mend that line") from None
+        raise DriveError(f"{where}: '{text}' is not a number{comma}; fix that line") from None
     if not np.isfinite(value):
-        raise DriveError(f"{where}: '{text}' is not a finite number; drop or mend that line")
+        raise DriveError(f"{where}: '{text}' is not a finite number; drop or fix that line")
     return value
 
 

@@ -235,7 +235,7 @@ def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
             axis.set_ylabel(f"{name}, {unit}")
             axis.grid(alpha=0.3)
         axes[0].legend(loc="upper right", ncols=3, fontsize=8)
-        axes[0].set_title("Localised by the map's markings, less the recorded pose")
+        axes[0].set_title("Localised pose minus recorded pose")
         axes[-1].set_xlabel("time, s")
 
 

@@ -188,7 +188,7 @@ def solve_bundle(
     if not len(row):
         raise MappingError(
             "no marking was seen in two images, so nothing can be optimised; drive past the markings "
-            "at a lower speed or raise the image rate."
+            "more slowly or raise the image rate."
         )
     knots, corners_start = lanes or (None, None)
     on_line = known_elsewhere(association, sightings.valid & usable, usable)

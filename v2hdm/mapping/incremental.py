@@ -94,7 +94,7 @@ class IncrementalMapper:
         due, ended = _FIRST_LINK_MARKINGS, False
         while not ended:
             association, ended = self._take_up_safely(tracks, usable, due)
-            progress(f"linking anew with {len(self._places)} markings mapped")
+            progress(f"associating again with {len(self._places)} markings mapped")
             present = replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)
             rig = self._solve(association, usable, present)
             tracks, usable = self._link(rig, False)

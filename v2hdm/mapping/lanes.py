@@ -110,7 +110,7 @@ def find_knots(
     alone = np.flatnonzero(np.bincount(lane[enough], minlength=len(lanes)) == 0)
     if len(alone):
         _log.warning(
-            "%d of %d lane lines take no part in the adjustment, the first at (%.1f, %.1f): too few images "
+            "%d of %d lane lines are not in the adjustment, the first at (%.1f, %.1f): too few images "
             "show any one place of them; drive past once more, or lower mapping.lanes.min_images",
             len(alone), len(lanes), *lanes[alone[0]].points_map[0],
         )  # fmt: skip

@@ -162,7 +162,7 @@ def run_methods(
     options = options or MappingOptions()
     check_options(options)
     if options.survey.file is not None:
-        raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
+        raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it and give its points")
     progress("linking sightings")
     given = Inputs(drive, detections, cameras, options)
     results: dict[str, MethodResult] = {}
@@ -272,7 +272,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     lost = without_corner(options.survey, bundle.problem.control)
     if len(lost):
         _log.warning(
-            "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
+            "%d of %d surveyed points are not used, since no map corner matches them within %g m: %s",
             len(lost), len(options.survey.points), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
     known = observability(bundle.problem, solution)

@@ -319,7 +319,7 @@ class Optimiser:
         try:
             return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the ground stays a plane, since no surface could be tried: %s", failure)
+            _log.warning("the ground stays a plane, since no surface could be fitted: %s", failure)
             return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
@@ -481,7 +481,7 @@ class Optimiser:
         try:
             selection = select_model(self._as_stated(bundle), bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the pose model stays %r, since none could be chosen: %s", _SETTLED_MODEL, failure)
+            _log.warning("the pose model stays %r, since none could be selected: %s", _SETTLED_MODEL, failure)
             return _SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores

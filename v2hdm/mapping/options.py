@@ -36,9 +36,9 @@ _RANGES = dict.fromkeys(
 class SizeOptions:
     """Sizes of classes that are painted to a standard, as factors of the joint solve.
 
-    ``by_class_m`` holds length and width, m: of diamonds the diagonals, of other classes the sides, as in
-    ``{diamond: [1.0, 0.7]}``. The paint keeps them up to ``sigma_m``; a marking that is off by more than
-    ``tolerance``, as a share of length or width, is none of that size.
+    ``by_class_m`` holds length and width, m (diagonals of diamonds, sides of other classes), as in
+    ``{diamond: [1.0, 0.7]}``. The paint matches them to within ``sigma_m``. A marking that is off by more
+    than ``tolerance``, as a fraction of length or width, is not of that size.
     """
 
     by_class_m: dict[str, list[float]] = field(default_factory=dict)
@@ -48,9 +48,9 @@ class SizeOptions:
 
 @dataclass(kw_only=True)
 class ControlOptions:
-    """A corner of a marking that a survey has measured.
+    """A surveyed corner of a marking.
 
-    ``id`` is its name in the survey, ``position_map`` its x and y and ``sigma_m`` theirs, m.
+    ``id`` is its name in the survey, ``position_map`` its x and y, ``sigma_m`` their standard deviations, m.
     """
 
     id: str
@@ -60,15 +60,14 @@ class ControlOptions:
 
 @dataclass(kw_only=True)
 class SurveyOptions:
-    """Corners of markings that a survey has measured, as factors of the joint solve.
+    """Surveyed corners of markings, as factors of the joint solve.
 
-    ``file`` is a CSV of control points and of check points, which are held out (docs/accuracy.md); ``crs`` is
-    the projected system of its eastings and northings, such as ``EPSG:32632``, and ``geoid_m`` the height of
-    the geoid above the ellipsoid where its heights count from the sea.
-    ``points`` are control points in the frame of the recorded poses. A point of the file that states no sigma
-    is known up to ``sigma_m``. Each control point ties down the nearest corner of the map within ``reach_m``.
-    Nothing else can tell the drift of a receiver from the ground: no camera sees what moves the vehicle and
-    its map alike.
+    ``file`` is a CSV of control points and of check points, which are held out (docs/accuracy.md).
+    ``crs`` is the projected system of its eastings and northings, such as ``EPSG:32632``.
+    ``geoid_m`` is the geoid's height above the ellipsoid, for heights above sea level.
+    ``points`` are control points in the frame of the recorded poses. ``sigma_m`` is the standard deviation
+    of points in the file that state none. Each control point ties down the nearest corner of the map within
+    ``reach_m``. Only a survey reveals a receiver's drift: no camera sees motion that vehicle and map share.
     """
 
     file: str | None = None
@@ -89,24 +88,24 @@ class SurveyOptions:
 
 @dataclass(kw_only=True)
 class MappingOptions:
-    """Everything about the mapping but the solver's own settings.
+    """Settings of the mapping, except the solver's own.
 
-    Sightings farther than ``max_range_m`` from the camera start no marking, but join the one that alone they
-    fit: by themselves they would tie the old place of a repainted marking to its new one.
-    ``model_floor_px`` is added to every corner's covariance for what no corner fit knows of: lens, shutter.
-    ``pose_model`` says what of each frame's pose is estimated along with the map: ``paper``, nothing;
-    ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
-    clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
-    ``loss_scale`` are the robust loss of the solver.
-    ``estimate_read_out`` estimates each camera's read-out time (rolling shutter), near the one that the drive
-    states.
-    ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
-    and in the end solved as ``batch`` does.
-    ``ground`` is ``plane``, once the recorded road is laid flat; ``surface``, which rises or falls with the
-    distance from the vehicle's own path, as a road with a crown does, and is a smooth spline beside; or
-    ``auto``, the plane unless the drive contradicts it and a surface predicts held-out observations better.
-    ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
-    ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
+    Attributes:
+        max_range_m: sightings farther from the camera start no marking, but join one if only that one fits;
+            starting one, they could tie a repainted marking's old place to its new one.
+        model_floor_px: added to every corner's covariance for errors that no corner fit knows: lens, shutter.
+        pose_model: the part of each frame's pose that is estimated: ``paper``, none; ``roll_pitch``;
+            ``full``, also heading and position; ``heave``, also height; ``clock``, also each camera's clock
+            offset; ``auto``, the one that predicts held-out observations best.
+        loss: robust loss of the solver: ``none``, ``huber``, ``cauchy`` or ``geman_mcclure``.
+        loss_scale: residual, in standard deviations, from which the loss departs from least squares.
+        estimate_read_out: estimate each camera's read-out time (rolling shutter) near the stated one.
+        mode: ``batch``; or ``incremental``, marking by marking as on the vehicle, then solved like batch.
+        ground: ``plane``, once the recorded road is laid flat; ``surface``, a cross-section along the
+            vehicle's path plus a smooth spline; or ``auto``, the plane unless the drive contradicts it and
+            a surface predicts held-out observations better.
+        rounds: number of times that association under the optimised extrinsic and a joint solve repeat.
+        device: torch device of the joint solves, ``cpu`` or ``cuda``.
     """
 
     max_range_m: float = 16.0
@@ -126,9 +125,9 @@ class MappingOptions:
 
 
 def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -> None:
-    """Raise ConfigError, which names the key, for values that no mapping can work with.
+    """Raise ConfigError, which names the key, for values that mapping cannot work with.
 
-    ``kinds`` are classes with four corners that the detector knows; None takes any.
+    ``kinds`` are the four-cornered classes that the detector knows; None accepts any.
     """
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 

@@ -212,7 +212,7 @@ def _over_ground(
         explained = rival is None or rival.fault not in _LIKE_GROUND
         is_curved = explained and curved.optimiser.is_curved(over)
         taken = "a surface" if is_curved else "a plane: no surface explains the drive"
-        _log.info("%s: the ground is taken for %s", ", ".join(inputs.cameras), taken)
+        _log.info("%s: the ground is mapped as %s", ", ".join(inputs.cameras), taken)
         if is_curved:
             return curved, over, tests
     return inputs, settled, found or _tested(inputs, settled, progress)
@@ -270,7 +270,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
     if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
         return True
-    _log.warning("the surveyed point %s is of no use: the marking there did not enter the map", one.about)
+    _log.warning("the surveyed point %s is not used: its marking did not enter the map", one.about)
     return False
 
 

@@ -299,7 +299,7 @@ def _sources(
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
                 f"{path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {camera!r} has "
-                f"{lens.info.width}x{lens.info.height}; mend its camera_info or images"
+                f"{lens.info.width}x{lens.info.height}; fix its camera_info or images"
             )
         return pixels[boxes[camera]].copy()
 

@@ -203,7 +203,7 @@ def write_mosaic(
     """
     if not _FINEST_M <= resolution_m < np.inf:
         raise ConfigError(
-            f"a resolution of {resolution_m:g} m a pixel makes no mosaic; give {_FINEST_M} or more"
+            f"a resolution of {resolution_m:g} m per pixel is too fine for a mosaic; give {_FINEST_M} or more"
         )
     hd_map = read_geojson(folder / "map.geojson")
     ground = ground_of(folder, drive, resolution_m)
@@ -212,7 +212,7 @@ def write_mosaic(
         try:
             put = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
         except ConfigError as missing:
-            _log.warning("no GeoTIFF is written: %s", missing)
+            _log.warning("no GeoTIFF was written: %s", missing)
             put = None
         for sheet in blend(ground.canvas, ground.after, ground.lenses, device, progress):
             if put is not None:

@@ -31,17 +31,17 @@ def read_base(path: Path) -> Base:
     path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
     if not hd_map.markings:
-        raise MapFileError(f"map.base: {path}: has no markings to bring up to date; map the drive by itself")
+        raise MapFileError(f"map.base: {path}: has no markings to update; map the drive without it")
     verdict = read_verdict(path)
     if verdict is not None and verdict.get("status") == "FAIL":
         raise MapFileError(
-            f"map.base: {path}: the verdict on its drive is FAIL, so that nothing can be built on it; mend "
+            f"map.base: {path}: the verdict on its drive is FAIL, so nothing can be built on it; fix "
             "that drive first (docs/verdict.md)"
         )
     if all(one.covariance_m2 is None or one.relative_sigma_m is None for one in hd_map.markings):
         raise MapFileError(
-            f"map.base: {path}: does not say how sure its markings are, as maps of older versions and "
-            "naive methods; map its drive anew"
+            f"map.base: {path}: states no uncertainty of its markings, like maps of older versions and "
+            "naive methods; map its drive again"
         )
     poses = [lay_flat(read_tum(one)).trajectory.map_from_vehicle for one in trajectories]
     left_out = read_exclusions(excluded) if excluded.is_file() else []

@@ -31,31 +31,32 @@ NO_DRIVE = (
 
 @dataclass(kw_only=True)
 class DriveConfig(ReadOptions):
-    """The drive and how to read it: ``path`` is its folder or bag, None where it is rendered.
+    """The drive and how to read it.
 
-    A list of paths are drives through one site, which are mapped together (docs/living-map.md).
+    ``path`` is the drive's folder or bag, or a list of drives through one site, which are mapped together
+    (docs/living-map.md); None if the drive is rendered.
     """
 
     path: Any = None
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The paths, none where the drive is rendered; raises ConfigError where there is no path."""
+        """The paths, none if the drive is rendered; raises ConfigError for anything that is not a path."""
         if not self.path:
             return ()
         listed = self.path if isinstance(self.path, list) else [self.path]
         wrong = [one for one in listed if not isinstance(one, str | Path) or not str(one)]
         if wrong:
-            raise ConfigError(f"drive.path: {wrong[0]!r} is no path; give one, or a list: [monday,friday]")
+            raise ConfigError(f"drive.path: {wrong[0]!r} is not a path; give one, or a list: [monday,friday]")
         return tuple(Path(one) for one in listed)
 
 
 @dataclass(kw_only=True)
 class MapConfig:
-    """The map that comes out.
+    """The map to update or correct; None for none.
 
-    ``base`` is the map.geojson that the drive brings up to date, ``corrections`` the file of what a person
-    says of an earlier map of the same drive (``v2hdm view``), None for none.
+    ``base`` is the map.geojson that the drive brings up to date.
+    ``corrections`` is a file of corrections to an earlier map of the same drive (``v2hdm view``).
     """
 
     base: str | None = None
@@ -74,29 +75,29 @@ class RunConfig:
     """Everything about one run.
 
     Attributes:
-        name: names the results, ``<output>/<name>/``; None takes the drive's own name.
+        name: name of the results folder, ``<output>/<name>/``; None takes the drive's own name.
         drive: the drive to map, or several that are mapped together.
-        map: an earlier map that the drive brings up to date, if there is one.
-        report: what its page shows (docs/report.md).
-        simulate: renders the drive into the cache first, instead of reading ``drive.path``.
+        map: an earlier map to bring up to date, if there is one.
+        report: contents of the report (docs/report.md).
+        simulate: a port to render into the cache and map, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
-        output: folder that takes the results, or the URL of one at an object store (docs/fleet.md).
-        cache: folder that keeps rendered drives, what is imported from bags and videos, and what each stage
-            of a run has found, for the next one (docs/cache.md).
-        cache_gb: what the cache may hold, GB (10^9 bytes); what was not used for longest goes first.
-        resume: whether what an earlier run has found is taken from the cache where nothing has changed
-            that it was made from; false makes all anew.
-        workers: processes for rendering and detection; 0 takes one per core.
-        device: the value that ``conf/map.yaml`` passes on as ``mapping.device``, ``cpu`` or ``cuda``.
-        all_maps: whether the map of every method and camera set is written, into ``maps/``.
-        mode: the value that it passes on as ``mapping.mode``, ``batch`` or ``incremental``.
-        accuracy_goal_cm: the radius, cm, within which 95 % of the corners, and the calibrations, have to be
-            known at 95 %, else the verdict is WARN (docs/verdict.md).
-        mosaic: whether the ground of a single drive is shown from above, too (docs/report.md).
-        export: formats of the map: ``geojson``, ``gpkg``, ``lanelet2``, ...; of the ground: ``geotiff``,
-            ``opencrg`` (docs/exports.md).
-        crs: the system of their coordinates, such as ``EPSG:25832``, or ``local``; ``map.geojson`` keeps its
+        output: folder for the results, or the URL of one in an object store (docs/fleet.md).
+        cache: folder for rendered drives, imports from bags and videos, and the results of each stage,
+            which later runs reuse (docs/cache.md).
+        cache_gb: size limit of the cache, GB (10^9 bytes); least recently used entries go first.
+        resume: whether to reuse results of earlier runs whose inputs have not changed; false recomputes
+            everything.
+        workers: number of processes for rendering and detection; 0 for one per core.
+        device: where the adjustment runs, ``cpu`` or ``cuda``; the same as ``mapping.device``.
+        all_maps: whether to write the map of every method and camera set, into ``maps/``.
+        mode: ``batch`` or ``incremental``; the same as ``mapping.mode``.
+        accuracy_goal_cm: 95 % of the corners, and the calibrations, must be known to this radius, cm, at
+            95 %, else the verdict is WARN (docs/verdict.md).
+        mosaic: whether to show the ground of a single drive from above (docs/report.md).
+        export: formats of the map (``geojson``, ``gpkg``, ``lanelet2``, ...) and of the ground (``geotiff``,
+            ``opencrg``; docs/exports.md).
+        crs: coordinate system of exports, such as ``EPSG:25832``, or ``local``; ``map.geojson`` keeps its
             longitude and latitude.
     """
 
@@ -122,7 +123,7 @@ class RunConfig:
 
 
 def run_name(config: RunConfig) -> str:
-    """The name of the run: as configured, else that of the drive which is to be rendered or read."""
+    """The name of the run: as configured, else that of the drive to be rendered or read."""
     if config.name is not None:
         return config.name
     if config.simulate is not None:
@@ -179,7 +180,7 @@ _RANGES = {f"{below}{key}": allowed for allowed, below, keys in _KEYS_WITHIN for
 
 
 def admit(config: RunConfig) -> str:
-    """Refuse, by ConfigError with the key, what cannot work before any long work; the run's name."""
+    """Raise ConfigError, which names the key, for settings that cannot work; returns the run's name."""
     from v2hdm.detection.detector import Detector
     from v2hdm.pipeline.survey import table_of
 
@@ -213,7 +214,7 @@ def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: 
     if has_base and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if drives > 1 and options.mode == INCREMENTAL:
-        raise ConfigError("mode=incremental maps one drive as the vehicle would; map several with mode=batch")
+        raise ConfigError("mode=incremental maps one drive, as on the vehicle; map several with batch")
     check_device(options.device)
 
 

@@ -100,7 +100,7 @@ def detect_images(
     path = None if camera is None else Path(camera)
     lens = _lens(path, camera_name, mounting)
     if limit is not None and limit < 1:
-        raise ConfigError(f"--limit {limit}: give the number of images to stop after, 1 or more")
+        raise ConfigError(f"--limit {limit}: give a number of images, 1 or more")
     if not isinstance(detector, Detector):
         options = replace(detector) if detector is not None else DetectorOptions()
         if path is None or lens is not None:
@@ -119,14 +119,14 @@ def _lens(
     """The intrinsics of ``--camera`` where they are all that the file holds, as other tools write it."""
     if camera is None:
         if camera_name is not None:
-            raise ConfigError("--camera-name: names a camera in the file of --camera; add that")
+            raise ConfigError("--camera-name: names a camera in the file of --camera; add --camera")
         return None
     if not is_calibration(camera):
         return read_intrinsics(camera, camera_name, "--camera-name")
     if camera_name is not None:
-        raise ConfigError(f"--camera-name: {camera} is the calibration of one camera; drop it")
+        raise ConfigError(f"--camera-name: {camera} is the calibration of one camera; drop --camera-name")
     if mounting is not None:
-        raise ConfigError("--camera and --mounting exclude each other: drop one, a calibration has both")
+        raise ConfigError("--camera and --mounting exclude each other: a calibration has a mounting")
     return None
 
 
@@ -196,7 +196,7 @@ class _Rough:
             known = "no --camera" if lens is None else f"no mounting in {self.file}"
             print(
                 f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide"
-                ", unless the images show another horizon (--mounting says otherwise); positions in px only",
+                ", unless the images show another horizon (set --mounting); positions in px only",
                 file=sys.stderr,
             )
         pitch_rad, fov_rad, sigma_rad, roll_rad = np.deg2rad([pitch_deg, fov_deg, sigma_deg, _ROLL_DEG])
@@ -212,9 +212,9 @@ class _Rough:
         self._said = True
         angles = np.rad2deg([found.pitch_rad, found.sigma_rad[0], found.roll_rad, found.sigma_rad[1]])
         pitch, pitch_sigma, roll, roll_sigma = angles.tolist()
-        where = "the folder's images" if self.folder else f"{frame.name} and images before it"
+        where = "the folder's images" if self.folder else f"{frame.name} and earlier images"
         print(
-            f"by the lines of {where} the camera looks {pitch:.1f} +- {pitch_sigma:.1f} deg down, roll "
+            f"from the lines of {where} the camera looks {pitch:.1f} +- {pitch_sigma:.1f} deg down, roll "
             f"{roll:.1f} +- {roll_sigma:.1f} deg",
             file=sys.stderr,
         )
@@ -226,13 +226,13 @@ def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
     if source.isdecimal():
         if path.exists():
             raise ConfigError(
-                f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
-                "or start from another folder for the camera"
+                f"{path}: both a camera's index and a file or folder here; write ./{path} for the file, "
+                "or run from another folder for the camera"
             )
         return ((frame, road) for frame in _of_camera(int(source), road, rough))
     if not (path.is_dir() or path.is_file()):
         kind = "is a pipe or a device" if path.exists() else "no such image, video or folder"
-        raise DriveError(f"{path}: {kind}; a camera is named by its index, such as 0")
+        raise DriveError(f"{path}: {kind}; give a camera by its index, such as 0")
     paths = list_images(path) if path.is_dir() else [path]
     is_drive = any(READERS[name][0](path) for name in (READERS if path.is_dir() else ("bag",)))
     if is_drive and paths in ([], [path]):
@@ -261,7 +261,7 @@ def _live_frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Fram
     elif path.is_dir():
         frames = arriving_frames(path)
     else:
-        raise ConfigError(f"--live: {path} is no camera's index and no folder; only these bring new images")
+        raise ConfigError(f"--live: {path} is not a camera's index or a folder; only these get new images")
     return ((frame, road) for frame in frames)
 
 
@@ -269,7 +269,7 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
     """The images of a drive, each read when its turn comes; if a calibration was given, of its camera."""
     if rough.lens is not None:
         raise ConfigError(
-            "--camera: this file holds intrinsics alone, and a drive has its own; drop --camera, or name the "
+            "--camera: this file holds only intrinsics, and a drive has its own; drop --camera, or name the "
             "file as camera_info in drive.yaml"
         )
     drive = read_drive(path)
@@ -279,7 +279,7 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
-            raise DriveError(f"{path}: no camera '{name}' of the calibration, but {', '.join(roads)}")
+            raise DriveError(f"{path}: no camera '{name}' in the calibration; it has {', '.join(roads)}")
         roads = {name: road}
     return (
         (replace(frame, name=f"{image.camera}_{frame.name}", stamp_s=image.stamp_s), roads[image.camera])
@@ -311,5 +311,5 @@ def _check_size(frame: Frame, road: RoadDetector) -> None:
         where = "the calibration" if road.calibration else "what is known"
         raise DriveError(
             f"{frame.source}: the image is {width}x{height}, but {where} of camera '{info.name}' is for "
-            f"{info.width}x{info.height}; give images of that size, or the calibration of these"
+            f"{info.width}x{info.height}; give images of that size, or a calibration for these"
         )

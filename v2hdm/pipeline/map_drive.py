@@ -144,7 +144,7 @@ def _mapped(
     except (MappingError, AdjustError) as failure:
         if all(one.status is not Status.FAIL for one in checked.findings):
             raise
-        failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
+        failed = Finding("map", Status.FAIL, None, None, "", f"this drive gave no map: {failure}", "map")
         verdict = Verdict.of([*checked.findings, failed])
         return replace(begun, verdict=verdict, figures={"results": {}})
     return _judge(begun, checked, detections, sets, survey, goal_cm, context)

@@ -142,7 +142,7 @@ class Result:
             MappingError: no map came of the drive; the verdict says why.
         """
         if not self.methods:
-            raise MappingError(f"{self.about['name']}: no map came of this drive; its verdict says why")
+            raise MappingError(f"{self.about['name']}: this drive gave no map; its verdict says why")
         return list(self.methods.values())[-1][BEST]
 
     @property
@@ -212,7 +212,7 @@ class Result:
                 try:
                     write_mosaic(folder, self.drive, device=self.device, progress=context.steps("mosaic"))
                 except (ConfigError, DriveError) as failure:  # a picture is no reason to lose a map
-                    _log.warning("no mosaic is made: %s", failure)
+                    _log.warning("no mosaic was made: %s", failure)
         if "qgis" in formats and self.methods:  # it opens the mosaic, too
             grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
             write_qgis(self.map, folder / "map.qgs", grid=grid)

@@ -85,7 +85,7 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     """
     output = place_of(config.output, "output=")
     if is_url(config.cache):
-        raise ConfigError(f"cache={config.cache}: is a URL; give a folder, on a disk that machines may share")
+        raise ConfigError(f"cache={config.cache}: is a URL; give a folder, which machines may share")
     stages = StageCache(Path(config.cache), config.resume)
     if isinstance(output, RemoteFolder):
         return _take_or_upload(config, output, stages, work, take, progress)
@@ -121,7 +121,7 @@ def _noted(folder: Path, cache: StageCache) -> _Finished | None:
 
 
 def _taken(result: RunResult) -> RunResult:
-    _log.info("nothing has changed: %s is taken as it is (resume=false makes it anew)", result.place)
+    _log.info("nothing has changed: %s is reused (resume=false recomputes it)", result.place)
     return result
 
 

@@ -63,7 +63,7 @@ def detect_in_pieces(
     total = len(drive.images)
     todo = [i for start in missing for i in range(start, min(start + PIECE, total))]
     if len(todo) < total:
-        _log.info("detections in %d of %d images were kept by an earlier run", total - len(todo), total)
+        _log.info("detections in %d of %d images reused from an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
     begun: _Piece = []
     done = 0

@@ -108,9 +108,9 @@ def _check_near(
         return
     likeliest = max(elsewhere, key=lambda says: _places(route, elsewhere[says], range_m), default="")
     near = int((route.query(elsewhere[likeliest])[0] <= range_m).sum()) if likeliest else 0
-    advice = "mind datum, zone, units, the order of the columns and the origin of the drive"
+    advice = "check datum, zone, units, column order and the drive's origin"
     if near:
-        advice = f"{near} would {likeliest}; mend the file or mapping.survey.crs"
+        advice = f"{near} would {likeliest}; fix the file or mapping.survey.crs"
     raise DriveError(
         f"{table.path}: none of its {len(points)} points lies within {range_m:g} m of the route, the nearest "
         f"is {away_m.min():.0f} m away: {advice}"

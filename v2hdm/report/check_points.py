@@ -126,7 +126,7 @@ class CheckTable:
                 "rmse_z_m": float(np.sqrt(np.mean(heights_m**2))),
             }
             if len(heights_m)
-            else {"compared": 0, "because": "the survey, or the map of this drive, has no heights"},
+            else {"compared": 0, "because": "the survey, or this drive's map, has no heights"},
         }
 
     @property
@@ -134,7 +134,7 @@ class CheckTable:
         """All of it in one line for a reader."""
         total = len(self.compared) + len(self.unmatched)
         if not self.compared:
-            return f"check points: none of {total} has a corner of the map within reach"
+            return f"check points: none of {total} has a map corner within reach"
         cm = 100 * self.off_m.mean(axis=0)
         inside = sum(one.is_inside for one in self.compared)
         return (

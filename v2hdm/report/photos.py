@@ -100,7 +100,7 @@ PENS: Mapping[str, Pen] = {
 }
 """How the grid is drawn under each mounting: the guess, and the one found from bare ground."""
 
-_WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "as bare ground says"}
+_WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "from bare ground"}
 
 _ROI = Pen("#ffffff")
 
@@ -287,8 +287,8 @@ def save_overlay(
             near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
             pieces = _visible_pieces(info, view(dense), near, 0.1)
             draw_lines(canvas, pieces, pen)
-        said = "found by the run" if name in OVERLAY else "that the run began with"
-        legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
+        said = "found by the run" if name in OVERLAY else "that the run started with"
+        legend.append((pen, f"{name}: the map with the calibration and pose {said}"))
     _write_image(path, with_legend(canvas, legend))
 
 

@@ -55,7 +55,7 @@ class Session:
             content = json.loads(sent)
             key, entry = str(content["key"]), content["correction"]
         except (ValueError, TypeError, LookupError, RecursionError):
-            raise MapFileError("no correction: expected a key and a correction") from None
+            raise MapFileError("not a correction: expected a key and a correction") from None
         with self._lock:
             now = {name: one for name, one in self.corrections.items() if name != key}
             if entry is not None:
@@ -83,7 +83,7 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingH
     """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its corrections."""
     facts = read_facts(folder, drive)
     if facts.hd_map is None:
-        raise MapFileError(f"{folder}: has no map to look at; mend its drive and map it again")
+        raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
     session, secret = Session.begun(folder, path, facts), secrets.token_urlsafe(16)
     text, place = page_text(folder, drive, {"secret": secret}), json_text({"secret": secret})
     kinds: Sequence[str] = sorted({*SHIPPED.names, *(one.kind for one in facts.hd_map.markings)})
@@ -107,7 +107,7 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingH
             if elsewhere or not self._is_ours() or self.path != f"/{secret}/correct":
                 return self._answer(404, "no such page")
             if not length.isdecimal() or int(length) > _MOST_BYTES:
-                return self._answer(400, "a correction is no larger than 100 kB")
+                return self._answer(400, "a correction has at most 100 kB")
             try:
                 session.take(self.rfile.read(int(length)))
             except (V2hdmError, OSError) as error:

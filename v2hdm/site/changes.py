@@ -187,7 +187,7 @@ def _check_site(decision: Decision, now: Looks, count: int) -> None:
     if paired.sum() < _LEAST_PAIRED * looked.sum() or not looked.any():
         raise MappingError(
             f"map.base: this drive finds {paired.sum()} of {looked.sum()} markings again that it should have "
-            "seen; is the map of this site and frame? Map the drive by itself to see"
+            "seen; is the map of this site and in this frame? Map the drive without it to check"
         )
 
 

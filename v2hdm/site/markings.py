@@ -22,7 +22,7 @@ from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CLUTTER, CORNERS_OF_IMAGE, PART_OF_SYMBOL, Posterior, posterior
 
 OF_SYMBOL = "part of other paint, such as an arrow or a letter"
-COVERED = "lies on a better supported marking"
+COVERED = "overlaps a better supported marking"
 _CLUTTER_BY = (
     "not shaped like a marking of its class",
     "seen in too few images",
@@ -55,7 +55,7 @@ class Classified:
             commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
             raise MappingError(
                 f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); "
-                "check the camera's IPM, the detector and that the drive passes its markings closely."
+                "check the camera's IPM and the detector, and that the drive passes close to its markings."
             )
         return tuple(
             Marking(

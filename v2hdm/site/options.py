@@ -1,4 +1,4 @@
-"""Settings of what enters the map."""
+"""Settings for what enters the map."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from v2hdm.io.maps.corrections import Correction
 class AcceptanceOptions:
     """The conditions for a candidate to enter the map.
 
-    ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not, and
-    of lying on the ground, given how it moves in the images; and a worst corner less certain than the best
-    one of the map by at most ``max_sigma_m``. ``corrections`` are what a person says of candidates, which
-    ``map.corrections`` reads from a file.
+    It must be a marking (from its shape and the images that show it or not) and lie on the ground (from its
+    motion in the images) with at least ``min_probability``. The sigma of its worst corner may exceed that of
+    the map's best corner by at most ``max_sigma_m``. ``corrections`` are a person's decisions on candidates,
+    read from the file ``map.corrections``.
     """
 
     min_probability: float = 0.9
@@ -29,9 +29,9 @@ AFTER, JOINT = "after", "joint"  # values of ``mapping.lanes.model``
 class LaneOptions:
     """How lane paint becomes polylines.
 
-    ``model`` is ``after``: lanes are drawn under the finished adjustment; or ``joint``: they take part in it
-    as cubic splines, and each vertex states its sigma.
-    Paint counts up to ``max_range_m`` from the camera, and a vertex needs ``min_images`` that show it.
+    ``model`` is ``after``, which draws lanes after the adjustment, or ``joint``, which makes them part of it
+    as cubic splines whose vertices have sigmas. Lane paint is used up to ``max_range_m`` from the camera. A
+    vertex needs ``min_images`` that show it.
     """
 
     model: str = AFTER

@@ -41,7 +41,7 @@ _MOST_CELLS = 500  # cells along the longer side of the average, beyond which th
 _PART = 0.3
 """Share of the weight of the images that show a place from which it is painted: some miss a part."""
 
-NO_POLYGON = "no polygon that crosses nowhere explains its outline"
+NO_POLYGON = "no simple polygon explains its outline"
 
 _COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
 _COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area

@@ -86,7 +86,7 @@ def _plain(value: object) -> object:
         return value.item()
     if isinstance(value, Path):
         return str(value)
-    raise TypeError(f"{type(value).__name__} cannot be kept")
+    raise TypeError(f"{type(value).__name__} cannot be cached")
 
 
 def _special(kind: Any, content: Any) -> object:
@@ -99,7 +99,7 @@ def _special(kind: Any, content: Any) -> object:
         return np.frombuffer(data, dtype).reshape(shape).copy()
     if isinstance(kind, type) and issubclass(kind, Path):
         return kind(content)
-    raise TypeError(f"{kind} cannot be kept")
+    raise TypeError(f"{kind} cannot be cached")
 
 
 def key_of(*parts: object) -> str:
@@ -169,10 +169,10 @@ class StageCache:
         except FileNotFoundError:
             return None
         except OSError as failure:
-            _log.warning("%s: cannot be read (%s); it is made anew", path, failure.strerror)
+            _log.warning("%s: cannot be read (%s); it is recomputed", path, failure.strerror)
             return None
         except CodecError:
-            _log.warning("%s: is damaged; it is made anew", path)
+            _log.warning("%s: is damaged; it is recomputed", path)
             with suppress(OSError):
                 path.unlink(missing_ok=True)
             return None
@@ -201,7 +201,7 @@ class StageCache:
         except OSError as failure:
             self._can_write = False
             _log.warning(
-                "%s: nothing can be kept there (%s): later runs begin anew; free space or set cache=",
+                "%s: cannot be written (%s): later runs cannot resume; free space or set cache=",
                 path.parents[1], failure.strerror,
             )  # fmt: skip
         return decode(content, kind)
@@ -301,6 +301,6 @@ def prune_to_limit(cache: Path, limit_gb: float) -> None:
     if removed:
         size_gb = sum(item.size for item in removed) / 1e9
         _log.info(
-            "%s: removed %d entries of %.1f GB that were not used for longest (cache_gb=%g)",
+            "%s: removed the %d least recently used entries, %.1f GB (cache_gb=%g)",
             cache, len(removed), size_gb, limit_gb,
         )  # fmt: skip

@@ -60,7 +60,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     refuse_input(path)
     if path.exists() and not path.is_file():
-        raise ConfigError(f"{path}: is no plain file, and nothing is put in its place; name another output")
+        raise ConfigError(f"{path}: is not a regular file and is not replaced; choose another output")
     partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         yield partial
@@ -81,7 +81,7 @@ def refuse_url(path: Path) -> None:
     """Raise ConfigError for a URL that was taken for a path: it would be a folder called ``s3:``."""
     if _URL.match(str(path)):
         raise ConfigError(
-            f"{path}: no URL is written to here, only as output= of v2hdm map and v2hdm fleet; "
+            f"{path}: URLs are allowed only as output= of v2hdm map and v2hdm fleet; "
             "give a path on this machine"
         )
 
@@ -139,7 +139,7 @@ def read_csv(path: Path, error: type[V2hdmError]) -> list[list[str]]:
     try:
         return list(reader)
     except csv.Error as failure:
-        raise error(f"{path}: line {reader.line_num}: {failure}; mend that line") from None
+        raise error(f"{path}: line {reader.line_num}: {failure}; fix that line") from None
 
 
 def dump_yaml(content: Mapping[str, Any]) -> str:

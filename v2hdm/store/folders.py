@@ -54,7 +54,7 @@ def take_lock(stream: IO[str]) -> bool:
     except (BlockingIOError, PermissionError):
         return False
     except OSError as failure:
-        _log.warning("%s: no lock can be held here (%s); do not write it twice at once", stream.name, failure)
+        _log.warning("%s: no lock is possible here (%s); do not write it twice at once", stream.name, failure)
     return True
 
 

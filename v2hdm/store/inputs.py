@@ -47,7 +47,7 @@ def refuse_input(path: Path) -> None:
     """Raise ConfigError where ``path`` is one of the files that this command reads."""
     noted = _noted.get()
     if noted and _identity(path) in noted:
-        raise ConfigError(f"{path}: is one of the inputs and is not written over; name another output")
+        raise ConfigError(f"{path}: is one of the inputs and is not overwritten; choose another output")
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -72,5 +72,5 @@ def warn_if_changed(path: Path, data: bytes) -> None:
                     written.add(str(entry["sha256"]))
         if written and digest not in written and (path, digest) not in _reported:
             _reported.add((path, digest))
-            advice = "edited since, or damaged; make it anew if nobody edited it"
-            _log.warning("%s: is not as we wrote it: %s", path, advice)
+            advice = "edited since, or damaged; if nobody edited it, make it again"
+            _log.warning("%s: has changed since we wrote it: %s", path, advice)

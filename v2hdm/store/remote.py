@@ -73,15 +73,15 @@ class RemoteFolder:
         protocol, rest = url.split("://", 1)
         if protocol not in _PACKAGES:
             known = ", ".join(f"{one}://" for one in _PACKAGES if one != _MEMORY)
-            raise ConfigError(f"{option} {url}: is at no store that we write to; choose a folder or {known}")
+            raise ConfigError(f"{option} {url}: is not in a supported store; choose a folder or {known}")
         parts = rest.rstrip("/").split("/")
         if ":" in parts[0]:
             raise ConfigError(
-                f"{option} {protocol}://...: holds what is no name of a bucket; credentials belong where "
+                f"{option} {protocol}://...: is not a bucket name; credentials belong where "
                 f"{_PACKAGES[protocol]} looks for them, not into a URL"
             )
         if not all(parts) or {".", ".."} & set(parts) or any(c in "?#*[" or not c.isprintable() for c in url):
-            raise ConfigError(f"{option} {url}: is no place at a store; write it as in s3://bucket/results")
+            raise ConfigError(f"{option} {url}: is not a path in a store; write it like s3://bucket/results")
         fsspec = need("fsspec", "map", f"{option} {url}", ConfigError)
         try:
             files, root = fsspec.core.url_to_fs(url, use_listings_cache=False)
@@ -151,13 +151,13 @@ class RemoteFolder:
         except FileNotFoundError:
             if not in_bucket:
                 raise
-            raise ConfigError(f"{self.url}: no such bucket; make it or give another {self._option}") from None
+            raise ConfigError(f"{self.url}: no such bucket; create it or change {self._option}") from None
         except Exception as failure:  # each package has errors of its own
             advice = f"check the network and start again, or give another {self._option}"
             if isinstance(failure, PermissionError) or "Credential" in type(failure).__name__:
-                advice = "check the credentials, as the package that speaks to the store takes them"
+                advice = "check the credentials of the store's package"
             where = f"{self.url}/{name}" if name else self.url
-            raise ConfigError(f"{where}: does not work ({_first_line(failure)}); {advice}") from None
+            raise ConfigError(f"{where}: failed ({_first_line(failure)}); {advice}") from None
 
 
 def _first_line(failure: Exception) -> str:
@@ -202,11 +202,11 @@ def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
     there = place.listed()
     found = {name: _entries(place, name, place.read(name)) for name in (LIST, UNFINISHED) if name in there}
     if there and not found:
-        raise ConfigError(f"{place} holds objects that are no results of ours: give another place")
+        raise ConfigError(f"{place} holds objects that are not results of V2HDM: give another place")
     holder = found[UNFINISHED][0] if UNFINISHED in found else writer
     if holder not in ("", writer):
         raise ConfigError(
-            f"{place} is being written by {holder}, or was when that was stopped; wait for it, start it "
+            f"{place} is being written by {holder}, or was when it stopped; wait for it, start it "
             f"there again, or, where it is dead, remove {UNFINISHED}"
         )
     entries = [one for _, listed in found.values() for one in listed]
@@ -246,7 +246,7 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
     there, put = place.listed(), []
     for name, one in new.items():
         if name not in there or there[name].size != one.size:
-            raise ConfigError(f"{place}/{name}: is not there as it was put; start again")
+            raise ConfigError(f"{place}/{name}: differs from what was uploaded; start again")
         put.append(replace(one, token=there[name].token))
     place.write(LIST, _listing(put))
     place.remove(UNFINISHED)

@@ -40,7 +40,7 @@ class _Target:
         try:
             self.path = shown.resolve()
         except (OSError, RuntimeError, ValueError):
-            raise ConfigError(f"output folder {shown}: leads nowhere; give another {option}") from None
+            raise ConfigError(f"output folder {shown}: is a broken link; give another {option}") from None
         if self.path.exists() and not self.path.is_dir():
             raise ConfigError(f"output folder {shown} is a file; give another {option}")
 
@@ -67,8 +67,7 @@ class _Target:
             return None
         if not (self.path / LIST).is_file():
             raise ConfigError(
-                f"output folder {self.shown} holds files that are no results of ours: give another "
-                f"{self.option}"
+                f"output folder {self.shown} holds files that V2HDM did not write: give another {self.option}"
             )
         head = self.read_list()[0]
         if made not in (None, head):
@@ -147,7 +146,7 @@ class _Target:
         """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
         for left in (unfinished, previous):
             if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
-                raise ConfigError(f"{left}: is in our way, not ours; move it, or give another {self.option}")
+                raise ConfigError(f"{left}: was not written by V2HDM; move it, or give another {self.option}")
         if previous.exists() and not self.path.exists():
             previous.replace(self.path)
         if previous.exists():
@@ -226,7 +225,7 @@ def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iter
 def _report_dropped(folder: Path, listed: Mapping[str, object], new: Path) -> None:
     """Log what was added to the earlier result, such as its mosaic, and is not true of the new one."""
     if dropped := [name for name in listed if (folder / name).is_file() and not (new / name).exists()]:
-        _log.warning("%s: of the earlier result, and gone with it: %s", folder, ", ".join(sorted(dropped)))
+        _log.warning("%s: removed with the earlier result: %s", folder, ", ".join(sorted(dropped)))
 
 
 @contextmanager
@@ -235,7 +234,7 @@ def added_to(folder: Path, option: str) -> Iterator[Path]:
     with _locked(folder, option) as there:
         with there.explained():
             if there.listed() is None:
-                raise ConfigError(f"{folder}: is no result of ours; give another {option}")
+                raise ConfigError(f"{folder}: is not a result of V2HDM; give another {option}")
             made = there.read_list()[0]
         with listed_files(folder, option, made):
             yield there.path
@@ -263,7 +262,7 @@ def listed_files(folder: Path, option: str, made: str) -> Iterator[Callable[[Pat
             raise ConfigError(f"{path}: a link is not replaced; move it, or give another {option}")
         name = place.relative_to(there.path).as_posix()
         if path.exists() and file_digest(path) not in ours.get(name, ()):
-            maker = f"no unchanged result of {made}" if made else "no file of ours"
+            maker = f"not an unchanged result of {made}" if made else "not a file of V2HDM"
             raise ConfigError(f"{folder / name}: is {maker}; move it, or give another {option}")
         return name
 
@@ -311,7 +310,7 @@ def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[WriteF
 def _locked(folder: Path, option: str) -> Iterator[_Target]:
     there = _Target(folder, option)
     if there.path.is_mount():
-        raise ConfigError(f"output folder {folder} is a disk of its own; give a folder within it")
+        raise ConfigError(f"output folder {folder} is a mount point; give a folder within it")
     with there.parents(), there.locked():
         yield there
 

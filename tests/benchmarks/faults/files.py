@@ -26,7 +26,9 @@ from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.mapping.options import MappingOptions
 
 _TEXTS = ("poses.tum", "drive.yaml", "front/camera_info.yaml", "front/images.txt")
-_TELLS = r"damaged|is not as we wrote it|was changed after|not fitted to|verdict: (WARN|FAIL)|^error: "
+_TELLS = (
+    r"damaged|has changed since we wrote it|was changed after|not fitted to|verdict: (WARN|FAIL)|^error: "
+)
 """What a door says of a file that it does not take for whole."""
 
 

@@ -109,7 +109,7 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
             "name": name, "version": "0.1.0", "date": "2026-11-23", "verdict": verdict(status),
             "drive": {"name": name, "paths": [str(drive.root)], "cameras": ["front"], "images": 5},
             "results": {"front": {"Opt": figures}}, "seconds": {"detect": 1.5},
-            "extrinsics": {"front": {"certainty": "front: the drive fixes both", "x_change_m": 0.1}},
+            "extrinsics": {"front": {"certainty": "front: the drive determines both", "x_change_m": 0.1}},
             "changes": changes(),
         }  # fmt: skip
         write_json(result / "metrics.json", metrics)

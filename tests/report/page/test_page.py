@@ -165,11 +165,11 @@ def test_without_its_drive_the_page_says_what_it_lacks(result):
 
 def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path):
     finding = {"check": "map", "status": "FAIL", "value": None, "limit": None, "unit": "",
-               "says": "no map came of this drive", "about": "map"}  # fmt: skip
+               "says": "this drive gave no map", "about": "map"}  # fmt: skip
     verdict = {"status": "FAIL", "findings": [finding], "untold": [], "passed": []}
     write_json(tmp_path / "metrics.json", {"name": "n", "verdict": verdict, "results": {}})
     text = write_page(tmp_path, None).read_text()
-    assert "no map came of this drive" in text
+    assert "this drive gave no map" in text
     assert 'id="map"' not in text
 
 
@@ -275,10 +275,10 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
     facts = read_facts(result, None)
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
     for name, of, told in (
-        ("elsewhere", placed, "none of this map's ground"),
-        ("none", placed, "neither a GeoTIFF"),
+        ("elsewhere", placed, "does not cover this map"),
+        ("none", placed, "not a readable GeoTIFF"),
         ("nowhere", placed, "no coordinate system"),
-        ("aerial", facts, "no place on the earth"),
+        ("aerial", facts, "no position on the earth"),
     ):
         with pytest.raises(MapFileError, match=f"{name}.tif: .*{told}"):
             background_layer(tmp_path / f"{name}.tif", of)
@@ -313,7 +313,7 @@ def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypat
     assert shown.shape[1] / shown.shape[0] == pytest.approx(800 / 600, rel=0.02)
     assert page.ground
     (tmp_path / "result" / "mosaic.webp").unlink()
-    with pytest.raises(MapFileError, match=r"mosaic\.webp: no picture"):
+    with pytest.raises(MapFileError, match=r"mosaic\.webp: not a readable picture"):
         document(read_facts(tmp_path / "result", drive))
 
 
@@ -330,7 +330,7 @@ def test_the_door_finds_the_drive_and_names_what_is_wrong(tmp_path, capsys):
     pictures_of = re.compile(r'id="pictures">\{"m1"')
     assert pictures_of.search((result / "report.html").read_text())
     assert run(["report", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith(f"error: {tmp_path}: no metrics.json in it")
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path}: has no metrics.json")
     lines = (result / "residuals.csv").read_text().splitlines()
     (result / "residuals.csv").write_text("\n".join([*lines[:3], "front/0.png,front,x"]) + "\n")
     assert run(["report", str(result)]) == 2
@@ -352,6 +352,6 @@ def test_another_drive_than_that_of_the_result_is_refused(tmp_path):
         (result / "metrics.json").write_text(json.dumps(metrics))
         if limit is None:
             assert drive_of(result, None) is None
-    with pytest.raises(MapFileError, match=r"metrics\.json: what it says of the drive is damaged"):
+    with pytest.raises(MapFileError, match=r"metrics\.json: its data on the drive are damaged"):
         drive_of(result, None)
     assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width

@@ -114,7 +114,7 @@ def test_other_pages_other_names_and_guesses_are_refused(served):
     assert ask(address, "POST", "/correct", sent)[0] == 404
     assert ask(address, "GET", "/")[0] == 404
     assert ask(address, "GET", "", Host="elsewhere.example")[0] == 404
-    assert ask(address, "POST", place, "x" * 200_000) == (400, "a correction is no larger than 100 kB")
+    assert ask(address, "POST", place, "x" * 200_000) == (400, "a correction has at most 100 kB")
     assert not path.exists()
     status, said = ask(
         address, "POST", place, json.dumps({"key": "m1", "correction": entry | {"says": "no"}})

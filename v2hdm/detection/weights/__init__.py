@@ -49,7 +49,7 @@ def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
         return None
     return (
         f"{path}: scores come from the judge of the shipped network, which was not fitted to this one; "
-        f"`{COMMANDS[JUDGE_FILE.name]}` fits it"
+        f"fit it with `{COMMANDS[JUDGE_FILE.name]}`"
     )
 
 
@@ -81,10 +81,10 @@ def _problem(folder: Path) -> str | None:
         if not path.is_file():
             problem = f"no such file; install v2hdm again, or make it with `{command}`"
         elif digest(path) != files[name]["sha256"]:
-            problem = "not the file of the manifest beside it; restore both from one commit, or make it with "
+            problem = "not the file in the manifest beside it; restore both from one commit, or make it with "
             problem += f"`{command}`"
         elif files[name]["network"] != files[NETWORK_FILE.name]["sha256"]:
-            problem = f"was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
+            problem = f"was fitted to a network other than {NETWORK_FILE.name}; run `{command}`"
         if problem:
             return f"{path}: {problem}"
     return None

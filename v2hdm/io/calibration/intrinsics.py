@@ -69,14 +69,14 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     when the file is damaged or of no known format, the camera not in it, or its lens beyond ours.
     """
     if path.suffix.lower() == ".bin":
-        raise DriveError(f"{path}: is binary; write the model as text (model_converter --output_type TXT)")
+        raise DriveError(f"{path}: is binary; export the model as text (model_converter --output_type TXT)")
     document = _read_document(path)
     chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
     if chosen is None:
         raise DriveError(f"{path}: no intrinsics of a known format ({', '.join(INTRINSICS)}) in this file")
     names = chosen.names(document)
     if camera is None and len(names) > 1:
-        raise DriveError(f"{path}: holds the cameras {', '.join(names)}; name one by {name_by}")
+        raise DriveError(f"{path}: holds the cameras {', '.join(names)}; choose one with {name_by}")
     if camera is not None and camera not in names:
         raise DriveError(f"{path}: no camera '{camera}' in this file; it holds: {', '.join(names)}")
     return chosen.read(document, names[0] if camera is None else camera)
@@ -89,7 +89,7 @@ def is_calibration(path: Path) -> bool:
 
 def _read_document(path: Path) -> Document:
     if path.is_dir():
-        raise DriveError(f"{path}: is a folder; name the calibration file in it")
+        raise DriveError(f"{path}: is a folder; give the calibration file in it")
     text = read_text(path, DriveError)
     start = text.lstrip("\ufeff \t\r\n")
     content: object = {}
@@ -106,7 +106,7 @@ def _read_document(path: Path) -> Document:
 
 def _of_xml(path: Path, text: str) -> dict[str, Any]:
     if "<!" in text.replace("<!--", ""):
-        raise DriveError(f"{path}: holds XML declarations, which no calibration has; restore the file")
+        raise DriveError(f"{path}: has XML declarations, which no calibration file has; restore it")
     try:
         root = ET.fromstring(text)
     except ET.ParseError as failure:
@@ -138,7 +138,7 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
         first, lens = _BEYOND[count]
         if any(values[first:]):
             raise DriveError(
-                f"{where}: a {lens} ({count} coefficients) is beyond our lens models; calibrate with 5 or 8"
+                f"{where}: a {lens} ({count} coefficients) is not supported; calibrate with 5 or 8"
             )
         values = values[:first]
     if count not in _BROWN_CONRADY:
@@ -163,7 +163,7 @@ def _mapping(content: object) -> dict[str, Any]:
 
 
 def _beyond(where: str, lens: str, instead: str) -> DriveError:
-    return DriveError(f"{where}: its lens is {lens}, which is beyond our models; calibrate with {instead}")
+    return DriveError(f"{where}: its lens model {lens} is not supported; calibrate with {instead}")
 
 
 def _need(entries: Mapping[str, Any], keys: Sequence[str], where: str, advice: str) -> None:
@@ -211,7 +211,7 @@ def _read_colmap(document: Document, name: str) -> CameraInfo:
     _, kind, width, height, *words = line.split()
     if kind not in COLMAP_MODELS:
         known = ", ".join(COLMAP_MODELS)
-        raise DriveError(f"{where}: COLMAP's {kind} is beyond our lens models; choose one of: {known}")
+        raise DriveError(f"{where}: COLMAP's {kind} is not supported; choose one of: {known}")
     focals, coefficients, model = COLMAP_MODELS[kind]
     try:
         values = np.array([float(word) for word in words])
@@ -259,7 +259,7 @@ def _read_opencv(document: Document, name: str) -> CameraInfo:
     where, entries, sides = str(document.path), document.lower, ("image_width", "image_height")
     if "xi" in entries:
         raise _beyond(where, "omnidirectional (xi)", "cv2.calibrateCamera or cv2.fisheye.calibrate")
-    _need(entries, ["distortion_coefficients"], where, "add it, zeros for a pinhole camera")
+    _need(entries, ["distortion_coefficients"], where, "add it, with zeros for a pinhole camera")
     _need(entries, sides, where, "add the size of the images it was made from")
     intrinsic = take_matrix(entries["camera_matrix"], f"{where}: camera_matrix")
     if intrinsic.shape != (3, 3):
@@ -279,8 +279,8 @@ def _read_own(document: Document, name: str) -> CameraInfo:
         raise DriveError(str(error)) from None
     if len(info.distortion) != DISTORTION_COEFFICIENTS.get(info.distortion_model):
         raise DriveError(
-            f"{document.path}: {info.distortion_model} with {len(info.distortion)} coefficients is no lens "
-            f"of ours; known are {', '.join(DISTORTION_COEFFICIENTS)}"
+            f"{document.path}: {info.distortion_model} with {len(info.distortion)} coefficients is not a "
+            f"supported lens; choose from {', '.join(DISTORTION_COEFFICIENTS)}"
         )
     return info
 

@@ -85,14 +85,14 @@ def trusted_calibrations(path: Path) -> dict[str, Calibration]:
     """The calibrations in a result folder, or of a file, by camera; MapFileError where none, or FAIL."""
     files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
     if not files:
-        raise MapFileError(f"{path}: no calibration_*.yaml in it; give a result of map or calibrate ground")
+        raise MapFileError(f"{path}: has no calibration_*.yaml; give a result of map or calibrate ground")
     found = {}
     for file in files:
         calibration = read_calibration(file)
         found[calibration.info.name] = calibration
         if read_provenance(file).verdict == "FAIL":
             raise MapFileError(
-                f"{file}: the verdict on its drive is FAIL, so that it cannot be relied on: docs/verdict.md"
+                f"{file}: the verdict on its drive is FAIL, so it cannot be relied on: docs/verdict.md"
             )
     return found
 
@@ -111,17 +111,17 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     if len(distortion) != expected:
         raise DriveError(
             f"{where}: distortion_coefficients: {model} has {expected} coefficients, got {len(distortion)}; "
-            "complete them (zeros where unused) or name the right model"
+            "complete them (zeros where unused) or give the right model"
         )
     name = take_text(content["camera_name"], f"{where}: camera_name", DriveError)
     width, height = (take_size_px(content[key], f"{where}: {key}", DriveError) for key in _SIZE)
     at = f"{where}: camera_matrix"
     intrinsic = take_matrix(content["camera_matrix"], at)
     if intrinsic.shape != (3, 3):
-        raise DriveError(f"{at}: expected 3 x 3, got {intrinsic.shape[0]} x {intrinsic.shape[1]}; mend it")
+        raise DriveError(f"{at}: expected 3 x 3, got {intrinsic.shape[0]} x {intrinsic.shape[1]}; fix it")
     zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
     if intrinsic[0, 0] <= 0 or intrinsic[1, 1] <= 0 or zeros.any() or intrinsic[2, 2] != 1:
-        raise DriveError(f"{at}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it")
+        raise DriveError(f"{at}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; fix it")
     info = CameraInfo(name, width, height, intrinsic, model, tuple(distortion.tolist()))
     return check_camera(info, where, DriveError)
 
@@ -141,7 +141,7 @@ def take_matrix(content: object, where: str) -> FloatArray:
     rows, cols = (take_size_px(entry[key], f"{where}, {key}", DriveError) for key in ("rows", "cols"))
     data = take_array(entry["data"], (-1,), f"{where}, data", DriveError)
     if len(data) != rows * cols:
-        raise DriveError(f"{where}: {rows} x {cols} does not fit its {len(data)} numbers; mend one of them")
+        raise DriveError(f"{where}: {rows} x {cols} does not fit its {len(data)} numbers; fix one of them")
     return data.reshape(rows, cols)
 
 
@@ -153,7 +153,7 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
-        raise DriveError(f"{where}: its images are binned or cut to a region; give camera_info as a file")
+        raise DriveError(f"{where}: its images are binned or cropped; give camera_info as a file")
     count = _coefficients_of(model, where, "give camera_info as a file with")
     if distortion[count:].any():
         raise DriveError(f"{where}: {model} has {count} coefficients, got {len(distortion)}; give a file")
@@ -211,7 +211,7 @@ def take_rigid(content: object, where: str) -> FloatArray:
     rotation = transform[:3, :3]
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)
     if not orthonormal or np.linalg.det(rotation) < 0 or not np.array_equal(transform[3], [0, 0, 0, 1]):
-        raise DriveError(f"{where}: not a rigid transform (rotation, translation, last row 0 0 0 1); mend it")
+        raise DriveError(f"{where}: not a rigid transform (rotation, translation, last row 0 0 0 1); fix it")
     return transform
 
 
@@ -239,9 +239,9 @@ def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray
     below_px = [0.5 * info.width, info.height - 1.0, 1.0]
     lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(info.intrinsic, below_px)
     if (rays[:, 2] <= 0).all() and lowest[2] > 0:
-        raise DriveError(f"{where}: lies behind the camera; give ground that it sees, x forward and y left")
+        raise DriveError(f"{where}: lies behind the camera; give ground in its view, x forward and y left")
     if not _in_image(info, rays if (rays[:, 2] > 0).any() else -rays).any():
-        raise DriveError(f"{where}: lies outside the image, by the initial IPM; mend one of them")
+        raise DriveError(f"{where}: lies outside the image, according to the initial IPM; fix one of them")
 
 
 def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:

@@ -131,7 +131,7 @@ def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
     models = {"plumb_bob": "radtan", "rational_polynomial": "radtan", "equidistant": "equidistant"}
     if info.distortion_model not in models or np.abs([skew, *info.distortion[4:]]).max() > _UNUSED:
         raise MapFileError(
-            f"camera '{info.name}': Kalibr has no lens with a skew or more than four coefficients, and this "
+            f"camera '{info.name}': Kalibr supports neither skew nor more than four coefficients, and this "
             f"is {info.distortion_model} {list(info.distortion)}; take its intrinsics from camera_info"
         )
     camera = {

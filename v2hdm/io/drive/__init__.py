@@ -102,14 +102,14 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that.
     """
     if not (folder / METRICS).is_file():
-        raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm map")
+        raise MapFileError(f"{folder}: has no {METRICS}; give the result folder of v2hdm map")
     stated = load_json(folder / METRICS, MapFileError).get("drive")
     stated = stated if isinstance(stated, dict) else {}
     try:
         paths = [Path(str(one)) for one in stated.get("paths") or []] if path is None else [path]
         options = _options(stated)
     except (TypeError, ValueError) as failure:
-        raise MapFileError(f"{folder / METRICS}: what it says of the drive is damaged ({failure})") from None
+        raise MapFileError(f"{folder / METRICS}: its data on the drive are damaged ({failure})") from None
     if not paths or not all(one.exists() for one in paths):
         return None
     drive = join_drives([read_drive(one, options) for one in paths])
@@ -117,7 +117,7 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     if expected != (drive.name, len(drive.images)):
         raise DriveError(
             f"{paths[0]}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
-            f"{expected[0]} of {expected[1]}; give that one with --drive"
+            f"{expected[0]} of {expected[1]}; give that drive with --drive"
         )
     return drive
 
@@ -126,7 +126,7 @@ def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:
     """The drive of a result, as :func:`drive_of`; refused if gone or several, ``what`` being of one."""
     drive = drive_of(folder, path)
     if drive is None:
-        raise DriveError(f"{folder}: its drive is not where it was; give its folder with --drive")
+        raise DriveError(f"{folder}: its drive has moved; give its folder with --drive")
     if drive.joined:
         raise MapFileError(f"{folder} is of several drives; {what} of one: map them one by one")
     return drive

@@ -34,7 +34,7 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     """
     where = folder / DRIVE_FILE
     if where.exists():
-        raise DriveError(f"{where}: exists; edit it, or give --write another folder")
+        raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
     content, missing = _told(source, folder)
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -69,7 +69,7 @@ def _told(source: Path, folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
         stems = [path.stem for path in source.iterdir() if path.suffix.lower() in SUFFIXES]
         if not stems:
             raise DriveError(
-                f"{source}: neither a bag, nor a video, nor a folder of images; --write is for these"
+                f"{source}: not a bag, a video or a folder of images; --write needs one of these"
             )
         try:
             latest = max(map(float, stems))

@@ -52,7 +52,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
     entries = {take_camera_name(name, f"{where}: cameras", DriveError): one for name, one in entries.items()}
     if not entries:
-        raise DriveError(f"{where}: names no camera; add one under 'cameras'")
+        raise DriveError(f"{where}: has no camera; add one under 'cameras'")
     bag = None
     if "bag" in content:
         bag = path / take_text(content["bag"], f"{where}: bag", DriveError)
@@ -140,7 +140,7 @@ def _take_read_out(entry: Mapping[str, Any], stamp_s: FloatArray, where: str) ->
     period_s = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else np.inf
     if not 0 <= read_out_s <= period_s:
         most = "" if np.isinf(period_s) else f" to {period_s:g}, the time from image to image"
-        raise DriveError(f"{where}: {read_out_s:g} s is no read-out time; give seconds, from 0{most}")
+        raise DriveError(f"{where}: {read_out_s:g} s is not a read-out time; give seconds, from 0{most}")
     return read_out_s
 
 
@@ -165,12 +165,12 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
     for key, value in values.items():
         if value < 0:
-            raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; mend it")
+            raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; fix it")
         if key.endswith("_over_m") and value == 0:
-            raise DriveError(f"{where}, {key}: an error that fades over no way is no drift; leave it out")
+            raise DriveError(f"{where}, {key}: an error that fades over 0 m is not a drift; leave it out")
     stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
     noise = PoseNoise.as_far_as_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
-            raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
+            raise DriveError(f"{where}, {drift}: is part of {total}, so not above it; fix one of them")
     return noise

@@ -22,11 +22,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class KittiOptions:
-    """Facts about a drive that the KITTI raw format does not say.
+    """Facts about a drive that the KITTI raw format does not state.
 
     Attributes:
         camera_height_m: height of the camera above the road (KITTI's nominal 1.65 m).
-        centre_sigma_m: how well the published calibration places the camera, per axis.
+        centre_sigma_m: standard deviation of the camera centre in the published calibration, per axis.
     """
 
     camera_height_m: float = 1.65
@@ -40,12 +40,11 @@ class ReadOptions:
     Attributes:
         format: name of a reader (see ``v2hdm.io.drive.READERS``), or ``auto`` to look at the folder.
         cameras: names of the cameras to read; empty for all.
-        max_gap_s: poses further apart than this are not interpolated across; images that fall into
-            such a gap are dropped.
-        limit: images of each camera to take at most, the first ones, for trying things; None takes all.
-        start_s: seconds of the drive to leave out at its beginning, by the stamps of its images.
+        max_gap_s: longest gap between poses to interpolate across; images in a longer one are dropped.
+        limit: maximum number of images per camera, the first ones, for quick tries; None for all.
+        start_s: seconds to skip at the beginning of the drive, from its first image.
         end_s: seconds after its first image at which the drive ends; None for its own end.
-        cache: folder that keeps what is imported from bags and videos.
+        cache: folder for imports from bags and videos.
         kitti: only used by the ``kitti`` reader.
     """
 
@@ -132,7 +131,7 @@ def _check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -
             )
         if header.orientation != 1:
             raise DriveError(
-                f"{image.path}: its EXIF orientation {header.orientation} says to turn it, and a "
+                f"{image.path}: its EXIF orientation {header.orientation} asks for a rotation, but a "
                 "calibration is of pixels as they are stored: take the orientation out of the images"
             )
 

@@ -123,9 +123,9 @@ def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera],
         return camera
     if not apart and _same_rig(so_far[camera], one):
         return camera
-    why = "its mounting has changed" if apart else "its lens or the guess of its mounting differs"
+    why = "its mounting has changed" if apart else "its lens or guessed mounting differs"
     _log.warning(
-        "camera %s of drive %s is another one than before (%s): it is calibrated by itself, as %s@%s",
+        "camera %s of drive %s is not the earlier one (%s): it is calibrated separately, as %s@%s",
         camera, visit, why, camera, visit,
     )  # fmt: skip
     return f"{camera}@{visit}"
@@ -138,10 +138,10 @@ def _check(drives: Sequence[Drive]) -> None:
         raise DriveError(f"{again[0]}: given twice; name each drive once in drive.path")
     without = [drive.root for drive in drives if drive.origin is None]
     if without and len(without) < len(drives):
-        problem = "has no origin, but other drives have: nobody knows how their frames lie to each other"
-        raise DriveError(f"{without[0]}: {problem}; state its origin, or those of none")
+        problem = "has no origin, but other drives have: how their frames are related is unknown"
+        raise DriveError(f"{without[0]}: {problem}; state its origin, or remove all origins")
     if without:
-        _log.warning("no drive has an origin: their coordinates are taken to be of one frame")
+        _log.warning("no drive has an origin: their coordinates are assumed to share one frame")
     datums = {drive.origin.datum: drive.root for drive in drives if drive.origin is not None}
     if len(datums) > 1:
         stated = ", ".join(f"{root}: {datum}" for datum, root in datums.items())
@@ -161,7 +161,7 @@ def _check_overlap(images: Sequence[Image], visits: Sequence[Visit]) -> None:
         if not any(away_m(place) <= _REACH_M for place in own):
             raise DriveError(
                 f"{one.root}: comes no nearer than {min(map(away_m, own)):.0f} m to the other drives, "
-                "so that they have nothing in common; map it by itself, or check the frame of its poses"
+                "so they have nothing in common; map it separately, or check the frame of its poses"
             )
 
 

@@ -141,7 +141,7 @@ def _list_images(path: Path, camera: str) -> ImageFiles:
         raise DriveError(f"{folder / 'data'}: no PNG or JPEG image; restore KITTI's images")
     stamp_s = _stamps_of(paths, folder / "timestamps.txt", "image")
     if (np.diff(stamp_s) <= 0).any():
-        raise DriveError(f"{folder / 'timestamps.txt'}: times are not strictly rising; restore the file")
+        raise DriveError(f"{folder / 'timestamps.txt'}: times are not strictly increasing; restore the file")
     return ImageFiles(camera=camera, stamp_s=stamp_s, paths=paths)
 
 
@@ -158,7 +158,7 @@ def _read_oxts(path: Path, camera: str) -> tuple[FloatArray, FloatArray]:
     oxts = np.array([_read_oxts_row(p) for p in paths])
     rising = np.concatenate([[True], stamp_s[1:] > np.maximum.accumulate(stamp_s)[:-1]])
     if not rising.all():
-        _log.warning("%s: dropped %d poses whose time does not rise", stamps_path, int((~rising).sum()))
+        _log.warning("%s: dropped %d poses whose time does not increase", stamps_path, int((~rising).sum()))
     return stamp_s[rising], oxts[rising]
 
 
@@ -178,7 +178,7 @@ def _read_oxts_row(path: Path) -> FloatArray:
     try:
         row = np.array(read_text(path, DriveError).split(), dtype=np.float64)
     except ValueError:
-        raise DriveError(f"{path}: holds something that is not a number; restore KITTI's own file") from None
+        raise DriveError(f"{path}: contains a non-number; restore KITTI's own file") from None
     if len(row) != _OXTS_COLUMNS or not np.isfinite(row[:6]).all():
         raise DriveError(f"{path}: expected {_OXTS_COLUMNS} finite numbers, got {len(row)}; restore the file")
     return row
@@ -195,7 +195,7 @@ def _read_stamps(path: Path) -> FloatArray:
             stamps.append(seconds + float(f"0.{fraction or 0}"))
         except ValueError:
             problem = f"expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'"
-            raise DriveError(f"{path}: line {number}: {problem}; mend it") from None
+            raise DriveError(f"{path}: line {number}: {problem}; fix it") from None
     return np.array(stamps)
 
 

@@ -45,7 +45,7 @@ class Sources:
     def want(self, stream: streams.Stream) -> Callable[[], Path]:
         """Put ``stream`` on the list; the function returned imports all of the list and gives its folder."""
         if self.bag is None:
-            raise DriveError(f"{stream.where}: names a topic, but the drive has no bag; add bag at the top")
+            raise DriveError(f"{stream.where}: names a topic, but the drive has no bag; add the key bag")
         place = len(self._streams)
         self._streams.append(stream)
 
@@ -107,7 +107,7 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
             if key not in content:
-                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: frame the map's, vehicle the vehicle's")
+                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: the map's or the vehicle's frame")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
         tf = streams.TfStream(True, where)
         tf_folder = sources.want(tf)
@@ -147,7 +147,7 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
             raise DriveError(f"{where}: {folder}: no such folder; check the path")
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not paths:
-            raise DriveError(f"{where}: {folder}: no image ({', '.join(SUFFIXES)}) in this folder")
+            raise DriveError(f"{where}: {folder}: no images ({', '.join(SUFFIXES)}) in this folder")
         if "stamps" in entry:
             stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
             stamp_s = read_stamps(stamps, len(paths), f"images in {folder}")
@@ -156,12 +156,12 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
                 stamp_s = np.array([float(path.stem) for path in paths])
             except ValueError:
                 raise DriveError(
-                    f"{where}: the images of {folder} are not named by their times; add stamps, one a line"
+                    f"{where}: the images of {folder} are not named by their times; add stamps, one per line"
                 ) from None
             order = np.argsort(stamp_s, kind="stable")
             stamp_s, paths = stamp_s[order], [paths[n] for n in order.tolist()]
         if (np.diff(stamp_s) <= 0).any():
-            raise DriveError(f"{where}: the times of the images of {folder} do not rise strictly; mend them")
+            raise DriveError(f"{where}: the image times of {folder} do not increase strictly; fix them")
         return ImageFiles(camera=camera, stamp_s=stamp_s / UNITS[unit], paths=paths)
 
     return images
@@ -192,17 +192,17 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
                     where = f"{path}: frame {len(stamps) + 1}"
                     if frame.rotation:
                         raise DriveError(
-                            f"{where} says to turn it, and a calibration is of pixels as they are stored: "
+                            f"{where} asks for a rotation, but a calibration is of stored pixels: "
                             "take the rotation out of the video"
                         )
                     if (complaints or frame.is_corrupt) and not complained:
                         complained = complaints[-1][2].strip() if complaints else "corrupt"
-                        _log.warning("%s: the decoder complains (%s); is it damaged?", where, complained)
+                        _log.warning("%s: decoder error (%s); is it damaged?", where, complained)
                     if frame.pts is None:
-                        raise DriveError(f"{where} has no time; give stamps, a time a line")
+                        raise DriveError(f"{where} has no time; give stamps, one per line")
                     stamps.append(float(frame.pts * frame.time_base))
                     if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
-                        raise DriveError(f"{where}: its time does not rise; convert the video")
+                        raise DriveError(f"{where}: its time does not increase; convert the video")
                     names.append(f"{len(names):06d}.png")
                     (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
         except (av.error.FFmpegError, IndexError) as failure:
@@ -211,7 +211,7 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
         finally:
             av.logging.set_level(None)
         if not stamps:
-            raise DriveError(f"{path}: holds no frame; convert or copy it again")
+            raise DriveError(f"{path}: has no frames; convert or copy it again")
         if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):
             _log.warning("%s: its frames end before its %.1f s do; is it cut off?", path, promised_s)
         write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
@@ -223,7 +223,7 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
     if ("start_s" in entry) == ("stamps" in entry):
         raise DriveError(
             f"{where}: add start_s, the time of the first frame on the poses' clock, or stamps, a file with "
-            "the time of every frame; one of the two"
+            "the time of every frame, but not both"
         )
 
     def images() -> ImageFiles:
@@ -234,7 +234,7 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
         stamp_s = read_stamps(stamps, len(listed.paths), f"frames of {path}")
         if (np.diff(stamp_s) <= 0).any():
-            raise DriveError(f"{stamps}: times do not rise strictly; mend them")
+            raise DriveError(f"{stamps}: times do not increase strictly; fix them")
         return replace(listed, stamp_s=stamp_s)
 
     return images

@@ -107,7 +107,7 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
         if not (point := known["id"]):
             raise DriveError(f"{where}: the point has no id; name it")
         if point in seen:
-            raise DriveError(f"{where}: the point {point} stands in line {seen[point]} already; keep one")
+            raise DriveError(f"{where}: point {point} is already in line {seen[point]}; keep one")
         seen[point] = line
     frame = _frame(names, crs, path)
     first, second = frame.columns
@@ -176,7 +176,7 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
     where, crs = str(table.path), table.crs
     if origin is None:
         raise DriveError(
-            f"{where}: {table.frame.value} have a place on the earth, the drive's map has none; give the "
+            f"{where}: {table.frame.value} have a position on the earth, the drive's map has none; give the "
             "drive an origin, or the points as x_m, y_m in the frame of its poses"
         )
     height_m = table.height_m
@@ -185,10 +185,10 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
         if datum.replace(" ", "") != origin.datum.replace(" ", ""):
             raise DriveError(
                 f"{where}: the points are in {datum} ({crs}), the drive's origin in {origin.datum}, which "
-                "differ by decimetres; give the points in that of the origin"
+                "differ by decimetres; give the points in the origin's datum"
             )
         if geodetic.has_height_datum(crs, where, DriveError) and table.geoid_m is None:
-            unused = "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m"
+            unused = "%s: heights of %s are above sea level and not used: set mapping.survey.geoid_m"
             _log.warning(unused, where, crs)
             height_m = np.full_like(height_m, np.nan)
     known = np.isfinite(height_m)
@@ -198,8 +198,8 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
         for name, (latitude_deg, longitude_deg) in zip(table.ids, table.coordinates, strict=True):
             if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
                 raise DriveError(
-                    f"{where}: latitude {latitude_deg:g}, longitude {longitude_deg:g} of {name} is no place "
-                    "on the earth; are they swapped?"
+                    f"{where}: latitude {latitude_deg:g}, longitude {longitude_deg:g} of {name} is not a "
+                    "position on the earth; are they swapped?"
                 )
     else:
         assert crs is not None
@@ -232,7 +232,7 @@ class _Row:
     def is_check(self) -> bool:
         role = self.text("role").lower() or "control"
         if role not in ("control", "check"):
-            raise DriveError(f"{self.where}: role '{role}' is neither control nor check; mend that line")
+            raise DriveError(f"{self.where}: role '{role}' is neither control nor check; fix that line")
         return role == "check"
 
 
@@ -242,7 +242,7 @@ def _columns(header: Sequence[str], path: Path) -> list[str | None]:
     for name, own in zip(header, ours, strict=True):
         if own is not None and ours.count(own) > 1:
             twice = [other for other, its in zip(header, ours, strict=True) if its == own]
-            raise DriveError(f"{path}: the columns {' and '.join(twice)} say the same; keep one of them")
+            raise DriveError(f"{path}: the columns {' and '.join(twice)} mean the same; keep one of them")
         near = difflib.get_close_matches(name.lower(), NAMES, n=1, cutoff=_NEARLY)
         if own is None and near:
             raise DriveError(f"{path}: unknown column '{name}'; did you mean '{near[0]}'?")
@@ -266,7 +266,7 @@ def _frame(names: Sequence[str | None], crs: str | None, path: Path) -> Frame:
     (frame,) = found
     if frame is Frame.GRID and crs is None:
         raise DriveError(
-            f"{path}: of which system are east and north? Set mapping.survey.crs, such as EPSG:32632, or "
+            f"{path}: which system are east and north in? Set mapping.survey.crs, such as EPSG:32632, or "
             "call the columns x_m, y_m if they are in the frame of the poses"
         )
     if frame is Frame.MAP and crs is not None:
@@ -274,7 +274,7 @@ def _frame(names: Sequence[str | None], crs: str | None, path: Path) -> Frame:
         raise DriveError(f"{path}: {problem}; call them east_m, north_m, or drop crs")
     if crs is not None and (frame is Frame.GEODETIC) != geodetic.is_geographic(crs, str(path), DriveError):
         kind = "latitudes and longitudes" if frame is Frame.GEODETIC else "east and north"
-        raise DriveError(f"{path}: holds {kind}, which {crs} has not; mend mapping.survey.crs")
+        raise DriveError(f"{path}: holds {kind}, which {crs} does not have; fix mapping.survey.crs")
     return frame
 
 

@@ -113,9 +113,9 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
         try:
             key, j, value = (camera, _microseconds(float(stamp))), int(marking), float(fraction)
         except ValueError:
-            raise DriveError(f"{where}: not '{','.join(SIGHTINGS)}'; mend that line") from None
+            raise DriveError(f"{where}: not '{','.join(SIGHTINGS)}'; fix that line") from None
         if not 0 <= j < markings or not 0.0 <= value <= 1.0:
-            raise DriveError(f"{where}: marking must be below {markings}, visible_fraction in 0 to 1; mend")
+            raise DriveError(f"{where}: marking must be below {markings}, visible_fraction in 0 to 1; fix")
         if key in row_of:
             visibility[row_of[key], j] = value
     return visibility
@@ -126,7 +126,7 @@ def _read_lane_visible(path: Path, hd_map: HdMap) -> tuple[BoolArray, ...]:
     for where, (lane, vertex) in _rows(path, LANE_VISIBLE):
         known = lane.isdecimal() and vertex.isdecimal()
         if not known or int(lane) >= len(visible) or int(vertex) >= len(visible[int(lane)]):
-            raise DriveError(f"{where}: no vertex {vertex} of a lane {lane} in the true map; mend that line")
+            raise DriveError(f"{where}: no vertex {vertex} of a lane {lane} in the true map; fix that line")
         visible[int(lane)][int(vertex)] = True
     return visible
 
@@ -139,5 +139,5 @@ def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]
     for number, row in enumerate(rows, start=2):
         where = f"{path}: line {number}"
         if len(row) != len(columns):
-            raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; mend that line")
+            raise DriveError(f"{where}: expected {len(columns)} columns, got {len(row)}; fix that line")
         yield where, row

@@ -85,7 +85,7 @@ def read_poses(
     named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
     if len(named) != 1:
         raise DriveError(
-            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic "
+            f"{where}: name one source, a pose file by its format ({', '.join(POSE_FORMATS)}) or a topic "
             f"of the bag; got {', '.join(named) or 'none'}"
         )
     (kind,) = named
@@ -128,13 +128,13 @@ def assemble(
     """
     if readings.antenna and settings.lever_arm_m is None:
         raise DriveError(
-            f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], where the antenna sits in "
+            f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], the antenna's position in "
             "the vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle"
         )
     if readings.attitudes is None:
         raise DriveError(
-            f"{where}: holds positions without a heading, and the course over ground is none where a vehicle "
-            "turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic)"
+            f"{where}: holds positions without a heading, and the course over ground is not a heading when a "
+            "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic)"
         )
     heading_sigma_rad = readings.attitudes.sigma_rad
     sure = _sure_enough(readings, settings.max_sigma_m, where)
@@ -158,7 +158,7 @@ def assemble(
     else:
         for key in ("heading", "geoid_m"):
             if getattr(settings, key) is not None:
-                only = "only for coordinates with a place on the earth; add crs or drop it"
+                only = "only for coordinates on the earth; add crs or drop it"
                 raise DriveError(f"{where}, {key}: {only}")
     if settings.lever_arm_m is not None:
         points = points - rotation @ settings.lever_arm_m
@@ -177,14 +177,14 @@ def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArra
     unsure = ~(readings.sigma_m <= max_sigma_m) if states else readings.sigma_m > max_sigma_m
     if unsure.all():
         stated = readings.sigma_m[np.isfinite(readings.sigma_m)]
-        best = f"the best is {stated.min():.2g} m" if len(stated) else "none is a fix"
+        best = f"the best is {stated.min():.2g} m" if len(stated) else "none has a fix"
         raise DriveError(
-            f"{where}: no position is sure to {max_sigma_m:g} m ({best}); record with an RTK fix, or set "
-            "max_sigma_m higher and expect a map as unsure"
+            f"{where}: no position is known to {max_sigma_m:g} m ({best}); record with an RTK fix, or raise "
+            "max_sigma_m and expect a map as uncertain"
         )
     if unsure.any():
         _log.warning(
-            "%s: left out %d of %d positions, not stated to be as sure as %g m (no RTK fix; max_sigma_m)",
+            "%s: left out %d of %d positions, whose sigma is not below %g m (no RTK fix; max_sigma_m)",
             where, int(unsure.sum()), len(unsure), max_sigma_m,
         )  # fmt: skip
     return np.asarray(~unsure)
@@ -218,13 +218,13 @@ def _on_earth(
     crs = settings.crs
     if crs is not None and earth.has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
         advice = "add geoid_m, the geoid's height above the ellipsoid"
-        raise DriveError(f"{where}: heights of {crs} count from the sea: {advice}")
+        raise DriveError(f"{where}: heights of {crs} are above sea level: {advice}")
     raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
     if geodetic:
         if crs is not None and not earth.is_geographic(crs, where, DriveError):
-            raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
+            raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; fix crs")
         if settings.heading == "grid":
-            raise DriveError(f"{where}: heading 'grid' of latitudes, longitudes, which have no grid; mend it")
+            raise DriveError(f"{where}: heading 'grid' for latitudes, longitudes, which have no grid; fix it")
         return raised, np.zeros(len(points))
     assert crs is not None
     if settings.heading is None:

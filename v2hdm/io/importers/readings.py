@@ -85,7 +85,7 @@ def read_stamps(path: Path, count: int, things: str) -> FloatArray:
         ]
     )
     if len(stamp_s) != count:
-        raise DriveError(f"{path}: {len(stamp_s)} times of {count} {things}; give one of each")
+        raise DriveError(f"{path}: {len(stamp_s)} times for {count} {things}; give one of each")
     return stamp_s
 
 
@@ -116,7 +116,7 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     coordinates = _GEODETIC if geodetic else _MAP
     if geodetic == (_MAP[0] in columns):
         either = f"{', '.join(_MAP)} or {', '.join(_GEODETIC)}"
-        raise DriveError(f"{path}: needs positions, as columns {either}, one of the two")
+        raise DriveError(f"{path}: needs positions, as columns {either}, but not both")
     _check_there(columns, coordinates[:2], path)
     count = len(rows)
     points = np.column_stack([columns.get(name, np.zeros(count)) for name in coordinates])
@@ -157,7 +157,7 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     lines = [*lines[:1], *(one for one in lines[1:] if not one[1].lstrip().startswith("#"))]
     if len(lines) < 2:
-        raise DriveError(f"{path}: holds no {thing}; expected a line of column names and one line a {thing}")
+        raise DriveError(f"{path}: has no {thing}; expected a line of column names and one line per {thing}")
     title = lines[0][1].lstrip("\ufeff# ")
     separator = next((mark for mark in separators if mark in title), None)
 
@@ -172,11 +172,11 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
         header = split(title)
         rows = [(number, split(line)) for number, line in lines[1:]]
     except csv.Error as failure:
-        raise DriveError(f"{path}: is no table ({failure}); mend its quotes or its longest cell") from None
+        raise DriveError(f"{path}: is not a table ({failure}); fix its quotes or its longest cell") from None
     for number, cells in rows:
         if len(cells) != len(header):
             problem = f"{len(cells)} cells under {len(header)} columns"
-            raise DriveError(f"{path}: line {number}: {problem}; mend that line")
+            raise DriveError(f"{path}: line {number}: {problem}; fix that line")
     return header, rows
 
 
@@ -189,7 +189,7 @@ def _parse(name: str, cell: str, where: str) -> float:
             return parse_sigma(cell)
     except ValueError:
         kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number, 0 or more"
-        raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None
+        raise DriveError(f"{where}: '{cell}' is not {kind}; fix that line") from None
     return parse_number(cell, where)
 
 
@@ -204,14 +204,14 @@ def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     named = [name for name in (*_STAMPS, "utc") if name in columns]
     if len(named) != 1:
         wanted, has = ", ".join(_STAMPS), ", ".join(named) or "none"
-        raise DriveError(f"{path}: needs one column of times, {wanted} or utc, has {has}; see columns")
+        raise DriveError(f"{path}: needs one time column, {wanted} or utc, has {has}; see columns")
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
 
 
 def _check_there(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
     for name in names:
         if name not in columns:
-            raise DriveError(f"{path}: has no column '{name}'; say under columns what the file calls it")
+            raise DriveError(f"{path}: has no column '{name}'; give the file's name for it under columns")
 
 
 def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
@@ -220,7 +220,7 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
     if "qw" in columns:
         _check_there(columns, _QUATERNION, path)
         if angles:
-            raise DriveError(f"{path}: has a quaternion and {angles[0]}: say one of them under columns")
+            raise DriveError(f"{path}: has a quaternion and {angles[0]}: choose one under columns")
         quaternion = np.column_stack([columns[name] for name in _QUATERNION])
         return checked_rotations(quaternion, lambda k: f"{path}: pose {k + 1}")
     if not yaws:
@@ -229,7 +229,7 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
                  ("pitch_deg", "pitch_rad", "pitch_up_deg")):  # fmt: skip
         twice = [name for name in kind if name in columns]
         if len(twice) > 1:
-            raise DriveError(f"{path}: says {twice[0]} and {twice[1]}: name one of them under columns")
+            raise DriveError(f"{path}: has {twice[0]} and {twice[1]}: choose one under columns")
     zeros = np.zeros(len(columns[yaws[0]]))
 
     def radians(kind: str) -> FloatArray:
@@ -277,7 +277,7 @@ def nmea_readings(lines: Iterable[str], where: str, first_day: date | None = Non
     if bad:
         _log.warning("%s: left out %d of %d damaged sentences", where, bad, total)
     if 2 * bad > total:
-        raise DriveError(f"{where}: {bad} of {total} NMEA sentences are damaged; record the log anew")
+        raise DriveError(f"{where}: {bad} of {total} NMEA sentences are damaged; record the log again")
     return log.readings(first_day)
 
 
@@ -332,7 +332,7 @@ class _Log:
         day = self._first_date or first_day
         if day is None:
             advice = "add date, the day of the first sentence"
-            raise DriveError(f"{self._where}: no RMC or ZDA sentence tells the date: {advice}")
+            raise DriveError(f"{self._where}: no RMC or ZDA sentence states the date: {advice}")
         if self._above_sea:
             _log.warning(
                 "%s: its heights count from the sea, and GGA does not say where that is; add geoid_m if the "

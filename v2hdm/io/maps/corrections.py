@@ -34,12 +34,12 @@ _MOST = 100_000
 
 @dataclass(kw_only=True)
 class Correction:
-    """A person's word on one marking, symbol or candidate that was left out.
+    """A person's decision on one marking, symbol or candidate that was left out.
 
-    ``kind`` and ``outline_map`` are its class and corners (N, 2), m, in the map that the person saw, a single
-    point where it was left out. ``says`` is ``accepted``, ``rejected``, for a ``reason``, or ``corrected``:
-    of ``new_kind``, or with corners ``moved`` to (2,) by their number from 1, up to ``sigma_m`` beside the
-    others. ``marking`` is its id in that map, for readers alone.
+    ``says`` is accepted, rejected or corrected. ``reason`` is an optional comment. ``kind`` and
+    ``outline_map`` are its class and corners (N, 2), m, in the map that they saw, one point if left out.
+    ``new_kind`` is the corrected class. ``moved`` has new positions (2,) of corners, numbered from 1.
+    ``sigma_m`` is their standard deviation, m. ``marking`` is its id in that map, only for readers.
     """
 
     says: str
@@ -53,7 +53,7 @@ class Correction:
 
     @property
     def place(self) -> str:
-        """Where it is, for a reader."""
+        """Its class, id and position, for messages."""
         x, y = np.mean(self.outline_map, axis=0)
         name = "" if self.marking is None else f" {self.marking}"
         return f"{self.kind}{name} at ({x:.2f}, {y:.2f})"

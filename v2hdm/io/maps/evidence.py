@@ -91,7 +91,7 @@ def read_residuals(path: Path) -> Residuals:
             if len(numbers[-1]) != len(COLUMNS) - 3:
                 raise ValueError
         except ValueError:
-            raise MapFileError(f"{path}: line {line}: not {len(COLUMNS)} fields as named above") from None
+            raise MapFileError(f"{path}: line {line}: not {len(COLUMNS)} fields as in the header") from None
         row_image.append(number)
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
     cameras = tuple(camera for _, camera, _ in images.values())
@@ -120,7 +120,7 @@ def read_exclusions(path: Path) -> list[Exclusion]:
     """Read the file of :func:`write_exclusions`; raises MapFileError where it is missing or damaged."""
     features = files.load_json(path, MapFileError).get("features")
     if not isinstance(features, list):
-        raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
+        raise MapFileError(f"{path}: no 'features'; give a file that v2hdm map wrote")
     excluded = []
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"

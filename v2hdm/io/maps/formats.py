@@ -186,7 +186,7 @@ def check_crs(
     chosen = [name for name in formats if crs is not None and _ALL[name].takes_crs]
     if crs is not None and not chosen:
         takers = ", ".join(name for name, one in FORMATS.items() if one.takes_crs)
-        raise ConfigError(f"{key}: no format that is to be written takes one ({takers} do); leave it out")
+        raise ConfigError(f"{key}: none of the formats to write uses it (only {takers}); leave it out")
     return {name: Grid.of(str(crs), origin, key, ConfigError, FORMATS[name].metres) for name in chosen}
 
 
@@ -214,8 +214,8 @@ def write_map(
         path = folder / _ALL[chosen].file.format(name=name)
         if chosen in GROUND_FORMATS and not hd_map.ground:
             _log.warning(
-                "%s is not written: the map holds no surface of the ground; map the drive with "
-                "mapping.ground=surface, or auto where it is no plane", path.name,
+                "%s is not written: the map holds no ground surface; map the drive with "
+                "mapping.ground=surface, or auto if it is not a plane", path.name,
             )  # fmt: skip
             continue
         more: dict[str, Any] = {"projector": projector} if chosen == "lanelet2" else {}
@@ -226,6 +226,6 @@ def write_map(
         if chosen == "geojson" and hd_map.origin is None and crs is None:
             _log.warning(
                 "%s: the drive has no origin on the earth, so its coordinates are metres, which a GIS opens "
-                "as degrees; the format gpkg says what they are", path.name,
+                "as degrees; the format gpkg marks them as metres", path.name,
             )  # fmt: skip
     return written

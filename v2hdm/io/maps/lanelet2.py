@@ -206,7 +206,7 @@ def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> tuple[st
     if len(squares) > 1:
         raise ConfigError(
             f"the map spans the MGRS squares {', '.join(sorted(squares))}, and Autoware's MGRS projector "
-            "takes one square: choose the projector LocalCartesian"
+            "allows one square: choose the projector LocalCartesian"
         )
     (square,) = squares
     utm = pyproj.Proj(proj="utm", zone=int(square[:-3]), ellps="WGS84")

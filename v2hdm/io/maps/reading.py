@@ -59,7 +59,7 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         endings = " or ".join(_READERS)
-        raise MapFileError(f"{path}: no map that can be read; give a file that ends in {endings}")
+        raise MapFileError(f"{path}: not a readable map; give a file that ends in {endings}")
     return reader(path), read_verdict(path)
 
 
@@ -145,7 +145,7 @@ class _Reader:
         if geometry is None and not properties.keys() & set(LAYERS):
             raise MapFileError(f"{where}: has no geometry, '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it")
         if geometry is not None and geometry.closed and len(geometry.positions) < 3:
-            raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
+            raise MapFileError(f"{where}: its ring has fewer than three corners; fix it, or drop it")
         geodetic = geometry is not None and self._origin is not None
         if geometry is not None and geodetic and self._grid is not None:
             if geometry.positions.shape[1] < 3:
@@ -154,12 +154,12 @@ class _Reader:
                 geometry, positions=self._grid.geodetic(geometry.positions, where, MapFileError)
             )
         if geometry is not None and geodetic and (np.abs(geometry.positions[:, 1]) > 90).any():
-            raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; mend it")
+            raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; fix it")
         closed = POINTS not in properties if geometry is None else geometry.closed
         stored = _stored(properties, closed, where)
         feature = stored if geometry is None else _believed(stored, geometry, self._origin, self._rounding)
         if closed and not feature.symbol and len(feature.points_map) != 4:
-            raise MapFileError(f"{where}: a marking has four corners, not {len(feature.points_map)}; mend it")
+            raise MapFileError(f"{where}: a marking has four corners, not {len(feature.points_map)}; fix it")
         if feature is not stored and len(stored.points_map):
             self._edited.append(len(self._features))
         self._features.append(feature)
@@ -238,7 +238,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         known = properties.get(key) if key not in EXACT or len(points) else None
         value = None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
         if value is not None and "sigma" in key and np.min(value, initial=0.0) < 0:
-            raise MapFileError(f"{where}, {key}: a standard deviation is negative; mend it or leave it out")
+            raise MapFileError(f"{where}, {key}: a standard deviation is negative; fix it or leave it out")
         return value
 
     left = [optional(name, take_number) for name in PAINT]
@@ -296,7 +296,7 @@ def _of_wkb(blob: object, where: str) -> Geometry | None:
         closed, dimensions = kind % 1000 == 3, (2, 3, 3, 4)[kind // 1000]
         if kind % 1000 not in (2, 3):
             several = kind % 1000 in (5, 6)
-            problem = "has several parts; split it" if several else "is none that a map has; draw another"
+            problem = "has several parts; split it" if several else "is not one that maps have; draw another"
             raise MapFileError(f"{where}: its geometry {problem}")
         if closed and count != 1:
             raise MapFileError(f"{where}: its polygon has holes; fill them")
@@ -336,7 +336,7 @@ def _layer(path: Path, layer: str) -> list[dict[str, Any]]:
             for row in data.execute(f'SELECT * FROM "{layer}"'):
                 left -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
                 if left < 0:
-                    raise MapFileError(f"{others} (its rows are more than its bytes); give one that is")
+                    raise MapFileError(f"{others} (it has more rows than bytes); give one that is")
                 rows.append(dict(zip((name for name, _ in columns), row, strict=True)))
     except (sqlite3.Error, AttributeError) as failure:
         raise MapFileError(f"{others} ({failure}); give one that is") from None

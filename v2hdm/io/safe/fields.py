@@ -28,7 +28,7 @@ def take_whole(content: object, least: int, most: int, where: str, error: type[V
     """``content`` as a whole number of a range."""
     value = take_number(content, where, error)
     if value != int(value) or not least <= value <= most:
-        raise error(f"{where}: expected a whole number of {least} to {most}, got {value:g}; mend it")
+        raise error(f"{where}: expected a whole number of {least} to {most}, got {value:g}; fix it")
     return int(value)
 
 
@@ -44,7 +44,7 @@ def take_origin(content: object, where: str, error: type[V2hdmError]) -> Geodeti
 
     latitude_deg, longitude_deg = number("latitude_deg"), number("longitude_deg")
     if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
-        raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; mend them")
+        raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; fix them")
     return GeodeticOrigin(
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
@@ -64,7 +64,7 @@ def take_covariance(content: object, size: int, where: str, error: type[V2hdmErr
         correlation = matrix / np.where(scale > 0, scale, 1.0)
         symmetric = np.abs(correlation - correlation.T).max() <= _ROUNDING
     if (variance < 0).any() or not symmetric or np.linalg.eigvalsh(correlation).min() <= -_ROUNDING:
-        raise error(f"{where}: not symmetric or negative somewhere; mend it or leave it out")
+        raise error(f"{where}: not symmetric or negative somewhere; fix it or leave it out")
     return matrix
 
 
@@ -76,9 +76,9 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> Camer
     (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
     if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:
         problem = "not of the form fx s cx, 0 fy cy, 0 0 1 with positive fx, fy"
-        raise error(f"{where}: camera_matrix: {problem}; mend it")
+        raise error(f"{where}: camera_matrix: {problem}; fix it")
     if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
-        raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; mend it")
+        raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; fix it")
     # The image's reach from the axis to a side, and up or down, in focal lengths.
     across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
     down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
@@ -87,7 +87,7 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> Camer
     # where 6 p r reaches 1; every real lens is below a tenth of that.
     tangential = np.hypot(k[2], k[3]) if info.distortion_model != "equidistant" and len(k) > 3 else 0.0
     if 6 * tangential * min(max(across, down), _MIDDLE) >= 1:
-        raise error(f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} turn the image over; order k1 k2 p1 p2 k3")
+        raise error(f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} flip the image; order k1 k2 p1 p2 k3")
     reach, scale_px = lens_reach(info), (fx + fy) / 2
     if reach >= np.hypot(across, down):
         return info

@@ -102,7 +102,7 @@ def png(pixels: np.ndarray) -> bytes:
 @lru_cache
 def _warn_turned(folder: Path, orientation: int) -> None:
     _log.warning(
-        "%s: images are turned upright, by their EXIF orientation %d; calibrate the turned ones",
+        "%s: images are rotated according to their EXIF orientation %d; calibrate the rotated ones",
         folder, orientation,
     )  # fmt: skip
 
@@ -130,9 +130,9 @@ def _opened(path: Path) -> Iterator[_Stored]:
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):
-            raise DriveError(f"{path}: is no image file but a folder or a device; check the list")
+            raise DriveError(f"{path}: is a folder or a device, not an image file; check the list")
         if about.st_size > _MOST_BYTES:
-            raise DriveError(f"{path}: image of {about.st_size / 1e6:.0f} MB; check what it is")
+            raise DriveError(f"{path}: image of {about.st_size / 1e6:.0f} MB; check its content")
         note_input(path)
         with path.open("rb") as stream:
             yield _Stored(stream, about.st_size)
@@ -159,9 +159,9 @@ def _checked(data: _Data, path: Path) -> Header:
         raise DriveError(f"{path}: image is truncated or damaged; restore it or drop it from the list")
     size = f"{path}: image is {header.width} x {header.height} px"
     if min(header.width, header.height) < LEAST_SIDE_PX:
-        raise DriveError(f"{size}; give images of at least {LEAST_SIDE_PX} px a side")
+        raise DriveError(f"{size}; give images of at least {LEAST_SIDE_PX} px per side")
     if header.width * header.height > MOST_PX:
-        raise DriveError(f"{size}, more than {MOST_PX // 10**6} million in all; scale it down or drop it")
+        raise DriveError(f"{size}, more than {MOST_PX // 10**6} million in total; scale it down or drop it")
     return header
 
 

@@ -28,7 +28,7 @@ MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing he
 MOST_NAME_LETTERS, _MOST_NAME_BYTES = 64, 200  # file systems end at 255 bytes
 _SHORT, _FEW = 60, 4
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
-_HALF = "half a letter (a surrogate without its other)"
+_HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
 _OPENING, _CLOSING = [ord("["), ord("{")], [ord("]"), ord("}")]
@@ -67,7 +67,7 @@ def read_text(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> st
         raise error(f"{path}: line {line}: not a UTF-8 text file; save it as UTF-8, or restore it") from None
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise error(f"{path}: line {line}: a zero byte, so that it is no text; restore the file")
+        raise error(f"{path}: line {line}: a zero byte, so it is not text; restore the file")
     return text
 
 
@@ -87,11 +87,11 @@ def parse_yaml(text: str, where: str, error: type[V2hdmError]) -> Any:
         line = "" if row is None else f" line {row + 1}"
         problem = getattr(failure, "problem", None) or getattr(failure, "reason", None) or "not readable"
         if "'\\t'" in problem:
-            problem = "a tab where blanks must be"
+            problem = "a tab instead of spaces"
         reason = " ".join(str(problem).split())
-        raise error(f"{where}:{line} YAML syntax error: {reason}; mend that line") from None
+        raise error(f"{where}:{line} YAML syntax error: {reason}; fix that line") from None
     except RecursionError:  # the scanner's own
-        raise error(f"{where}: YAML nested deeper than {MOST_DEPTH} levels; mend it") from None
+        raise error(f"{where}: YAML nested deeper than {MOST_DEPTH} levels; fix it") from None
 
 
 def read_json(path: Path, error: type[V2hdmError]) -> Any:
@@ -104,14 +104,14 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
     letters = np.frombuffer(_QUOTED.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
     steps = np.isin(letters, _OPENING).astype(np.int32) - np.isin(letters, _CLOSING)
     if np.cumsum(steps).max(initial=0) > MOST_DEPTH:
-        raise error(f"{where}: JSON nested deeper than {MOST_DEPTH} levels; mend it")
+        raise error(f"{where}: JSON nested deeper than {MOST_DEPTH} levels; fix it")
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         entries = dict(pairs)
         if len(entries) < len(pairs):
             names = [name for name, _ in pairs]
             twice = next(name for n, name in enumerate(names) if name in names[:n])
-            raise error(f"{where}: {shown(twice)} is there twice in one JSON object; keep one")
+            raise error(f"{where}: {shown(twice)} appears twice in one JSON object; keep one")
         return entries
 
     def whole(digits: str) -> int | float:
@@ -124,12 +124,12 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
             json.dumps(content, ensure_ascii=False).encode()
         return content
     except UnicodeEncodeError:
-        raise error(f"{where}: {_HALF}, where a text may be; mend it") from None
+        raise error(f"{where}: {_HALF}instead of a text; fix it") from None
     except RecursionError:
-        raise error(f"{where}: JSON nested too deep; mend it") from None
+        raise error(f"{where}: JSON nested too deep; fix it") from None
     except json.JSONDecodeError as failure:
         at = f"{where}: line {failure.lineno}"
-        raise error(f"{at} JSON syntax error: {failure.msg}; mend that line") from None
+        raise error(f"{at} JSON syntax error: {failure.msg}; fix that line") from None
 
 
 def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
@@ -142,13 +142,13 @@ def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
         raise error(f"{where}: a name is empty; give one")
     fault = None
     if set(content) & set("/\\"):
-        fault = "has a separator of folders"
+        fault = "has a path separator"
     elif not content.isprintable():
         fault = "has a letter that does not show, such as a line's end"
     elif content.startswith("."):
         fault = "begins with a dot"
     elif content != content.strip():
-        fault = "begins or ends with a blank"
+        fault = "begins or ends with a space"
     elif len(content) > MOST_NAME_LETTERS or len(content.encode()) > _MOST_NAME_BYTES:
         fault = f"is longer than {MOST_NAME_LETTERS} letters"
     if fault is not None:
@@ -177,7 +177,7 @@ def shown(content: object) -> str:
             return f"[{', '.join(map(shown, content))}]"
         return f"a list of {len(content)}" if len(content) != 1 else "a list of one"
     if isinstance(content, int) and abs(content) >= 10**MOST_DIGITS:
-        return "a number of very many digits"
+        return "a number with very many digits"
     letters = str(content)[: _SHORT + 1]
     text = "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in letters)
     if len(text) > _SHORT:
@@ -204,32 +204,32 @@ class _Loader(yaml.SafeLoader):
         self._depth -= 1
         if isinstance(event, yaml.AliasEvent):
             if id(node) not in self._sizes:
-                _refuse("an alias of what it is part of", event.start_mark)
+                _refuse("an alias of something that contains it", event.start_mark)
             self._entries += self._sizes[id(node)]
         if self._entries > MOST_ENTRIES:
-            _refuse(f"more than {MOST_ENTRIES} values, with what aliases repeat", event.start_mark)
+            _refuse(f"more than {MOST_ENTRIES} values, including aliases", event.start_mark)
         self._sizes.setdefault(id(node), self._entries - begun)
         return node
 
     def construct_scalar(self, node: Any) -> Any:
         value = super().construct_scalar(node)
         if node.tag == _INT and len(value) > MOST_DIGITS:
-            _refuse(f"a number of {len(value)} digits", node.start_mark)
+            _refuse(f"a number with {len(value)} digits", node.start_mark)
         if any("\ud800" <= letter <= "\udfff" for letter in value):
             _refuse(_HALF, node.start_mark)
         return value
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
         if node.tag not in _PLAIN:
-            _refuse(f"the tag {shown(node.tag)}, where only plain values may be", node.start_mark)
+            _refuse(f"the tag {shown(node.tag)}, but only plain values are allowed", node.start_mark)
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError, TypeError, LookupError):
-            _refuse(f"{shown(node.value)} is not what its tag says", node.start_mark)
+            _refuse(f"{shown(node.value)} does not match its tag", node.start_mark)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         if not isinstance(node, yaml.MappingNode):
-            _refuse("not the mapping that its tag says", node.start_mark)
+            _refuse("not a mapping, as its tag states", node.start_mark)
         written = {}
         for key, _ in node.value:
             if key.tag == _MERGE:
@@ -237,7 +237,7 @@ class _Loader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 _refuse("a key that is a list or a mapping", key.start_mark)
             if key.value in written:
-                _refuse(f"the key {shown(key.value)} is there twice", key.start_mark)
+                _refuse(f"the key {shown(key.value)} appears twice", key.start_mark)
             written[key.value] = key
             key.tag = _TEXT
         return super().construct_mapping(node, deep)

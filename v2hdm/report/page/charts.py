@@ -128,7 +128,7 @@ def _histogram_chart(residuals: GroundResiduals) -> str:
             _steps(left, lengths, edges_px, f"{name} ({len(lengths)})", number)
             _steps(right, residuals.distance_sigma[own], edges_sigma, name, number)
         ideal = edges_sigma * np.exp(-0.5 * edges_sigma**2)
-        right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="as the noise model says")
+        right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="as the noise model states")
         left.set(xlabel="distance, projected to observed (px)", ylabel="share of corners per px")
         right.set_xlabel("the same (standard deviations)")
         for axes in (left, right):

@@ -92,7 +92,7 @@ class Facts:
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read the result folder of a run, and what is known by its ``drive``; MapFileError where damaged."""
     if not (folder / "metrics.json").is_file():
-        raise MapFileError(f"{folder}: no result of v2hdm map (no metrics.json in it); give its folder")
+        raise MapFileError(f"{folder}: not a result of v2hdm map (no metrics.json); give its folder")
     metrics = load_json(folder / "metrics.json", MapFileError)
     sets = list(metrics.get("results") or {})
     hd_map = read_geojson(folder / "map.geojson") if (folder / "map.geojson").is_file() else None
@@ -139,7 +139,7 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
     try:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
-        raise MapFileError(f"{path}: not a line of 8 numbers for each pose of trajectory.tum") from None
+        raise MapFileError(f"{path}: not one line of 8 numbers per pose of trajectory.tum") from None
     stamp_s, poses = adjusted.stamp_s, adjusted.map_from_vehicle
     recorded, moved = None, poses
     if drive is not None and drive.trajectory is not None:

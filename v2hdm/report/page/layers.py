@@ -59,7 +59,7 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     if not 0 < len(text) <= LARGEST_BYTES:
         pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_UNCHANGED) if coded else None
         if pixels is None:
-            raise MapFileError(f"{path}: no picture that can be read; make the mosaic again")
+            raise MapFileError(f"{path}: not a readable picture; make the mosaic again")
         text = _webp(pixels)
     return {"src": text, "type": "image/webp", "bounds": bounds.tolist()}
 
@@ -100,7 +100,7 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     )
     origin = None if facts.hd_map is None else facts.hd_map.origin
     if origin is None:
-        raise MapFileError(f"{path}: this map has no place on the earth; state the origin in drive.yaml")
+        raise MapFileError(f"{path}: this map has no position on the earth; state the origin in drive.yaml")
     (west, south), (east, north) = _extent(facts)
     step = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
     size = {"width": int(np.ceil((east - west) / step)), "height": int(np.ceil((north - south) / step))}
@@ -117,9 +117,9 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
                 bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
                 seen = there.dataset_mask()
     except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
-        raise MapFileError(f"{path}: neither a GeoTIFF nor XYZ tiles that can be read ({failure})") from None
+        raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles ({failure})") from None
     if not seen.any():
-        raise MapFileError(f"{path}: shows none of this map's ground; give a picture of its site")
+        raise MapFileError(f"{path}: does not cover this map; give a picture of its site")
     if bands.dtype != np.uint8:
         low, high = np.percentile(bands[:, seen > 0], (1, 99))
         bands = np.clip((bands - low) * 255.0 / max(high - low, 1e-9), 0, 255).astype(np.uint8)

@@ -110,7 +110,7 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         figures.append(Figure("Against the truth", number(best["corner_rmse_m"], 1, 100), "cm", note))
     checked = facts.metrics.get("check_points") or {}
     if "rmse_m" in checked:
-        note = f"RMSE of {checked.get('compared')} surveyed points that no estimate has seen"
+        note = f"RMSE of {checked.get('compared')} surveyed points that no estimate used"
         figures.append(Figure("Check points", number(checked["rmse_m"], 1, 100), "cm", note))
     if "reprojection_rmse_px" in best:
         before = best.get("initial_reprojection_rmse_px")

@@ -331,7 +331,7 @@ class Port:
         encoded, data = cv2.imencode(".jpg", image_bgr, quality)
         if not encoded:
             raise DriveError(
-                f"port '{self.config.name}': an image cannot be coded as JPEG; check the OpenCV installation"
+                f"port '{self.config.name}': an image cannot be stored as JPEG; check the OpenCV installation"
             )
         return data.tobytes()
 
@@ -378,7 +378,7 @@ def build_port(config: PortConfig) -> Port:
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
-        problem = f"{route.length_m:g} m in all; give {_SHORTEST_ROUTE_M:g} m or more"
+        problem = f"{route.length_m:g} m in total; give {_SHORTEST_ROUTE_M:g} m or more"
         raise ConfigError(f"port '{config.name}', route.pieces: {problem}")
     layout = build_layout(config.paint, route, streams[_LAYOUT])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
@@ -430,7 +430,7 @@ def _check(config: PortConfig) -> None:
     for name, stencil in config.paint.stencils.items():
         key = f"paint.stencils.{name}"
         rules += [
-            (name not in PAINT_CLASSES, f"{key}: there is a class of this name; give another"),
+            (name not in PAINT_CLASSES, f"{key}: a class of this name exists; choose another"),
             (stencil.spacing_m > 1, f"{key}.spacing_m: must be more than 1 m"),
             (
                 stencil.shapes_m and all(map(_is_convex, stencil.shapes_m)),

@@ -1,6 +1,6 @@
-"""Everything that makes up a rendered port, as plain values: what `conf/run/port*.yaml` fills in.
+"""The settings of a rendered port, as plain values that `conf/run/port*.yaml` fills in.
 
-Angles are in degrees here, since people write these values; the code below works in radians.
+Angles are in degrees here, since people write these values; the renderer works in radians.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ class MountConfig:
     """Where a camera sits on the vehicle: its centre, then yaw (left), pitch (down) and roll.
 
     Attributes:
-        x_m: ahead of the vehicle's origin.
-        y_m: to its left.
-        z_m: above the ground.
-        yaw_deg: viewing direction, to the left.
-        pitch_deg: downwards.
-        roll_deg: about the viewing direction.
+        x_m: distance ahead of the vehicle's origin.
+        y_m: distance to the left of the origin.
+        z_m: height above the ground.
+        yaw_deg: yaw of the viewing direction, to the left.
+        pitch_deg: pitch of the viewing direction, downwards.
+        roll_deg: roll about the viewing direction.
     """
 
     x_m: float
@@ -31,17 +31,17 @@ class MountConfig:
 
 @dataclass(kw_only=True)
 class CameraConfig:
-    """One camera: lens, mount, and the mount of the same camera on the other vehicle, which lends its IPM.
+    """A camera: its lens, its mount, and its mount on the other vehicle, which lends its IPM.
 
     ``distortion`` are plumb_bob coefficients k1 k2 p1 p2 k3.
 
     Attributes:
-        width: of an image, px.
-        height: of an image, px.
+        width: image width, px.
+        height: image height, px.
         focal_px: focal length.
-        principal_offset_px: of the principal point from the image's centre, right and down.
+        principal_offset_px: offset of the principal point from the image centre, right and down.
         psf_sigma_px: blur of the lens, standard deviation.
-        vignetting: loss of light in the corners, as a share.
+        vignetting: loss of light in the corners, as a fraction.
     """
 
     mount: MountConfig
@@ -59,7 +59,7 @@ class CameraConfig:
 class CalibrationConfig:
     """The manual calibration: ground points surveyed and clicked in an image, and a survey of the camera.
 
-    ``points_ahead_m`` are distance along the viewing direction and offset to the left, in m from the camera.
+    ``points_ahead_m`` are the points' distances ahead and offsets to the left, in m from the camera.
 
     Attributes:
         survey_sigma_m: standard deviation of a surveyed point.
@@ -80,19 +80,19 @@ class CalibrationConfig:
 
 @dataclass(kw_only=True)
 class DisturbanceConfig:
-    """Differences of the recorded poses from the true ones; standard deviations per axis.
+    """Errors of the recorded poses; standard deviations per axis.
 
-    Roll and pitch jitter have a white and a correlated part of equal power; so has the heading error. RTK's
+    Roll and pitch jitter have a white and a correlated part of equal power; so has the heading error. The RTK
     position error has a white part and one that is correlated over ``rtk_correlation_m`` of driving.
 
     Attributes:
-        roll_pitch_deg: of the body's attitude.
-        heave_m: of the body's height.
-        jitter_correlation_s: time over which attitude and height are correlated.
-        rtk_white_m: of a position, independent at each time.
-        rtk_correlated_m: of a position, common to a stretch of road.
-        heading_deg: of the recorded heading.
-        heading_correlation_s: time over which the heading's error is correlated.
+        roll_pitch_deg: standard deviation of the body's roll and pitch.
+        heave_m: standard deviation of the body's height.
+        jitter_correlation_s: correlation time of attitude and height.
+        rtk_white_m: white position error.
+        rtk_correlated_m: correlated position error.
+        heading_deg: error of the recorded heading.
+        heading_correlation_s: correlation time of the heading error.
     """
 
     roll_pitch_deg: float = 0.11
@@ -107,12 +107,12 @@ class DisturbanceConfig:
 
 @dataclass(kw_only=True)
 class RouteConfig:
-    """The way: pieces of [length in m, turn to the left in degrees], driven at about ``speed_mps``.
+    """The route, made up of ``pieces`` and driven at about ``speed_mps``.
 
     Attributes:
-        pieces: [length in m, turn to the left in degrees] of each.
+        pieces: [length in m, turn to the left in degrees] of each piece.
         image_spacing_m: distance driven between two images.
-        pose_rate_hz: recorded poses a second.
+        pose_rate_hz: recorded poses per second.
     """
 
     pieces: list[list[float]] = field(
@@ -129,9 +129,9 @@ class RouteConfig:
 class StencilConfig:
     """Paint of a user's own class, in rows along the route.
 
-    ``shapes_m`` are the convex polygons that make it up, as points [ahead, left] in m. One of four points is
-    a marking of the true map. A stencil is painted every ``spacing_m`` at each of ``offsets_m``, to the left
-    of the route, where there is room.
+    ``shapes_m`` are the convex polygons that make it up, as points [ahead, left] in m. Those with four points
+    are markings of the true map. A stencil is painted every ``spacing_m`` along each of ``offsets_m`` to the
+    left of the route, where there is room.
     """
 
     shapes_m: list[list[list[float]]]
@@ -143,26 +143,26 @@ class StencilConfig:
 class PaintConfig:
     """The markings: diamonds in rows beside and on the route, lane lines, arrows, stop lines, lettering.
 
-    Offsets are to the left of the route, in m; ``field_offsets_m`` are rows further out, on straights
-    only. ``wear`` and ``dirt`` are the means of what varies from marking to marking. ``stencils`` are paint
-    of users' own classes, by their names.
+    Offsets are to the left of the route, in m; ``field_offsets_m`` are rows of diamonds farther out, only on
+    straights. ``wear`` and ``dirt`` are mean values, which vary from marking to marking. ``stencils`` are
+    paint of users' own classes, by name.
 
     Attributes:
         diamond_length_m: diagonal along the route.
-        diamond_width_m: diagonal across it.
-        diamond_spacing_m: along the route.
-        diamond_offsets_m: of the rows of diamonds.
-        placing_sigma_m: how far a marking is off its place.
-        placing_sigma_deg: how far it is turned.
-        solid_offsets_m: of solid lines.
-        dashed_offsets_m: of dashed lines.
-        line_width_m: of lane lines.
-        dash_length_m: of dashes.
-        dash_gap_m: between two dashes.
-        arrow_spacing_m: between two arrows.
-        stop_line_spacing_m: between two stop lines.
-        lettering_spacing_m: between two words.
-        yellow_diamonds: whether diamonds are yellow, not white.
+        diamond_width_m: diagonal across the route.
+        diamond_spacing_m: distance between diamonds along the route.
+        diamond_offsets_m: offsets of the rows of diamonds.
+        placing_sigma_m: standard deviation of a marking's position from its nominal one.
+        placing_sigma_deg: standard deviation of a marking's direction.
+        solid_offsets_m: offsets of solid lines.
+        dashed_offsets_m: offsets of dashed lines.
+        line_width_m: width of lane lines.
+        dash_length_m: length of dashes.
+        dash_gap_m: gap between two dashes.
+        arrow_spacing_m: distance between two arrows.
+        stop_line_spacing_m: distance between two stop lines.
+        lettering_spacing_m: distance between two words.
+        yellow_diamonds: whether diamonds are yellow instead of white.
     """
 
     diamond_length_m: float = 1.2
@@ -188,18 +188,19 @@ class PaintConfig:
 
 @dataclass(kw_only=True)
 class SurfaceConfig:
-    """The ground; see :class:`v2hdm.simulate.render.scene.Ground`. Lengths of 0 for ``slab_m``: no joints.
+    """The ground; see :class:`v2hdm.simulate.render.scene.Ground`.
 
     Attributes:
+        slab_m: length and width of concrete slabs; 0 for no joints.
         texture: concrete or asphalt.
         albedo: mean reflectance.
-        contrast: of the texture, as a share of the albedo.
-        stains: strength of large stains, as a share of the albedo.
-        joint_width_m: of the joints between slabs.
-        wet_fraction: share of the ground that is wet.
-        tyre_marks: how dark the lanes are driven.
-        patches: number of repaired places.
-        oil_stains: number of them.
+        contrast: contrast of the texture, as a fraction of the albedo.
+        stains: strength of large stains, as a fraction of the albedo.
+        joint_width_m: width of the joints between slabs.
+        wet_fraction: fraction of the ground that is wet.
+        tyre_marks: darkness of the tyre marks on the lanes.
+        patches: number of repaired patches.
+        oil_stains: number of oil stains.
     """
 
     texture: str = "concrete"
@@ -216,19 +217,19 @@ class SurfaceConfig:
 
 @dataclass(kw_only=True)
 class ReliefConfig:
-    """Heights of the ground, which is a plane where none is given. Slopes are metres up per metre.
+    """Heights of the ground, a plane by default. Slopes are metres up per metre.
 
     Attributes:
         grade: slope along the map's x axis, in which the route begins.
-        crown: slope down to both sides of the route, for 10 m.
-        ramp: slope up in the route's direction between ``ramp_at_m`` and ``ramp_length_m`` later.
-        bank: slope up to the left of the route there.
-        ramp_at_m: way along the route where the ramp begins.
-        ramp_length_m: of the ramp; its slopes ease in and out over 12 m.
-        gully_m: depth of gullies along the route, on both sides.
-        gully_offset_m: of the gullies from the route.
-        kerb_m: height of a kerb to the left of the route, beyond which the ground is as high.
-        kerb_offset_m: of the kerb from the route.
+        crown: downward slope on both sides of the route, for 10 m.
+        ramp: upward slope along the route, from ``ramp_at_m`` for ``ramp_length_m``.
+        bank: upward slope to the left of the route on the ramp.
+        ramp_at_m: distance along the route at which the ramp begins.
+        ramp_length_m: length of the ramp; its slopes ease in and out over 12 m.
+        gully_m: depth of the gullies on both sides of the route.
+        gully_offset_m: distance of the gullies from the route.
+        kerb_m: height of a kerb to the left of the route and of the ground beyond it.
+        kerb_offset_m: distance of the kerb from the route.
     """
 
     grade: float = 0.0
@@ -245,23 +246,22 @@ class ReliefConfig:
 
 @dataclass(kw_only=True)
 class YardConfig:
-    """Things that stand and drive in the port, and the light.
+    """Objects that stand and drive in the port, and the light.
 
-    ``stack_fill`` is the fraction of the places beside the route with container stacks; parked trucks
-    and barriers stand closer; moving trucks come the other way. Strips are shadows of cranes and beams.
+    ``stack_fill`` is the fraction of the places beside the route that hold container stacks.
 
     Attributes:
-        stack_clearance_m: of container stacks from the route.
-        parked_trucks: number of them.
-        barriers: number of them.
-        lamp_posts: number of them.
-        moving_trucks: number of them.
-        moving_offset_m: of oncoming trucks, to the left of the route.
-        shadow_strips: number of them.
+        stack_clearance_m: distance of container stacks from the route.
+        parked_trucks: number of parked trucks, closer than the stacks.
+        barriers: number of barriers, closer than the stacks.
+        lamp_posts: number of lamp posts.
+        moving_trucks: number of oncoming trucks.
+        moving_offset_m: distance of oncoming trucks to the left of the route.
+        shadow_strips: number of shadows of cranes and beams.
         sun_azimuth_deg: direction of the sun, to the left of the map's x axis.
-        sun_elevation_deg: of the sun above the horizon.
-        sun_strength: of the direct light against that of the sky.
-        haze_m: distance at which haze takes most of the contrast.
+        sun_elevation_deg: elevation of the sun above the horizon.
+        sun_strength: factor on the strength of direct sunlight.
+        haze_m: distance at which haze removes most of the contrast.
     """
 
     stack_fill: float = 0.55
@@ -280,13 +280,13 @@ class YardConfig:
 
 @dataclass(kw_only=True)
 class ExposureConfig:
-    """The shutter and the sensor: the exposure aims at a mean of ``level``, varying by ``level_sigma``.
+    """The shutter and the sensor, which aims at a mean brightness of ``level``, varying by ``level_sigma``.
 
     Attributes:
         exposure_s: time that the shutter is open.
-        full_well_electrons: that a pixel of full brightness holds; fewer are noisier.
-        read_noise: standard deviation, as a share of full brightness.
-        jpeg_quality: of the files, 50 to 100.
+        full_well_electrons: electrons in a pixel at full brightness; fewer mean more noise.
+        read_noise: standard deviation of read noise, as a fraction of full brightness.
+        jpeg_quality: JPEG quality of the images, 50 to 100.
     """
 
     exposure_s: float = 0.002
@@ -319,13 +319,13 @@ def _rear() -> CameraConfig:
 class PortConfig:
     """A port, a vehicle with its cameras, and one drive through it.
 
-    ``initial_ipm`` is ``calibrated`` when the drive starts from this vehicle's own manual calibration,
-    ``estimated`` when it starts from the other vehicle's. ``visit`` numbers drives through one port: the same
-    paint, other noise of poses and images, other traffic. Equal values give equal files, byte for byte.
+    ``initial_ipm`` is the calibration that the drive starts from: calibrated (this vehicle's own, manual) or
+    estimated (the other vehicle's). ``visit`` numbers drives through one port: the same paint with different
+    pose noise, image noise and traffic. Equal values give equal files, byte for byte.
 
     Attributes:
-        name: of the port and its drive.
-        seed: of everything that is drawn at random.
+        name: name of the port and its drive.
+        seed: seed of all random draws.
     """
 
     name: str = "port1"

@@ -69,7 +69,7 @@ def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
     other = abs(scale_u / max(scale_v, 1e-9) - 1) < _OTHER_SIZE and abs(scale_u - 1) > _OTHER_SIZE
     size = f"{scale_u * info.width:.0f} x {scale_v * info.height:.0f}"
     cause = (
-        f"camera_info is that of images of about {size}, these are {info.width} x {info.height}; divide fx, "
+        f"camera_info is for images of about {size}, these are {info.width} x {info.height}; divide fx, "
         f"fy, cx, cy by {scale_u:.3g}"
         if other
         else f"the principal point is {100 * off:.0f} % of the width off the image's centre; check cx and cy"
@@ -83,8 +83,8 @@ def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
     focal = fx / info.width
     yield judge(
         "focal length", name, focal, _LONGEST, "image widths", least=_SHORTEST,
-        fine="the focal length is one of a lens for roads",
-        wrong=f"fx is {focal:.2g} image widths, no lens for roads; give it in px of these images, not in mm",
+        fine="the focal length is plausible for road cameras",
+        wrong=f"fx is {focal:.2g} image widths, implausible; give it in px of these images, not in mm",
     )  # fmt: skip
     yield judge(
         "square pixels", name, fx / fy - 1, _SQUARE, "",
@@ -108,14 +108,14 @@ def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[F
     if before < _ROI_IN_VIEW:
         says = (
             "roi_vehicle lies behind the camera: its x, or the guess, has the wrong sign (x is forward, a "
-            "rear camera's ROI has negative x); mend one of them"
+            "rear camera's ROI has negative x); fix one of them"
         )
         return failed(before, _ROI_IN_VIEW, "", says)
     seen = _share_in_image(camera, grid, depth)
     if seen < _ROI_IN_VIEW:
         says = (
-            f"only {100 * seen:.0f} % of roi_vehicle is in the image, as the guess of the mounting says: "
-            "mend roi_vehicle or the guess"
+            f"only {100 * seen:.0f} % of roi_vehicle is in the image, according to the guessed mounting: "
+            "fix roi_vehicle or the guess"
         )
         return failed(seen, _ROI_IN_VIEW, "", says)
     area = abs(float(signed_area(camera.roi_vehicle)))
@@ -133,7 +133,7 @@ def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> Fi
     return judge(
         "survey against guess", name, away, _BORROWED_M + 3 * float(np.linalg.norm(prior.sigma_m)), "m",
         fine="survey and guess put the camera at about the same place",
-        wrong=f"centre_prior puts the camera {away:.1f} m away from where its guess does: "
+        wrong=f"centre_prior puts the camera {away:.1f} m away from its guess: "
         f"{_survey_cause(survey, guess_vehicle)}",
     )  # fmt: skip
 
@@ -150,24 +150,24 @@ def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
         if np.linalg.norm(survey / scale - guess) < _NEAR_SURVEY_M:
             return f"it is in {unit}; write it in metres"
     offset = ", ".join(f"{value:+.1f}" for value in survey - guess)
-    return f"by {offset} m in x, y, z; survey it from the vehicle's origin on the ground, or mend the guess"
+    return f"by {offset} m in x, y, z; survey it from the vehicle's origin on the ground, or fix the guess"
 
 
 def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
     height = float(camera_centre(cam_from_vehicle)[2])
     yield judge(
         "camera height", name, height, _HIGHEST_M, "m", least=_LOWEST_M,
-        fine="the guess puts the camera at the height of a vehicle",
-        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres)",
+        fine="the guessed camera height is plausible for a vehicle",
+        wrong=f"the guess puts the camera {height:.2f} m above the ground; fix the IPM (in metres)",
     )  # fmt: skip
     tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-cam_from_vehicle[0, 2], -1, 1))))
     if cam_from_vehicle[1, 2] > 0:  # upside down
         tilt_deg = 180.0 - tilt_deg
     yield judge(
         "camera tilt", name, tilt_deg, _TILTED_DEG, "deg",
-        fine="the guess holds the camera upright",
+        fine="the guess has the camera upright",
         wrong=f"the guess tilts the camera by {tilt_deg:.0f} deg about its axis: its axes are x right, y "
-        "down, z forward, and v counts downwards; mend the guess, or turn the images",
+        "down, z forward, and v counts downwards; fix the guess, or turn the images",
     )  # fmt: skip
 
 
@@ -183,7 +183,7 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
         "ipm against camera matrix", name, value, _MISSHAPEN, "",
         fine="the IPM is a homography of this camera matrix",
         wrong=f"the IPM and camera_info differ by {100 * value:.0f} %, most in {part}: one of the two is "
-        "wrong, of another resolution, or the IPM was made from distorted pixels; make it anew",
+        "wrong or at another resolution, or the IPM was made from distorted pixels; recalibrate it",
         status=Status.WARN,
     )  # fmt: skip
 
@@ -205,8 +205,8 @@ def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: Flo
     coarse = (range_m**2 + centre[2] ** 2) / (max(centre[2], 0.1) * focal)
     return judge(
         "roi range", name, float(coarse), _COARSEST_M, "m/px",
-        fine="a pixel shows little ground at the ROI's far end",
-        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m; end it nearer",
+        fine="a pixel covers little ground at the ROI's far end",
+        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel covers {coarse:.1f} m; end it closer",
         status=Status.WARN,
     )  # fmt: skip
 
@@ -341,10 +341,10 @@ def check_road(drive: Drive) -> Iterator[Finding]:
     x, y = worst.at_map
     yield judge(
         "road", "poses", float(np.rad2deg(lean_rad)), float(np.rad2deg(_ROAD_SIGMAS * sigma_rad)), "deg",
-        fine="the ground is plane as far as the cameras look",
+        fine="the ground is a plane as far as the cameras look",
         wrong=f"{worst.station_m:.0f} m along the route, at x {x:.0f} m, y {y:.0f} m, the ground bends "
         f"by {worst.value_m:.2f} m over {worst.distance_m:.0f} m (a ramp, a crest or a banked curve): "
-        "a plane misplaces markings there; leave mapping.ground at auto, or end roi_vehicle nearer",
+        "a plane misplaces markings there; leave mapping.ground at auto, or end roi_vehicle closer",
         status=Status.FAIL if lean_rad > _ROAD_BENT * sigma_rad else Status.WARN,
     )  # fmt: skip
 

@@ -46,24 +46,24 @@ CHECKS = (
 
 _READ_AS: Mapping[Reading, str] = {
     Reading.HEADING_FROM_PATH: "the ground matches only if the vehicle heads along its path: "
-    "the recorded yaw is wrong (from north, clockwise, or off by a constant); mend it",
+    "the recorded yaw is wrong (from north, clockwise, or off by a constant); fix it",
     Reading.MIRRORED: "the ground matches only if the path is mirrored: x and y of the positions are swapped "
-    "(NED instead of east, north, up), or the images are mirrored; mend the positions or the images",
+    "(NED instead of east, north, up), or the images are mirrored; fix the positions or the images",
     Reading.BACKWARDS: "the ground matches only if the camera looks the other way: "
-    "images of front and rear are swapped, or yaw is off by 180 deg; mend one of them",
+    "images of front and rear are swapped, or yaw is off by 180 deg; fix one of them",
 }
 
 NO_MATCH = (
-    "bare ground does not match between the images as stamps, poses, lens and guess say: check the clock, "
-    "the unit of the positions (feet?), whether the images are upside down, and the guess of the mounting"
+    "bare ground does not match between the images with these stamps, poses, lens and guess: check the "
+    "clock, the unit of the positions (feet?), whether the images are upside down, and the guessed mounting"
 )
 """The sentence where no cause is known."""
 
 _UNTOLD = {
-    GroundStatus.TOO_LITTLE: "too little ground is in view, or too little motion, to check lens, clock and "
-    "mounting by it: drive further, or widen roi_vehicle",
-    GroundStatus.NO_TEXTURE: "too little of the ground is found again in other images to check lens and "
-    "mounting by it: drive by day or with more light, shorter exposure, or on rougher ground",
+    GroundStatus.TOO_LITTLE: "too little ground in view, or too little motion, to check lens, clock and "
+    "mounting: drive farther, or enlarge roi_vehicle",
+    GroundStatus.NO_TEXTURE: "too little of the ground matches other images to check lens and "
+    "mounting: drive by day or with more light, shorter exposure, or on rougher ground",
 }
 
 
@@ -85,35 +85,35 @@ _CHECKS: Mapping[str, _Check] = {
     "focal_scale": _Check(
         "focal length from ground", _FOCAL, "%", 100.0, Status.FAIL, ("too short", "too long"),
         "the ground fits the focal length",
-        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate anew",
+        "the focal length in camera_info is {size:.1f} % {way} for the ground; recalibrate",
     ),
     "distortion_k1": _Check(
         "distortion", _DISTORTION, "", 1.0, Status.FAIL, ("larger", "smaller"),
         "the ground fits the lens' distortion",
-        "the lens bends otherwise than distortion_coefficients say: k1 should be {size:.2f} {way}; "
-        "calibrate the camera (are they left at zero, or those of another lens?)",
+        "the distortion differs from distortion_coefficients: k1 should be {size:.2f} {way}; "
+        "calibrate the camera (are they zero, or from another lens?)",
     ),
     "grade": _Check(
         "grade", _GRADE, "%", 100.0, Status.WARN, ("rise", "fall"),
         "the recorded heights and pitch fit the ground",
         "the poses {way} over the ground by {size:.2f} %: heights and pitch contradict each other; "
-        "mend the receiver's pitch, or write both as 0",
+        "fix the receiver's pitch, or write both as 0",
     ),
     "up_m": _Check(
         "survey height", _UP_M, "m", 1.0, Status.WARN, ("low", "high"),
         "the ground fits the camera's surveyed height",
         "centre_prior is {size:.2f} m too {way} for what the ground shows; survey the camera's height above "
-        "the road anew, or widen its sigma_m",
+        "the road again, or increase its sigma_m",
     ),
     "forward_m": _Check(
         "survey forward", _ALONG_M, "m", 1.0, Status.WARN, ("far behind", "far ahead"),
-        "the ground fits the camera's surveyed place along the vehicle",
+        "the ground fits the camera's surveyed position along the vehicle",
         "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (the "
         "antenna instead of the axle?), or its x is wrong; give both for one origin",
     ),
     "left_m": _Check(
         "survey left", _ALONG_M, "m", 1.0, Status.WARN, ("far to the right", "far to the left"),
-        "the ground fits the camera's surveyed place across the vehicle",
+        "the ground fits the camera's surveyed position across the vehicle",
         "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (an "
         "antenna at the side?), or its y is wrong; give both for one origin",
     ),
@@ -208,7 +208,7 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
     if key == "distortion_k1" and calibration is not None:
         down_rad = np.arcsin(-calibration.cam_from_vehicle[2, 2])
         if down_rad < STEEP_RAD:
-            return "the camera looks too level, and a bent lens looks like a bent road"
+            return "the camera looks too level, so that lens distortion and a curved road look alike"
     return ""
 
 
@@ -217,7 +217,7 @@ def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Findin
     vague = parameter.name in ("forward_m", "left_m") and parameter.sigma > _VAGUE_M
     if not parameter.observable or vague or confounded:
         why = parameter.why_not or confounded or "the route turns too little; drive a turn"
-        says = f"this drive cannot tell it: {why}"
+        says = f"this drive does not show it: {why}"
         return Finding(one.name, Status.PASS, None, one.scale * one.limit, one.unit, says, name)
     value, limit = one.scale * parameter.value, one.scale * max(one.limit, _SURE * parameter.sigma)
     wrong = one.wrong.format(size=abs(value), way=one.ways[parameter.value < 0])
@@ -228,7 +228,7 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Fi
     """Residuals and errors of poses: they show that something is wrong where nothing above says what."""
     yield judge(
         "ground residual", name, estimate.median_residual, _RESIDUAL, "",
-        fine="matched ground lies where lens and mounting put it",
+        fine="matched ground lies where lens and mounting predict",
         wrong="matched ground does not lie where any mounting puts it: the lens' distortion or focal "
         "length in camera_info is wrong, or the road in the ROI is no plane",
     )  # fmt: skip
@@ -239,8 +239,8 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Fi
         yield judge(
             "poses against ground", name, innovations[part], _PULL, "",
             fine="the images move as the poses do, within pose_noise",
-            wrong=f"the images move otherwise than the poses: their {part} is {innovations[part]:.0f} times "
-            "pose_noise off; state the noise as it is, or check the clock",
+            wrong=f"images and poses move differently: their {part} is {innovations[part]:.0f} times "
+            "pose_noise off; state the actual noise, or check the clock",
             status=Status.WARN,
         )  # fmt: skip
 
@@ -277,8 +277,8 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
             continue
         size, way = abs(1e3 * clock.value), "later" if clock.value > 0 else "earlier"
         correctable = abs(clock.value) <= _CORRECTABLE_S
-        recovery = "the map is corrected by it; mend the stamps" if correctable else "mend the stamps"
-        whose = "all cameras alike: the poses' clock is off" if common else "this camera's clock is off"
+        recovery = "the map is corrected for it; fix the stamps" if correctable else "fix the stamps"
+        whose = "all cameras equally: the poses' clock is off" if common else "this camera's clock is off"
         yield judge(
             "clock", name, 1e3 * clock.value, 1e3 * max(_CLOCK_S, _SURE * clock.sigma), "ms",
             fine="images and poses are on one clock",
@@ -344,10 +344,10 @@ def _turned(camera: Camera) -> Camera:
 _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     (
         lambda drive: scaled(drive, _FOOT_M),
-        "the ground matches once positions are taken for feet; multiply them by 0.3048 to give metres",
+        "the ground matches if positions are in feet; multiply them by 0.3048 to get metres",
     ),
     (
         upside_down,
-        "the ground matches once the images are turned by 180 deg: they are upside down; turn them",
+        "the ground matches if the images are rotated by 180 deg: they are upside down; rotate them",
     ),
 )

@@ -99,7 +99,7 @@ AXES_SWAPPED = (
 class Path(Enum):
     """The recorded path, judged by the images' ground."""
 
-    AS_GIVEN = "path and yaw are as the images show them"
+    AS_GIVEN = "path and yaw agree with the images"
     RIGHT_YAW_WRONG = "the path is right, the yaw is not"
     MIRRORED = "the path is mirrored"
 
@@ -148,7 +148,7 @@ def _alignment(motion: Motion) -> Iterator[Finding]:
 def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: float) -> Finding:
     straight = offset_rad[turn_rad < _STRAIGHT_RAD]
     if len(straight) < 10:
-        return passed("heading offset", "poses", "the route has no straight stretch that would tell it")
+        return passed("heading offset", "poses", "the route has no straight stretch that would show it")
     value = float(np.rad2deg(np.median(straight)))
     sigma = 1.25 * np.std(straight) / np.sqrt(max(1.0, len(straight) / overlap))  # of a median
     limit = float(np.rad2deg(_MISALIGNED_RAD + _SURE * sigma))
@@ -156,7 +156,7 @@ def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: floa
         "heading offset", "poses", value, limit, "deg",
         fine="on straight stretches the vehicle goes where its heading points",
         wrong=f"on straight stretches the vehicle drives {abs(value):.1f} deg to the "
-        f"{'left' if value > 0 else 'right'} of its heading; mend the alignment of the heading's antennas",
+        f"{'left' if value > 0 else 'right'} of its heading; fix the alignment of the heading's antennas",
         status=Status.WARN,
     )  # fmt: skip
 
@@ -166,7 +166,7 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
     turns = np.abs(curvature) > _CURVED_PER_M
     if turns.sum() < 30:
         same = "a straight route looks the same in a mirrored world (x and y swapped, NED): drive a turn"
-        unknown = "straight poses do not tell how far the origin (antenna?) is from the axle: drive a turn"
+        unknown = "straight poses do not show how far the origin (antenna?) is from the axle: drive a turn"
         return [passed("mirrored", "poses", same), passed("origin", "poses", unknown)]
     centred = offset_rad - np.median(offset_rad[~turns]) if (~turns).any() else offset_rad
     lever = np.tan(centred[turns]) / curvature[turns]
@@ -177,10 +177,10 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
     return [
         judge(
             "origin", "poses", value, _LEVER_M + _SURE * sigma, "m",
-            fine="the recorded point follows its heading in turns, as one at the rear axle does",
+            fine="in turns the recorded point follows its heading, like one at the rear axle",
             wrong=f"in turns the recorded point moves as one {abs(value):.1f} m "
             f"{'ahead of' if value > 0 else 'behind'} the rear axle does (the antenna?); give the poses and "
-            "the survey of the cameras for one and the same origin",
+            "the survey of the cameras the same origin",
             status=Status.WARN,
         )
     ]  # fmt: skip
@@ -203,8 +203,8 @@ def _cause(motion: Motion, path: Path | None) -> str | None:
     if (np.abs(wrapped(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
         return (
             f"the vehicle drives {abs(np.rad2deg(offset_rad)):.0f} deg to the "
-            f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; subtract that offset of "
-            "the heading's antennas from yaw"
+            f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; subtract this offset of "
+            "the heading antennas from yaw"
         )
     if _turns_too_fast(motion):
         return "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw"

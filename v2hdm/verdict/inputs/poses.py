@@ -138,8 +138,8 @@ def check_path(motion: Motion) -> list[Finding]:
     return [
         judge(
             "speed", "poses", speed, _FASTEST_MPS, "m/s",
-            fine="the vehicle's speed is one of a road vehicle",
-            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; mend it",
+            fine="the speed is plausible for a road vehicle",
+            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; fix it",
         )
     ]  # fmt: skip
 
@@ -147,7 +147,7 @@ def check_path(motion: Motion) -> list[Finding]:
 def _hardly_moves(motion: Motion) -> Finding:
     moved_m = float(np.linalg.norm(np.ptp(motion.position[:, :2], axis=0)))
     says = (
-        f"the vehicle nowhere moves {_CHORD_M:g} m in {_CHORD_M / _SLOWEST_MPS:g} s: a drive that stands "
+        f"the vehicle nowhere moves {_CHORD_M:g} m in {_CHORD_M / _SLOWEST_MPS:g} s: a standing vehicle "
         "maps nothing; check that positions are in metres and stamps in seconds"
     )
     for unit, scale in _TOO_SMALL.items():
@@ -228,7 +228,7 @@ def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
         return None
     says = (
         f"the stamps of the poses jitter by {jitter_ms:.0f} ms: positions scatter {along_m / across_m:.0f} "
-        "times as much along the way as across it; stamp poses when they are measured, not when they arrive"
+        "times as much along the path as across it; stamp poses when they are measured, not when they arrive"
     )
     return Finding("pose stamps", Status.FAIL, jitter_ms, None, "ms", says, "poses")
 
@@ -241,8 +241,8 @@ def check_attitude(motion: Motion) -> Iterator[Finding]:
     largest_deg = float(np.rad2deg(largest_rad))
     yield judge(
         "attitude", "poses", largest_deg, STEEPEST_DEG, "deg",
-        fine="roll and pitch are those of a vehicle on a road",
-        wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken "
+        fine="roll and pitch are plausible for a vehicle on a road",
+        wrong=f"roll or pitch reach {largest_deg:.0f} deg, impossible on a road: were degrees taken "
         f"for radians (then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the "
         "order qx qy qz qw?",
     )  # fmt: skip
@@ -302,8 +302,8 @@ def _is_course(motion: Motion, scatter_rad: float) -> bool:
 
 def _course(scatter_rad: float) -> Finding:
     says = (
-        f"the heading is the course from position to position, with their scatter of {scatter_rad:.2g} rad,"
-        " and not the vehicle's; record the heading of the vehicle, as two antennas or an INS measure it"
+        f"the heading is the course between positions, with their scatter of {scatter_rad:.2g} rad,"
+        " and not the vehicle's; record the vehicle's heading from two antennas or an INS"
     )
     return Finding("heading", Status.FAIL, scatter_rad, None, "rad", says, "poses")
 
@@ -314,7 +314,7 @@ def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: s
         return Finding("pose noise", Status.WARN, value, limit, unit, says, f"pose_noise.{key}")
     return judge(
         "pose noise", f"pose_noise.{key}", value, limit, unit,
-        fine=f"{key} is that of a good receiver",
+        fine=f"{key} is plausible for a good receiver",
         wrong=f"{key} {value:g} is {means}; state it in {wanted}, as a standard deviation",
         status=Status.WARN,
     )  # fmt: skip
@@ -322,12 +322,12 @@ def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: s
 
 def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
     ratio = measured / stated
-    degrees = " (degrees taken for radians would do that)" if unit == "rad" and ratio > _USELESS else ""
+    degrees = " (were degrees taken for radians?)" if unit == "rad" and ratio > _USELESS else ""
     return judge(
         "pose scatter", "poses", ratio, _UNDERSTATED, "",
         fine="the poses scatter no more than stated",
         wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times pose_noise.{key} "
-        f"{stated:.2g}{degrees}; state {key} as it is, or find out why the receiver is worse than it says",
+        f"{stated:.2g}{degrees}; state {key} as it is, or find out why the receiver is worse than stated",
         status=Status.FAIL if ratio > _USELESS else Status.WARN,
     )  # fmt: skip
 

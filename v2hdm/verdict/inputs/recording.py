@@ -59,7 +59,7 @@ def _pose_rate(drive: Drive, motion: Motion) -> Iterator[Finding]:
     error_m = _DRIVEN_MPS2 * longest_s**2 / 8
     rare = judge(
         "pose rate", "poses", interval_s, limit_s, "s",
-        fine=f"{1 / interval_s:.0f} poses a second are enough",
+        fine=f"{1 / interval_s:.0f} poses per second are enough",
         wrong=f"poses are {interval_s:.2f} s apart: between them they err by more than the stated noise; "
         "record the receiver's full rate",
         status=Status.WARN,
@@ -82,8 +82,8 @@ def _held(motion: Motion) -> Finding:
     jump_m = float(motion.step_m[1:][same[:-1]].max(initial=0.0))
     return judge(
         "repeated poses", "poses", share, _HELD, "",
-        fine="no pose repeats the one before while the vehicle moves",
-        wrong=f"{100 * share:.0f} % of the poses repeat the one before while the vehicle moves, up to "
+        fine="no pose repeats the previous one while the vehicle moves",
+        wrong=f"{100 * share:.0f} % of the poses repeat the previous one while the vehicle moves, up to "
         f"{jump_m:.2f} m off: the log is faster than the receiver, or the receiver froze; drop the repeats",
     )  # fmt: skip
 
@@ -95,7 +95,7 @@ def _posed(drive: Drive, name: str, posed: int) -> Finding:
         "images without pose", name, share, _WITHOUT_POSE, "",
         fine="the images have poses",
         wrong=f"{without} of {posed + without} images have no pose at their time: poses and images "
-        "overlap only in part, or the poses have gaps; check that both are of the same drive and on "
+        "overlap only in part, or the poses have gaps; check that both are from the same drive and on "
         "one clock",
         status=Status.FAIL if share > _HALF else Status.WARN,
     )  # fmt: skip
@@ -158,7 +158,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
     steps_m = np.diff([image.map_from_vehicle[:2, 3] for image in images], axis=0)
     moving = (np.flatnonzero(np.linalg.norm(steps_m, axis=1) > _MOVED_M) + 1).tolist()
     if not moving:
-        says = "the vehicle does not move between the images, so that repeated ones cannot be told"
+        says = "the vehicle does not move between the images, so repeated ones cannot be recognised"
         return passed("frozen images", name, says)
     copied = [k for k in moving if filecmp.cmp(images[k - 1].path, images[k].path, shallow=False)]
     share, at = len(copied) / len(moving), copied
@@ -180,7 +180,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
     where = f", first at {images[at[0]].stamp_s:.2f} s" if at else ""
     return judge(
         "frozen images", name, share, _FROZEN, "",
-        fine="each image differs from the one before",
+        fine="each image differs from the previous one",
         wrong=f"{100 * share:.0f} % of the images repeat the one before while the vehicle moves{where}: the "
         "camera froze, or one file is listed several times; drop the repeats from the list",
     )  # fmt: skip

@@ -52,7 +52,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         yield _judged("map", reached_m, goal_m, says, helps)
     for name, one in best.calibrations.items():
         left_m, helps = ground_ahead(one)
-        says = f"its mounting leaves the ground ahead known to {_cm(left_m)} (95 %){goal}"
+        says = f"the ground ahead is known, given its mounting, to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
 
 
@@ -60,7 +60,7 @@ def _conditions(evidence: SolveEvidence) -> str:
     """The inputs that absolute accuracy rests on: one that may be wrong, or those that no image shows."""
     doubtful, relied = doubted(evidence), relied_on(evidence)
     if doubtful is not None:
-        return f" (unless the {CHECKS[doubtful.fault][0]} is off, as it may be)"
+        return f" (unless the {CHECKS[doubtful.fault][0]} is off, which is possible)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
 
 
@@ -76,7 +76,7 @@ def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     pose_m = [] if best.poses is None else _CIRCLE_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
     parts = [
         (_median(pose_m), "the poses: tie them down by mapping.survey"),
-        (_median([_own_m(one) for one in coarse]), "each marking's own views: pass them nearer and again"),
+        (_median([_own_m(one) for one in coarse]), "each marking's own views: pass them closer and again"),
     ]
     # What one camera leaves open, a better one settles.
     left_m, helps = min(map(ground_ahead, best.calibrations.values()), default=(np.inf, ""))
@@ -171,7 +171,7 @@ def check_points(table: CheckTable) -> Finding:
     """
     total = len(table.compared) + len(table.unmatched)
     if not table.compared:
-        says = f"none of {total} has a corner of the map within reach, the first: {table.unmatched[0][1]}"
+        says = f"none of {total} has a map corner within reach, the first: {table.unmatched[0][1]}"
         return Finding(CHECK, Status.WARN, None, None, "", says, "map")
     off_m, covariance = table.off_m.ravel(), table.covariance_m2
     value, limit = _ratio(table.squared, len(off_m)), _limit(len(off_m))
@@ -191,10 +191,10 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
         return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
     says = (
         f"{stated} corners of the map have a point within reach, and {most} would {likeliest}: "
-        "mend the file or mapping.survey.crs"
+        "fix the file or mapping.survey.crs"
     )
     if not stated and not most:
-        says = "no corner of the map has a surveyed point within reach: mind datum, zone, units, reach_m"
+        says = "no corner of the map has a surveyed point within reach: check datum, zone, units, reach_m"
     return [Finding(FRAME, Status.WARN, float(stated), None, "", says, "survey")]
 
 
@@ -210,8 +210,8 @@ def _explained(table: CheckTable, off_m: FloatArray, covariance: FloatArray) -> 
     stated_m = float(np.sqrt(np.trace(covariance) / len(table.compared)))
     return Status.FAIL, (
         f"they lie {100 * table.rmse_m:.1f} cm off the map (RMSE), where map and survey state "
-        f"{100 * stated_m:.1f} cm: the map is worse than it says; state larger pose_noise, drift above all, "
-        "and let some of them be control points"
+        f"{100 * stated_m:.1f} cm: the map is worse than stated; state larger pose_noise, above all drift, "
+        "and make some of them control points"
     )
 
 
@@ -225,8 +225,8 @@ def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Fault:
     by_m = np.linalg.solve(shift.T @ weighed, weighed.T @ off_m)
     says = (
         f"the map lies {100 * by_m[0]:+.1f} cm in x and {100 * by_m[1]:+.1f} cm in y of all of them: survey "
-        "and poses have another datum or origin, or the receiver drifts by more than pose_noise says; let "
-        "some of them be control points"
+        "and poses have another datum or origin, or the receiver drifts by more than pose_noise; make "
+        "some of them control points"
     )
     return squared(off_m - shift @ by_m, covariance), (Status.FAIL, says)
 
@@ -236,7 +236,7 @@ def _without(table: CheckTable, k: int) -> _Fault:
     one = table.compared[k]
     says = (
         f"{one.point.id} lies {100 * one.distance_m:.1f} cm off its corner of {one.kind} {one.marking_id}, "
-        "the others where they should: measure it anew, and look at the paint there"
+        "the others where they should: survey it again, and look at the paint there"
     )
     rest = squared(table.off_m.ravel()[kept], table.covariance_m2[np.ix_(kept, kept)]) if len(kept) else 0.0
     return rest, (Status.WARN, says)
@@ -262,7 +262,7 @@ def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
         if not known_lengths(alone, [name] * len(markings), corners_map, numbers):
             says = (
                 f"none of the {len(markings)} markings of class {name} is about {size[0]:g} m by "
-                f"{size[1]:g} m, so that the size was not used; mend or drop it"
+                f"{size[1]:g} m, so that the size was not used; fix or drop it"
             )
             about = f"mapping.known_sizes.by_class_m.{name}"
             found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
@@ -275,7 +275,7 @@ def check_corrections(corrections: Sequence[Correction], best: MethodResult) -> 
     if not missing:
         return []
     says = (
-        f"{len(missing)} of {len(corrections)} have found no candidate, and change nothing: "
-        f"{', '.join(missing[:5])}; correct the map of this very drive, or drop them"
+        f"{len(missing)} of {len(corrections)} match no candidate and have no effect: "
+        f"{', '.join(missing[:5])}; correct a map of this drive, or drop them"
     )
     return [Finding("corrections", Status.WARN, float(len(missing)), 0.0, "", says, "map.corrections")]

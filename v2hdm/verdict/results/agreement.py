@@ -69,8 +69,8 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterat
         sigmas = mounting_sigmas(one.calibrations[name], together.calibrations[name])
         yield judge(
             "alone and together", name, sigmas, _MOUNTING_LIMIT_SIGMAS, "sigmas",
-            fine="mapped alone and with the others, it has the same mounting",
-            wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with the others"
+            fine="mapped alone, it has the same mounting as with the others",
+            wrong=f"mapped alone, its mounting is {sigmas:.0f} sigmas from that with the others"
             ": cameras do not agree; check its clock, its survey and camera_info",
         )  # fmt: skip
 
@@ -94,9 +94,9 @@ def _offset(
     cause = ("clocks or forward surveys of a centre disagree", "headings or lateral surveys disagree")[axis]
     return judge(
         "cameras apart", f"{first}, {second}", float(sigmas[axis]), _OFFSET_LIMIT_SIGMAS, "sigmas",
-        fine=f"{len(apart)} markings that both saw lie in one place",
+        fine=f"{len(apart)} markings that both saw coincide",
         wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
-        f"does: {cause}; synchronise and measure anew",
+        f"does: {cause}; synchronise and measure again",
     )  # fmt: skip
 
 
@@ -218,6 +218,6 @@ def check_heights(drive: Drive) -> Iterator[Finding]:
         "heights", "poses", float(off_m[worst]), float(_SURE_SIGMAS * np.sqrt(2.0) * sigma_m), "m",
         fine="the recorded heights of all passes agree",
         wrong=f"at x {x:.0f} m, y {y:.0f} m the heights of two passes differ by {off_m[worst]:.2f} m: check "
-        "the receiver's fix on both; heights of the map there are as uncertain, its plan is not",
+        "the receiver's fix on both; map heights there are equally uncertain, positions are not",
         status=Status.WARN,
     )  # fmt: skip

@@ -65,45 +65,45 @@ _LEVER_OBSERVABLE_M = 0.025
 # The check that reports each fault, and the recovery.
 CHECKS: Mapping[Fault, tuple[str, str]] = {
     Fault.CLOCK: (
-        "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
+        "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by that",
     ),
     Fault.CLOCK_DRIFT: (
-        "clock drift", "give images the times at which they were taken, on the clock of the receiver",
+        "clock drift", "stamp images with their exposure time on the receiver's clock",
     ),
     Fault.CROWN: (
-        "crown", "leave mapping.ground at auto, or map the sides of the road's crown by themselves",
+        "crown", "leave mapping.ground at auto, or map the two sides of the crown separately",
     ),
-    Fault.COURSE: ("heading", "record the heading of the vehicle, as two antennas or an INS measure it"),
-    Fault.STEP: ("position step", "check the receiver's log there, and leave out what has no RTK fix"),
+    Fault.COURSE: ("heading", "record the vehicle's heading from two antennas or an INS"),
+    Fault.STEP: ("position step", "check the receiver's log there, and leave out poses without an RTK fix"),
     Fault.KNOCK: ("mounting", "fasten the camera, and map what was driven before and after by themselves"),
     Fault.FOCAL: (
         "focal length",
-        "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
+        "check fx and fy in camera_info against the resolution, or recalibrate the lens",
     ),
     Fault.DISTORTION: (
         "distortion",
-        "check distortion_coefficients (and the focal length) in camera_info, or calibrate anew",
+        "check distortion_coefficients (and the focal length) in camera_info, or recalibrate",
     ),
     Fault.PRINCIPAL: (
         "principal point",
-        "check cx and cy in camera_info against the image's size and crop, or calibrate anew",
+        "check cx and cy in camera_info against the image's size and crop, or recalibrate",
     ),
-    Fault.SLOPE: ("slope", "record the height of the poses, or roll and pitch against the road"),
+    Fault.SLOPE: ("slope", "record the height of the poses, or roll and pitch"),
     Fault.SURVEY: (
         "survey",
-        "measure the camera's centre anew, mind signs, axes and the origin on the ground under the axle",
+        "survey the camera's centre again; check signs, axes and the origin on the ground under the axle",
     ),
     Fault.LEVER: (
         "survey",
-        "state the centres from the point that the poses are of, such as the antenna, or move the poses",
+        "measure the centres from the reference point of the poses, such as the antenna, or move the poses",
     ),
     Fault.SIZE: ("known_sizes", "measure the paint, or leave it out of mapping.known_sizes"),
-    Fault.CONTROL: ("surveyed points", "measure it anew, or leave it out of mapping.survey"),
+    Fault.CONTROL: ("surveyed points", "survey it again, or leave it out of mapping.survey"),
     Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
 }  # fmt: skip
 
 # How an input was corrected, where it was not just left out.
-_CORRECTED_BY = {Fault.CLOCK: "the images were posed anew", Fault.SIZE: "no known size was used"}
+_CORRECTED_BY = {Fault.CLOCK: "images got poses at the corrected times", Fault.SIZE: "no known size was used"}
 
 _LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
 
@@ -144,10 +144,10 @@ def over_ground(findings: Iterable[Finding], best: MethodResult, is_tried: bool)
     ``mapping.ground=auto`` has it) and explained the markings no better.
     """
     if best.hd_map.ground:
-        fine = "the ground bends, and is mapped as a surface"
+        fine = "the ground is curved, and mapped as a surface"
         answered = {"road": tuple(Status), **dict.fromkeys(_OVER_PLANES, (Status.WARN,))}
     else:
-        fine = "the recorded heights bend, but what the markings show is a plane"
+        fine = "the recorded heights are curved, but the markings show a plane"
         answered = {"road": (Status.WARN,)} if is_tried else {}
     return [
         replace(one, status=Status.PASS, says=fine, limit=None)
@@ -238,8 +238,8 @@ def _is_left(one: Contradiction, corrected: Sequence[Contradiction]) -> bool:
 def _unknown(one: Contradiction) -> Finding:
     """No input can be off by as much as would explain the residuals."""
     says = (
-        "the markings contradict the inputs, and no wrong input of a plausible size explains them: compare "
-        "images and poses, in time and in place"
+        "the markings contradict the inputs, and no plausible input error explains them: compare "
+        "images and poses in time and space"
     )
     return Finding("cause unknown", Status.FAIL, one.sigmas, even_sigmas(one), "sigmas", says, "map")
 
@@ -268,16 +268,14 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
         least = min(hidden or tested, key=_sigma)
         below = f" below {_least_shown(least)}" if np.isfinite(_sigma(least)) else ""
         whose = " that all cameras share" if hidden else ""
-        says = f"the markings of this drive do not tell errors{whose}{below}"
+        says = f"the markings of this drive do not reveal errors{whose}{below}"
         return passed(check, ", ".join(least.cameras), f"{says}: drive a turn, and past more of them")
     worst = max(observable, key=lambda one: one.sigmas)
     if is_contradicted(worst):
-        says = "not told apart from what is named as wrong: mend that first"
+        says = "not told apart from what is named as wrong: fix that first"
         return passed(check, ", ".join(worst.cameras), says)
     blind = _least_shown(max(observable, key=_sigma))
-    says = (
-        f"the markings agree with what is stated, to {worst.sigmas:.1f} sigmas; they show errors from {blind}"
-    )
+    says = f"the markings agree with the inputs, to {worst.sigmas:.1f} sigmas; they show errors from {blind}"
     return _input(worst, Status.PASS, says)
 
 
@@ -318,16 +316,16 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
     loosest_s, loose = _loosest_clock_s(evidence), _loose_levers(evidence)
     if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
-        sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
-        says = f"the markings do not tell {sure} whether all clocks are late alike: drive a turn"
+        sure = f"to better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
+        says = f"the markings do not show {sure} whether all clocks are equally late: drive a turn"
         yield passed("clock", "all cameras", says)
     if loose and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
         worst_m = max(one.sigma for one in loose)
-        sure = f"no better than {200 * worst_m:.0f} cm" if worst_m < 1 else "not"
+        shows = f"shows only to {200 * worst_m:.0f} cm" if worst_m < 1 else "does not show"
         says = (
-            f"this drive tells {sure} how far {names} the cameras sit of the point that the poses are of: "
-            "the survey of centre and antenna is relied on; drive a turn"
+            f"this drive {shows} how far {names} the cameras are from the poses' reference point: "
+            "the result relies on the survey of centre and antenna; drive a turn"
         )
         yield passed("survey", "all cameras", says)
 
@@ -389,7 +387,7 @@ def _stamps(evidence: SolveEvidence) -> Finding:
     allowed = max(evidence.pose_noise.values(), default=0.0) <= _POSE_NOISE_LIMIT
     return judge(
         "image stamps", "poses", _jitter_odds(evidence) * (evidence.jitter_s > _LEAST_JITTER_S), _ODDS_LIMIT,
-        "", fine="the poses err as much across the way as along it",
+        "", fine="the poses err as much across the path as along it",
         wrong=f"the stamps of the images jitter by {by_ms:.0f} ms: poses err {ratio:.0f} times as much along "
         "the way as across it: stamp images when exposed, not when they arrive",
         status=Status.WARN if allowed else Status.FAIL,
@@ -401,9 +399,9 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
     factor = evidence.pose_noise[kind]
     yield judge(
         "pose noise", "poses", factor, _POSE_NOISE_LIMIT, "",
-        fine=f"the poses err {factor:.1f} times as much as pose_noise says, which map and tests allow for",
-        wrong=f"the poses err {factor:.1f} times as much as pose_noise.{kind} says: state it, or find out "
-        "why the receiver, or its clock, is worse than it says",
+        fine=f"the poses err {factor:.1f} times as much as pose_noise, which map and tests allow for",
+        wrong=f"the poses err {factor:.1f} times as much as pose_noise.{kind}: state it, or find out "
+        "why the receiver, or its clock, is worse than stated",
         status=Status.WARN,
     )  # fmt: skip
     yield judge(
@@ -426,8 +424,8 @@ def _excluded(best: MethodResult) -> Finding:
     says = f"{left_out} of {count} candidates were left out"
     return judge(
         "excluded", "map", surely, _EXCLUDED_LIMIT, "",
-        fine=f"{says}, those aside that are merely uncertain or not on the ground",
-        wrong=f"{says}: markings are seen, but not where others put them; see excluded.geojson",
+        fine=f"{says}, not counting those that are merely uncertain or not on the ground",
+        wrong=f"{says}: markings are seen, but not where others place them; see excluded.geojson",
         status=Status.WARN,
     )  # fmt: skip
 
@@ -443,7 +441,7 @@ def _words(one: Contradiction) -> str:
             where = f" {one.about}" if one.about else ""
             return f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than their stamps say"
         case Fault.CLOCK_DRIFT:
-            how = f"wanders, as stamps do that are counted: within {1e3 * size:.0f} ms"
+            how = f"wanders, as counted stamps do: within {1e3 * size:.0f} ms"
             if one.axis == 0:
                 how = f"runs {'slow' if one.value > 0 else 'fast'}: by {1e3 * size:.0f} ms over the drive"
             return f"the clock of the images of {whose} {how}"

@@ -25,12 +25,12 @@ _IMAGE_WORDS = frozenset(
     {"image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "compressed",
      "camera", "cameras", "sensing", "sensors", "raw", "image_raw_compressed"}
 )  # fmt: skip
-LENS = "the lens, a file of ROS, Kalibr, OpenCV or COLMAP: front.yaml"
+LENS = "the intrinsics, a file from ROS, Kalibr, OpenCV or COLMAP: front.yaml"
 MOUNTING = (
-    "where the camera sits, m forward, left, up of the ground under the rear axle; its roll, pitch (down) "
+    "the camera's position, m forward, left, up from the ground under the rear axle; its roll, pitch (down) "
     "and yaw (left) to some ten degrees: {xyz_m: [2.1, 0, 1.6], rpy_deg: [0, 12, 0]}"
 )
-LEVER_ARM = "m forward, left, up of the ground under the rear axle: [1.2, 0, 1.8]"
+LEVER_ARM = "m forward, left, up from the ground under the rear axle: [1.2, 0, 1.8]"
 _TURNED = 1e-6  # elements of a rotation that are closer to the identity's are so by rounding
 _DESCRIPTION = "drive.yaml"
 IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
@@ -43,7 +43,7 @@ def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
         description = BagDescription(path, cache)
         if description.missing:
             raise DriveError(
-                f"{path}: says nothing of {', '.join(description.missing)}; "
+                f"{path}: does not state {', '.join(description.missing)}; "
                 f"v2hdm check {path.name} --write FOLDER asks for it and writes the drive.yaml"
             )
         with new_entry(folder) as partial:
@@ -58,7 +58,7 @@ def list_topics(path: Path, cache: Path) -> str:
     width = max((len(topic.name) for topic in topics), default=0)
     lines = [f"{topic.name:<{width}}  {topic.messages:>8}  {topic.kind}" for topic in topics]
     if not any(topic.kind in IMAGE_KINDS for topic in topics):
-        return "\n".join([*lines, "", "# no topic of images: not a drive"])
+        return "\n".join([*lines, "", "# no image topic: not a drive"])
     found = BagDescription(path, cache)
     said = f"; missing: {', '.join(found.missing)}" if found.missing else ""
     return "\n".join([*lines, "", f"# drive.yaml{said}", dump_yaml(found.content).rstrip()])
@@ -80,7 +80,7 @@ class BagDescription:
             has_static, has_tf = TF_STATIC in bag.topics, TF_TOPIC in bag.topics
             self._frame_of = _frames_of_topics(bag, {topic.name for topic in wanted if topic is not None})
         if not images:
-            raise DriveError(f"{path}: has no topic of images ({', '.join(IMAGE_KINDS)}); not a drive")
+            raise DriveError(f"{path}: has no image topic ({', '.join(IMAGE_KINDS)}); not a drive")
         self._frames = Frames({})
         if has_static or has_tf:
             stream = TfStream(has_tf, f"{path}: tf")
@@ -96,7 +96,7 @@ class BagDescription:
             world = next((name for name in _MAPS if name in self._frames.names), None)
             if world is not None and self._vehicle is not None:
                 return {"topic": TF_TOPIC, "frame": world, "vehicle": self._vehicle}
-            self.missing["poses.topic"] = "the topic of poses, of the bag's several or none"
+            self.missing["poses.topic"] = "the topic of poses; the bag has several or none"
             return {"topic": "?"}
         entry: dict[str, Any] = {"topic": position.name}
         if position.kind == kinds.FIX:
@@ -106,7 +106,7 @@ class BagDescription:
         sensor = self._frame_of.get(position.name, "")
         vehicle_from_sensor = self._vehicle_from(sensor)
         if vehicle_from_sensor is None:
-            self.missing["poses.lever_arm_m"] = f"where '{sensor}' sits in the vehicle frame, {LEVER_ARM}"
+            self.missing["poses.lever_arm_m"] = f"position of '{sensor}' in the vehicle frame, {LEVER_ARM}"
             entry["lever_arm_m"] = "?"
             return entry
         entry["lever_arm_m"] = vehicle_from_sensor[:3, 3].tolist()
@@ -115,7 +115,7 @@ class BagDescription:
             turned = self._vehicle_from(self._frame_of.get(heading.name, ""))
         if turned is None:
             self.missing["poses.mounting_rpy_deg"] = (
-                "roll, pitch and yaw of the heading's sensor, deg: [0, 0, 0]"
+                "roll, pitch and yaw of the heading sensor, deg: [0, 0, 0]"
             )
             entry["mounting_rpy_deg"] = "?"
         elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:

@@ -66,8 +66,8 @@ def _pixels(fields: Any, where: str) -> np.ndarray:
     row = width * channels
     if not height or not width or step < row or len(fields.data) < step * (height - 1) + row:
         raise DriveError(
-            f"{where}: {len(fields.data)} bytes are no image of {width} x {height} in {fields.encoding} with "
-            f"{step} bytes a row; record it anew"
+            f"{where}: {len(fields.data)} bytes are not an image of {width} x {height} in {fields.encoding} "
+            f"with {step} bytes per row; record it again"
         )
     data = np.zeros(step * height, dtype=np.uint8)
     data[: len(fields.data)] = fields.data[: len(data)]
@@ -89,7 +89,7 @@ class VideoDecoder:
     def __init__(self, form: str, where: str) -> None:
         self._av = need("av", "video", f"{where}: video in a bag", DriveError)
         if form not in _FORMATS:
-            raise DriveError(f"{where}: video in the format '{form}', known are {', '.join(_FORMATS)}")
+            raise DriveError(f"{where}: video in the format '{form}', supported are {', '.join(_FORMATS)}")
         self._where = where
         self._context: Any = self._av.CodecContext.create(_CODECS.get(form, form), "r")
         self._begun = False
@@ -114,7 +114,7 @@ class VideoDecoder:
             if damaged and not self._complained:
                 self._complained = True
                 _log.warning(
-                    "%s: packet %d: the decoder complains (%s); is it damaged?",
+                    "%s: packet %d: decoder error (%s); is it damaged?",
                     self._where, number + 1, complaints[-1][2].strip() if complaints else "corrupt",
                 )  # fmt: skip
             for frame in frames:
@@ -184,17 +184,17 @@ def readings_of(
     order = in_order(stamp_s, where, "message")
     stamp_s, rows = stamp_s[order], rows[order]
     if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
-        raise DriveError(f"{where}: holds a position that is not finite; record it anew")
+        raise DriveError(f"{where}: holds a position that is not finite; record it again")
     heading_s, turned = headings or (stamp_s, rows[:, 4:])
     by_time = in_order(heading_s, where, "message of the heading")
     heading_s, turned = heading_s[by_time], turned[by_time]
     if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
-        raise DriveError(f"{where}: a message states a variance below 0; record it anew with 0, not known")
+        raise DriveError(f"{where}: a message states a negative variance; record it again with 0 for unknown")
     # A dual antenna writes nan where it has none.
     known = np.isfinite(turned[:, :4]).all(axis=1)
     attitudes = None
     if known.any():
-        advice = "no orientation was measured there: choose another topic for the heading"
+        advice = "it has no measured orientation: choose another topic for the heading"
         rotation = checked_rotations(turned[known, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[known], rotation, turned[known, 4])
     geodetic = kind == FIX
@@ -241,7 +241,7 @@ class Frames:
             table = table[in_order(table[:, 0], f"{where}, {parent} to {child}", "transform")]
             norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
             if not np.isfinite(table).all() or (norm < 0.5).any():
-                raise DriveError(f"{where}: the transform of {child} in {parent} is none; record it anew")
+                raise DriveError(f"{where}: the transform of {child} in {parent} is invalid; record it again")
             poses = make_transform(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
             # Old recorders publish fixed frames again and again.
             moves = len(poses) > 1 and bool(np.ptp(poses, axis=0).max() > _FIXED)
@@ -265,11 +265,11 @@ class Frames:
         path = self._path(dst, src)
         if path is None:
             names = ", ".join(self.names)
-            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; there are: {names}")
+            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; available: {names}")
         tracks = [(self._edges[edge], forward) for edge, forward in path]
         busiest = max((track for track, _ in tracks), key=lambda track: len(track.stamp_s), default=None)
         if busiest is None or len(busiest.stamp_s) < 2:
-            raise DriveError(f"{where}: {src} does not move in {dst}; name the map's frame and the vehicle's")
+            raise DriveError(f"{where}: {src} does not move in {dst}; give the map's frame and the vehicle's")
         stamp_s = busiest.stamp_s
         inside = np.ones(len(stamp_s), dtype=bool)
         out = np.tile(np.eye(4), (len(stamp_s), 1, 1))
@@ -280,8 +280,8 @@ class Frames:
                 inside &= known
             out = out @ (poses if forward else inverse(poses))
         if not inside.any():
-            problem = f"the transforms between {src} and {dst} are never known at one time"
-            raise DriveError(f"{where}: {problem}; record them anew")
+            problem = f"the transforms between {src} and {dst} are never known at the same time"
+            raise DriveError(f"{where}: {problem}; record them again")
         return Trajectory(stamp_s[inside], out[inside])
 
     def _path(self, dst: str, src: str) -> list[tuple[Edge, bool]] | None:
@@ -314,5 +314,5 @@ def transform_rows(fields: Any) -> list[tuple[Edge, tuple[float, ...]]]:
 def frame_name(name: str) -> str:
     """A frame's name without the slash that old recorders put before it."""
     if not name.isprintable():
-        raise DriveError(f"a frame is named {name!r}: names have letters that show; rename it in the bag")
+        raise DriveError(f"a frame is named {name!r}: names need visible characters; rename it in the bag")
     return name.lstrip("/")

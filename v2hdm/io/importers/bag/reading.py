@@ -61,7 +61,7 @@ def bag_files(path: Path) -> list[Path]:
         raise DriveError(f"{path}: no such bag; check the path")
     files = _parts(path)
     if not files:
-        raise DriveError(f"{path}: no bag in this folder ({', '.join(SUFFIXES)}); check the path")
+        raise DriveError(f"{path}: no bags in this folder ({', '.join(SUFFIXES)}); check the path")
     described = path / _METADATA
     return [described, *files] if described.is_file() else files
 
@@ -111,8 +111,8 @@ class Bag:
             yield Message(*message, fields)
         if missing > 0:
             raise DriveError(
-                f"{self.path}: {missing} messages of {', '.join(sorted(topics))} that it lists are not "
-                "there; copy it again, or mend it with 'ros2 bag reindex'"
+                f"{self.path}: {missing} listed messages of {', '.join(sorted(topics))} are "
+                "missing; copy it again, or repair it with 'ros2 bag reindex'"
             )
 
     def _fields(self, connection: Any, data: bytes) -> Any:
@@ -148,12 +148,12 @@ class Bag:
         wanted = ", ".join(sorted(kind.split("/")[-1] for kind in kinds))
         topic = self.topics.get(name)
         if topic is None:
-            raise DriveError(f"{where}: {self.path} has no topic {name}; of type {wanted} it has: {fitting}")
+            raise DriveError(f"{where}: {self.path} has no topic {name}; topics of type {wanted}: {fitting}")
         if topic.kind not in kinds:
-            problem = f"topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}"
+            problem = f"topic {name} of {self.path} is of type {topic.kind}, expected {wanted}"
             raise DriveError(f"{where}: {problem}; it has: {fitting}")
         if not topic.messages:
-            raise DriveError(f"{where}: topic {name} of {self.path} holds no message; record it")
+            raise DriveError(f"{where}: topic {name} of {self.path} has no messages; record it")
         return topic
 
 
@@ -200,7 +200,7 @@ def _limit_unpacking() -> None:
             stream = new()
             out: bytes = stream.decompress(data, max_length=_TIMES * len(data) + _SPARE_BYTES)
             if not stream.eof:
-                raise DriveError("is cut off, or unpacks to more than a recording would")
+                raise DriveError("is cut off, or unpacks to more than a recording could")
             return out
 
         return unpack
@@ -213,7 +213,7 @@ def _limit_unpacking() -> None:
             nonlocal left
             left -= len(data := whole.read(count))
             if left < 0:
-                raise DriveError(f"{file.name}: unpacks to more than a recording would; unpack it yourself")
+                raise DriveError(f"{file.name}: unpacks to more than a recording could; unpack it yourself")
             return bytes(data)
 
         with zstd.open(file, mode) as whole:
@@ -232,7 +232,7 @@ def _check_definition(text: str) -> None:
     plain = _TEXTS.sub("", text)
     odd = any(not _LITERAL.fullmatch(one[1]) for one in _CONSTANT.finditer(plain))
     if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or _LONG.search(plain):
-        raise DriveError("its definition is none of a recording's; convert it where it was recorded")
+        raise DriveError("its definition is not from a recording; convert it where it was recorded")
 
 
 def _check_database(path: Path) -> None:
@@ -241,7 +241,7 @@ def _check_database(path: Path) -> None:
         header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
-        raise DriveError(f"{path}: was not closed, {journal.name} holds its end; run 'ros2 bag reindex'")
+        raise DriveError(f"{path}: was not closed; {journal.name} holds its end; run 'ros2 bag reindex'")
     if len(header) < 100:
         return
     page_bytes = int.from_bytes(header[16:18], "big")
@@ -249,7 +249,7 @@ def _check_database(path: Path) -> None:
     expected = int.from_bytes(header[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
     there = path.stat().st_size
     if header[24:28] == header[92:96] and there < expected:
-        raise DriveError(f"{path}: is cut off: {there} of {expected} bytes are there; copy it again")
+        raise DriveError(f"{path}: is cut off: {there} of {expected} bytes; copy it again")
 
 
 @contextmanager
@@ -268,6 +268,6 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
             ) from None
         reason = " ".join(str(failure).split()) or type(failure).__name__
         raise DriveError(
-            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or mend it "
+            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or fix it "
             f"with '{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
         ) from None

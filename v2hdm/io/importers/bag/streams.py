@@ -95,7 +95,7 @@ class ImageStream(Stream):
             stamp_s.append(stamp_of(message, self._stamps, not number, where))
             if number and stamp_s[-1] <= stamp_s[-2]:
                 raise DriveError(
-                    f"{where}: its time {stamp_s[-1]:.6f} s is not after that of the one before "
+                    f"{where}: its time {stamp_s[-1]:.6f} s is not after the previous one "
                     f"({stamp_s[-2]:.6f} s): two clocks or two recordings in one topic; keep one of them"
                 )
             if message.kind == VIDEO:
@@ -132,8 +132,8 @@ class InfoStream(Stream):
                 number += 1
                 if _lens(later.fields) != lens:
                     raise DriveError(
-                        f"{where}: message {number} states another lens than the first; map the parts of the "
-                        "recording one by one, or give the right camera_info as a file"
+                        f"{where}: message {number} has another lens than the first; map the parts of the "
+                        "recording separately, or give the right camera_info as a file"
                     )
 
 
@@ -254,8 +254,8 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
     stamp = fields.timestamp if message.kind == VIDEO else fields.header.stamp
     if not stamp.sec and not stamp.nanosec and not first:
         raise DriveError(
-            f"{where}: its header has no time; set stamps: received to take the recorder's, which come later "
-            "by as much as the computer needed"
+            f"{where}: its header has no time; set stamps: received to use the recorder's, which are late "
+            "by the computer's delay"
         )
     return float(stamp.sec + stamp.nanosec / 1e9)
 
