@@ -300,7 +300,7 @@ def test_a_step_of_heights_is_that_to_the_least_cost_of_everything_anew(engine):
 
     low, middle, high = (cost(share) for share in (-0.01, 0.0, 0.01))
     slope, bend = (high.cost - low.cost) / 0.02, (high.cost - 2 * middle.cost + low.cost) / 1e-4
-    information, gradient = height_information(middle.covariance.whitening, csr_array(heights[:, None]))
+    information, gradient = height_information(middle, csr_array(heights[:, None]))
     sigma = information[0, 0] ** -0.5
     assert sigma == pytest.approx(bend**-0.5, rel=0.05)
     assert -gradient[0] / information[0, 0] == pytest.approx(-slope / bend, abs=0.05 * sigma)

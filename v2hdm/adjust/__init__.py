@@ -15,14 +15,7 @@ from v2hdm.adjust.problem import (
     SolveOptions,
 )  # fmt: skip
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
-from v2hdm.adjust.selection import (
-    MODELS,
-    estimate_noise,
-    predicts_better,
-    select_model,
-    whitening_under,
-    with_model,
-)
+from v2hdm.adjust.selection import MODELS, estimate_noise, predicts_better, select_model, with_model
 from v2hdm.adjust.sensitivity import height_information, moves_with_heights
 from v2hdm.adjust.solution import (
     Solution,
@@ -38,5 +31,5 @@ __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
     "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
     "height_information", "line_variance_factor", "moves_with_heights", "observability", "pose_innovations",
-    "predicts_better", "score_faults", "select_model", "sigmas_of", "solve", "whitening_under", "with_model",
+    "predicts_better", "score_faults", "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

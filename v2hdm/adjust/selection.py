@@ -35,7 +35,7 @@ from v2hdm.adjust.problem import (
 )
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.whitening import Whitening, factorise
+from v2hdm.adjust.whitening import factorise
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import exp
@@ -261,17 +261,6 @@ class _Scales:
     over: float = 0.0
 
 
-def whitening_under(problem: Problem, solution: Solution, sigmas: Sequence[PoseSigma]) -> Whitening:
-    """The Hessian at the ``solution`` of a problem, had its visits' poses these ``sigmas``."""
-    descent = solution.covariance.descent
-    arrays = descent.engine.arrays
-    states = tuple(POSE_STATES[axis] for axis in arrays.states)
-    _, *prior = state_prior(replace(problem, pose_sigma=tuple(sigmas)), states)
-    transition, root = (arrays.state_transition.new_tensor(one) for one in prior)
-    engine = descent.engine.over(replace(arrays, state_transition=transition, state_information_root=root))
-    return factorise(engine, descent.plan, descent.estimate, descent.robust)
-
-
 def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...]:
     """The sigmas of each visit's poses that the drive shows; as stated where nothing is estimated.
 
@@ -281,10 +270,16 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
     arrays, stated = descent.engine.arrays, problem.pose_sigmas
     if not arrays.states:
         return stated
+    states_of = tuple(POSE_STATES[axis] for axis in arrays.states)
     scales, generator = dict.fromkeys(_GROUPS, _Scales()), torch.Generator()
     for _ in range(_ROUNDS):
         sigmas = tuple(_scaled(one, scales) for one in stated)
-        whitening = whitening_under(problem, solution, sigmas)
+        _, *prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
+        transition, root = (arrays.state_transition.new_tensor(one) for one in prior)
+        engine = descent.engine.over(
+            replace(arrays, state_transition=transition, state_information_root=root)
+        )
+        whitening = factorise(engine, descent.plan, descent.estimate, descent.robust)
         noise = torch.randn(_DRAWS, whitening.size, generator=generator.manual_seed(0), dtype=torch.float64)
         off = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]
         states = descent.estimate.frame_state + torch.stack([one.frame_state for one in off])

@@ -210,13 +210,13 @@ def raised(solved: Sensitivity, height: Tensor) -> Rows:
     return {"observations": solved.seen(height[:, None] * solved.poses[:, :3, 2])}
 
 
-def height_information(whitening: Whitening, heights: Any) -> tuple[FloatArray, FloatArray]:
+def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
     """The information (B, B) on parameters that raise the ground, and the gradient (B,) of the cost by them.
 
     ``heights`` (K, B), sparse, are m by which a unit of each raises what each observation of the problem
-    shows; ``whitening`` is at a solution.
+    shows.
     """
-    solved = Sensitivity.at(whitening)
+    solved = Sensitivity.at(solution.covariance.whitening)
     unit = raised(solved, torch.ones_like(solved.root))["observations"]
     columns = heights[solved.arrays.order.cpu().numpy()]
     squared = unit.square().sum(0).cpu().numpy()

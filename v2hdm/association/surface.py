@@ -7,8 +7,8 @@ way s along the path, d to its left, is
 
 a grade of the whole map, a cross-section alike along the route, whose slopes change at the path and at
 knots beside it (a crown), and a bicubic spline: bank, ramps, crests and dips. The grade stands apart: where
-the path begins to bend, a plane has a kink in s. Of the priors, slopes a are 0 +- 3 %; second derivatives
-along, across and both ways have a standard deviation each, estimated from the drive by its marginal
+the path begins to bend, a plane has a kink in s. Of the priors, slopes a are 0 +- 3 %; second differences of
+c along, across and both ways have a standard deviation each, estimated from the drive by its marginal
 likelihood, so that a plane is what is left where nothing speaks against it; on the path heights and slopes
 are the recorded ones (:mod:`v2hdm.io.drive.road`), within their noise.
 
@@ -21,7 +21,7 @@ poses by which they are moved, a corner then fits its pixels exactly where its p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -30,12 +30,11 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.optimize import minimize
-from scipy.sparse import csr_array, diags_array, hstack, kron
+from scipy.sparse import csr_array, diags_array, hstack
 from scipy.spatial import cKDTree
 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
-from v2hdm.geometry.planar import cross
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
 
@@ -60,9 +59,6 @@ _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
 _WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
 
-_TIGHTEST = (
-    0.3  # share of the way along the path that is left beside it in a bend: ground beyond is another's
-)
 _CURVATURE = 1e-3  # usual second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
 
@@ -431,10 +427,10 @@ class Surface:
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score
-        usual, whole, bends = np.full(3, np.log(_CURVATURE)), information + known, self._bends()
+        usual, whole = np.full(3, np.log(_CURVATURE)), information + known
 
         def cost(sizes: FloatArray) -> float:
-            prior = self._smoothness(bends, sizes)
+            prior = self._smoothness(sizes)
             try:
                 lower, own = (cholesky(one, lower=True) for one in (whole + prior, prior))
             except np.linalg.LinAlgError:  # so even that rounding leaves nothing of the ridge
@@ -445,46 +441,22 @@ class Surface:
 
         search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
         best = minimize(cost, usual, method="Nelder-Mead", options=search).x
-        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(bends, best)), dtype=np.float64)
+        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(best)), dtype=np.float64)
         parameters = covariance @ towards
         moved = parameters - self.parameters
         gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
         found = replace(self, parameters=parameters, covariance=covariance, datum_m=datum_m)
         return found, float(gain)
 
-    def _bends(self) -> list[FloatArray]:
-        """J'J (B, B) of second derivatives along, along and across, and across, at the spline's nodes.
-
-        They are those by the map's directions, so that no plane bends, not even beside a bend of the path:
-        there (1 - kappa d) ds is the way on the map.
-        """
-        begin_m, step_m, count = self.knots
-        (value, slope, bend), (value_across, slope_across, bend_across) = (
-            [diags_array(weights, offsets=[0, 1, 2], shape=(n - 2, n))
-             for weights in ([1 / 6, 2 / 3, 1 / 6], [-0.5 / h, 0.0, 0.5 / h], [h**-2, -2 * h**-2, h**-2])]
-            for n, h in ((count, step_m), (_ACROSS, _ACROSS_M))
-        )  # fmt: skip
-        station = begin_m + step_m * np.arange(count - 2, dtype=np.float64)
-        (_, before, sense), (_, behind, _) = (
-            self.paths.at(station + way) for way in (-step_m / 2, step_m / 2)
-        )
-        turned = sense * np.arctan2(cross(before, behind), np.einsum("ni,ni->n", before, behind)) / step_m
-        left_m = -_SIDE_M + _ACROSS_M * np.arange(_ACROSS - 2)
-        kappa, rate = (np.repeat(one, len(left_m)) for one in (turned, np.gradient(turned, step_m)))
-        left_m = np.tile(left_m, len(station))
-        way = np.maximum(1.0 - kappa * left_m, _TIGHTEST)
-        ahead = diags_array(1 / way) @ kron(slope, value_across)
-        along = kron(bend, value_across) + diags_array(rate * left_m) @ ahead
-        along = diags_array(way**-2) @ (along - diags_array(kappa * way) @ kron(value, slope_across))
-        mixed = diags_array(1 / way) @ (kron(slope, slope_across) + diags_array(kappa) @ ahead)
-        rows = along, mixed, kron(value, bend_across)
-        return [np.asarray((one.T @ one).toarray()) for one in rows]
-
-    def _smoothness(self, bends: Sequence[FloatArray], sizes: FloatArray) -> FloatArray:
-        """The prior's information (B, B), by the logarithms of the sizes (3,) of second derivatives."""
-        spline = np.eye(len(bends[0])) / _RIDGE_M**2
-        for size, own in zip(np.exp(-2 * sizes).tolist(), bends, strict=True):
-            spline += size * own
+    def _smoothness(self, sizes: FloatArray) -> FloatArray:
+        """The prior's information (B, B), by the logarithms of the sizes (3,) of second differences."""
+        _, step_m, along = self.knots
+        ways = [[np.eye(n), np.diff(np.eye(n), axis=0) / h, np.diff(np.eye(n), 2, axis=0) / h**2]
+                for n, h in ((along, step_m), (_ACROSS, _ACROSS_M))]  # fmt: skip
+        grams = [[one.T @ one for one in way] for way in ways]
+        spline = np.eye(along * _ACROSS) / _RIDGE_M**2
+        for size, order in zip(np.exp(-2 * sizes).tolist(), (2, 1, 0), strict=True):
+            spline += size * np.kron(grams[0][order], grams[1][2 - order])
         slopes = np.repeat([_GRADE_SIGMA, _SLOPE_SIGMA], [_GRADES, _HINGES])
         return np.asarray(block_diag(np.diag(slopes**-2), spline))
 

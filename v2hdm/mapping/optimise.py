@@ -16,7 +16,6 @@ from functools import partial
 import numpy as np
 
 from v2hdm.adjust import (
-    Drift,
     PoseSigma,
     Problem,
     Status,
@@ -25,7 +24,6 @@ from v2hdm.adjust import (
     moves_with_heights,
     predicts_better,
     select_model,
-    whitening_under,
 )
 from v2hdm.association.ground import Located, Views, easy_views, images_with_symbol, locate
 from v2hdm.association.groups import (
@@ -91,13 +89,9 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 
 _GROUND_ROUNDS = 6  # solves over better and better ground, at most: four are enough for a crown of 4 %
 
-SWAY = Drift(0.003, 10.0)
-"""How far a vehicle leans for seconds, rad, m: .17 deg on KITTI drives. A tenth of a millirad, taken for the
-ground's, bends 100 m of it by centimetres."""
-
 _LANE_ROUNDS = 3  # solves with lanes: the stated variance of points may be thirty times the true one
 
-_SETTLED_M = 3e-3  # change of the seen heights, root mean square, from which on the ground is settled
+_SETTLED_M = 1e-3  # change of the seen heights, root mean square, from which on the ground is settled
 
 
 def silent(step: str) -> None:
@@ -375,9 +369,7 @@ class Optimiser:
         surface = Surface.level(paths) if surface is None else replace(surface, paths=paths)
         points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
         columns = surface.seen_columns(points_map, self._seen.frame[bundle.row])
-        sigmas = [_swaying(one) for one in bundle.problem.pose_sigmas]
-        whitening = whitening_under(bundle.problem, bundle.solution, sigmas)
-        better, gain = surface.estimated(*height_information(whitening, columns), self._recorded)
+        better, gain = surface.estimated(*height_information(bundle.solution, columns), self._recorded)
         step_m = columns @ (better.parameters - surface.parameters)
         return better, gain, float(np.sqrt(np.mean(step_m**2)))
 
@@ -486,13 +478,6 @@ class Optimiser:
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name
-
-
-def _swaying(sigma: PoseSigma) -> PoseSigma:
-    """``sigma`` of a vehicle that leans by acceleration and in bends: of the ground it says nothing then."""
-    white = sigma.roll_pitch_rad**2 - sigma.roll_pitch_drift.sigma**2
-    total_rad = float(np.sqrt(max(white, 0.0) + SWAY.sigma**2))
-    return replace(sigma, roll_pitch_rad=total_rad, roll_pitch_drift=SWAY)
 
 
 def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
