@@ -483,13 +483,13 @@ class Surface:
         return known, towards, datum_m
 
     def _meet(
-        self, rays: FloatArray, centre_map: FloatArray, frame: IntArray, seen_height_m: Heights
+        self, view: _View, frame: IntArray, pixels: FloatArray, seen_height_m: Heights
     ) -> tuple[FloatArray, BoolArray]:
-        """Where rays (K, 3) from cameras (K, 3) at frames (K,) meet the ground (K, 2), and which (K,) do.
+        """Where the ground is seen (K, 2) at pixels (K, 2), its heights given, and which (K,) show it.
 
-        Those that meet it nowhere, or far away, stay on the plane. ``seen_height_m`` are the heights (K,) at
-        points (K, 2).
+        Rays that meet it nowhere, or far away, stay on the plane.
         """
+        rays, centre_map = view.rays(pixels), view.centre
         with np.errstate(all="ignore"):
             plane = centre_map[:, :2] - (centre_map[:, 2:] / rays[:, 2:]) * rays[:, :2]
             found = (rays[:, 2] < 0) & (np.linalg.norm(plane - centre_map[:, :2], axis=1) < _REACH_M)
@@ -525,14 +525,15 @@ class Surface:
 
         Each is of a camera ``intrinsic`` (K, 3, 3) at ``cam_from_map`` (K, 4, 4), taken at ``frame`` (K,).
         """
-        view = _View(intrinsic, cam_from_map)
+        return self._flat_px(_View(intrinsic, cam_from_map), frame, pixels)
+
+    def _flat_px(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
         points, found = self._shown(view, frame, pixels)
         return np.where(found[:, None], view.on_plane_px(points, found), pixels)
 
     def _shown(self, view: _View, frame: IntArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """The ground's points (K, 2) at pixels (K, 2), and which (K,) show it."""
-        heights = partial(self.seen_height_m, frame=frame)
-        return self._meet(view.rays(pixels), view.centre, frame, heights)
+        return self._meet(view, frame, pixels, partial(self.seen_height_m, frame=frame))
 
     def _pixels_by_pixels(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
         """The derivative (K, 2, 2) of :meth:`flattened_px`, over planes that touch the ground there."""
@@ -546,7 +547,7 @@ class Surface:
             return np.asarray(height_m + np.einsum("ki,ki->k", slope, at_map - points))
 
         def moved(to_px: FloatArray) -> FloatArray:
-            at, near = self._meet(view.rays(to_px), view.centre, frame, touching)
+            at, near = self._meet(view, frame, to_px, touching)
             return np.where((found & near)[:, None], view.on_plane_px(at, near), to_px)
 
         columns = [moved(pixels + step) - moved(pixels - step) for step in _STEP_PX * np.eye(2)]
@@ -554,33 +555,33 @@ class Surface:
 
     def flattened(self, sightings: Sightings, rig: Rig) -> Sightings:
         """``sightings`` as if all that they show lay on the plane z = 0, under the cameras of ``rig``."""
+        pixels = sightings.corners_pinhole_px.reshape(-1, 2)
 
-        def moved(camera: IntArray, frame: IntArray, pixels: FloatArray) -> FloatArray:
-            known, out = np.isfinite(pixels).all(axis=1), pixels.copy()
-            camera, frame = camera[known], frame[known]
-            cam_from_map = rig.cam_from_map(camera, frame)
-            out[known] = self.flattened_px(rig.intrinsic[camera], cam_from_map, frame, pixels[known])
+        def known(
+            camera: IntArray, frame: IntArray, pixels: FloatArray, of: Callable[..., FloatArray]
+        ) -> FloatArray:
+            """``of`` the pixels (N, 2) that are known, else nan."""
+            seen = np.isfinite(pixels).all(axis=1)
+            camera, frame = camera[seen], frame[seen]
+            found = of(_View(rig.intrinsic[camera], rig.cam_from_map(camera, frame)), frame, pixels[seen])
+            out = np.full((len(pixels), *found.shape[1:]), np.nan)
+            out[seen] = found
             return out
 
-        camera, frame = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4)
-        pixels = sightings.corners_pinhole_px.reshape(-1, 2)
-        known, jacobian = np.isfinite(pixels).all(axis=1), np.full((len(pixels), 2, 2), np.nan)
-        own = camera[known], frame[known]
-        view = _View(rig.intrinsic[own[0]], rig.cam_from_map(*own))
-        jacobian[known] = self._pixels_by_pixels(view, own[1], pixels[known])
-        by_corner = jacobian.reshape(-1, 4, 2, 2)
+        corners = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4), pixels
+        jacobian = known(*corners, self._pixels_by_pixels).reshape(-1, 4, 2, 2)
         symbols = sightings.symbols
         if len(symbols.camera):
             length = [len(outline) for outline in symbols.outlines_pinhole_px]
             of_point = np.repeat(np.arange(len(length)), length)
             outlines = np.concatenate(symbols.outlines_pinhole_px)
-            outlines = moved(symbols.camera[of_point], symbols.frame[of_point], outlines)
+            outlines = known(symbols.camera[of_point], symbols.frame[of_point], outlines, self._flat_px)
             parts = np.split(outlines, np.cumsum(length)[:-1])
             symbols = replace(symbols, outlines_pinhole_px=tuple(parts))
         return replace(
             sightings,
-            corners_pinhole_px=moved(camera, frame, pixels).reshape(-1, 4, 2),
-            covariance_px=by_corner @ sightings.covariance_px @ np.swapaxes(by_corner, -1, -2),
+            corners_pinhole_px=known(*corners, self._flat_px).reshape(-1, 4, 2),
+            covariance_px=jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2),
             symbols=symbols,
         )
 
