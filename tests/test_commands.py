@@ -107,7 +107,7 @@ def test_a_warning_is_one_line_whatever_name_of_a_file_is_in_it(tmp_path):
     [
         (
             "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
-            "ended by signal 11 under ulimit -v; the",
+            "ended by signal 11 under ulimit -v; not enough memory",
         ),
         ("raise ImportError('a.so: failed to map segment from shared object')", "not enough memory"),
         ("raise RuntimeError('std::bad_alloc')", "not enough memory"),

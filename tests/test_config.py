@@ -42,8 +42,8 @@ def test_every_shipped_run_composes_into_dataclasses(run):
         ("+run=port2 +mapping.known_sizes.by_class_m={diamond:[1,0.7]}", "write 1.0"),
         ("+run=kitti", "drive.path"),
         ("+run=kitti drive.path=nowhere", "nowhere"),
-        ("+run=kitti drive.path=straße", "wants quotes"),
-        ("+run=kitti drive.path=a(1)", "wants quotes"),
+        ("+run=kitti drive.path=straße", "needs quotes"),
+        ("+run=kitti drive.path=a(1)", "needs quotes"),
     ],
 )
 def test_a_wrong_argument_is_one_line_that_names_it(line, named, tmp_path, monkeypatch, capsys):
@@ -91,7 +91,7 @@ def test_every_key_is_explained(schema):
 def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped():
     page = help_text("v2hdm map", "Maps.", RunConfig, Path(__file__).parents[1] / "conf")
     assert "v2hdm map [key=value ...]" in page
-    assert "mapping.max_range_m (number, 16.0)\n      Sightings farther than" in page
+    assert "mapping.max_range_m (number, 16.0)\n      sightings farther from" in page
     assert "Shipped runs: kitti, port1, port2" in page
     assert all(key.name in page for key in keys_of(RunConfig))
     assert max(map(len, page.splitlines())) <= 110

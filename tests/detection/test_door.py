@@ -326,7 +326,7 @@ def test_a_mistake_is_one_line_exit_code_2_and_nothing_half_written(bench, tmp_p
 @pytest.mark.parametrize("index", [97, 99999999999])
 def test_a_camera_that_does_not_open_is_one_line(bench, capfd, index):
     assert bench.run(index) == 2
-    assert capfd.readouterr().err.startswith(f"error: camera {index}: does not open")
+    assert capfd.readouterr().err.startswith(f"error: camera {index}: cannot be opened")
 
 
 def test_a_number_that_is_a_folder_as_well_as_a_cameras_index_is_asked_about(

@@ -516,7 +516,7 @@ def test_damage_that_the_decoder_of_a_topics_video_conceals_is_reported_once(tmp
     stream = ImageStream("/video", "header", "here")
     import_streams(write_ros2(tmp_path / "bag", made), [stream], tmp_path / "cache")
     assert re.search(r"/video: packet 7: decoder error", caplog.text)
-    assert caplog.text.count("complains") == 1
+    assert caplog.text.count("decoder error") == 1
 
 
 def test_a_video_that_is_cut_off_turned_or_a_playlist_is_reported(tmp_path, caplog):
@@ -535,7 +535,7 @@ def test_a_video_that_is_cut_off_turned_or_a_playlist_is_reported(tmp_path, capl
     with pytest.raises(DriveError, match="frame 1 asks for a rotation"):
         _import_video(path, tmp_path / "turned", "here")
     assert len(list(video_frames(path))) == 20
-    assert "turned by 90 degrees" in caplog.text
+    assert "rotated by 90 degrees" in caplog.text
     path.write_text("ffconcat version 1.0\nfile a.mkv\n")
     with pytest.raises(DriveError, match="not readable as a video"):
         _import_video(path, tmp_path / "list", "here")

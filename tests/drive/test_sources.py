@@ -98,7 +98,7 @@ def test_a_source_that_does_not_fit_is_named(folder):
         ({"video": "text.mp4", "start_s": 1}, "text.mp4: not readable as a video"),
         ({"video": "front.mkv", "start": 1}, "unknown key 'start'; did you mean 'start_s'"),
         ({"folder": "front/images"}, "not named by their times; add stamps"),
-        ({"folder": "front/images", "stamps": "times.txt"}, "2 times of 7 images in"),
+        ({"folder": "front/images", "stamps": "times.txt"}, "2 times for 7 images in"),
         ({"folder": "front/images", "unit": "h"}, "unit: expected one of s, ms, us, ns"),
         ({"folder": "nowhere"}, "no such folder"),
         ({"folder": "front"}, "no image .* in this folder"),

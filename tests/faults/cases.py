@@ -101,7 +101,7 @@ YAML_TEXTS: dict[str, tuple[str | bytes, str]] = {
     "nested 70 deep": ("name: " + "[" * 70 + "]" * 70, "nested deeper"),
     "nested 3000 deep": ("name: " + "[" * 3000 + "]" * 3000, "nested deeper"),
     "mappings nested 3000 deep": ("name: " + "{a: " * 3000 + "}" * 3000, "nested deeper"),
-    "alias bomb": (ALIAS_BOMB, "aliases repeat"),
+    "alias bomb": (ALIAS_BOMB, "including aliases|no intrinsics of a known format"),
     "alias of itself": ("name: &a [*a]\n", "alias of something that contains it"),
     "unknown alias": ("name: *a\n", "YAML syntax error"),
     "5000 digits": ("name: " + "9" * 5000 + "\n", "5000 digits"),
@@ -159,7 +159,7 @@ BAD_NAMES: dict[str, tuple[object, str]] = {
     "escape sequence": ("a\x1b[31mb", "does not show|special characters"),
     "turned around": ("a\u202eb", "does not show"),
     "line separator": ("a\u2028b", "does not show"),
-    "blank at the end": ("front ", "blank"),
+    "blank at the end": ("front ", "a space"),
     "too long": ("x" * 65, "longer than 64"),
     "too many bytes": ("\U0001f697" * 64, "longer than 64"),
 }
@@ -490,15 +490,15 @@ def outputs() -> Iterator[Case]:
     more = {"code": 0, "leaves": "found.jsonl", "tells": True}
     yield detects("output is a link to what is to be", "imgs/a.jpg --output link", through, "", **more)
     circle = both(drive(), lambda root: (root / "out").symlink_to("out"))
-    yield Case("result onto a link in a circle", CHECK, CHECKED, circle, "leads nowhere|cannot")
+    yield Case("result onto a link in a circle", CHECK, CHECKED, circle, "broken link|cannot")
     for most in (0, 10, 1000, 5000):
         name = f"result on a disk with room for {most} bytes"
         yield checked(name, "cannot be written", disk_bytes=most)
     yield Case(
         "export onto the map", "v2hdm export", ("map.geojson", "--format", "geojson"),
-        lambda root: write_geojson(make_map(), root / "map.geojson"), "written over",
+        lambda root: write_geojson(make_map(), root / "map.geojson"), "would be overwritten",
     )  # fmt: skip
-    yield exported("export onto a link to the map", _linked_map, "written over")
+    yield exported("export onto a link to the map", _linked_map, "would be overwritten")
 
 
 def _folder_with(folder: str, name: str) -> Prepare:
@@ -555,7 +555,7 @@ def arguments() -> Iterator[Case]:
     words = ("map.geojson", "--format", "gpkg", "--output", "\udcff")
     yield Case(
         "export into a name that is no UTF-8", "v2hdm export", words,
-        lambda root: write_geojson(make_map(), root / "map.geojson"), "a name that is no UTF-8",
+        lambda root: write_geojson(make_map(), root / "map.geojson"), "a name that is not UTF-8",
         leaves="here/\udcff$",
     )  # fmt: skip
     for line, says in {
@@ -596,9 +596,9 @@ SETTINGS = _plainly(
     "detector.model=nowhere.onnx": "nowhere.onnx",
     "export=[pdf]": "pdf",
     "maping.max_range_m=1": "did you mean mapping",
-    "drive": "is no key=value",
+    "drive": "is not key=value",
     "+run=port9": "port9",
-    "drive.path=straße": "wants quotes",
+    "drive.path=straße": "needs quotes",
     "mapping=null": "mapping",
     "drive.cameras=front": "drive.cameras",
     "--config-name=x": "no option --config-name=x",

@@ -29,11 +29,11 @@ DAMAGES: dict[str, tuple[Change, str]] = {
     "no drive.yaml": (remove("drive.yaml"), r"not a drive in any known format .*drive-format.md"),
     "typo": (edit("drive.yaml", r"^pose_noise", "pose_noize"), r"'pose_noize'; did you mean 'pose_noise'\?"),
     "camera typo": (front(roi_vehicl=[[0, 0]]), r"camera 'front': unknown key 'roi_vehicl'; did you mean"),
-    "no cameras": (edit("drive.yaml", r"^cameras:(.|\n)*", "cameras: {}"), r"names no camera"),
+    "no cameras": (edit("drive.yaml", r"^cameras:(.|\n)*", "cameras: {}"), r"has no camera"),
     "bad noise": (edit("drive.yaml", r"position_m: 0\.01", "position_m: -1.0"), r"position_m: .*negative"),
     "much drift": (
         edit("drive.yaml", r"drift_m: 0\.008", "drift_m: 0.02"),
-        r"is part of position_m and cannot",
+        r"is part of position_m, so not above it",
     ),
     "short drift": (
         edit("drive.yaml", r"_over_m: 25\.0", "_over_m: 0"),
@@ -70,7 +70,10 @@ DAMAGES: dict[str, tuple[Change, str]] = {
         front(read_out_s=-0.01),
         r"read_out_s: -0.01 s is not a read-out time; give seconds",
     ),
-    "long read-out": (front(read_out_s=1.0), r"read_out_s: 1 s is no .*, from 0 to 0.6, the time from image"),
+    "long read-out": (
+        front(read_out_s=1.0),
+        r"read_out_s: 1 s is not .*, from 0 to 0.6, the time from image",
+    ),
     "read-out nan": (front(read_out_s=float("nan")), r"read_out_s: expected a finite number, got nan"),
     "read-out text": (front(read_out_s="fast"), r"read_out_s: expected a finite number"),
     "linear": (front(linear_response="perhaps"), r"linear_response: expected true or false"),

@@ -39,11 +39,11 @@ def entries(**content: object) -> Change:
 ROUTE = {"stamp_s": "100", "x_m": "0", "y_m": "0", "yaw_deg": "0", "sigma_m": ".02"}
 ROUTE |= {"heading_sigma_deg": ".1"}
 ROUTES = [
-    *(("sigma_m", cell, "sigma_m|cells under|no table") for cell in NO_NUMBERS),
-    *(("heading_sigma_deg", cell, "heading_sigma_deg|cells under|no table") for cell in NO_NUMBERS),
-    *(("x_m", cell, "x_m|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
-    *(("stamp_s", cell, "stamp_s|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
-    *(("yaw_deg", cell, "yaw_deg|cells under|no table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("sigma_m", cell, "sigma_m|cells under|not a table") for cell in NO_NUMBERS),
+    *(("heading_sigma_deg", cell, "heading_sigma_deg|cells under|not a table") for cell in NO_NUMBERS),
+    *(("x_m", cell, "x_m|cells under|not a table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("stamp_s", cell, "stamp_s|cells under|not a table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("yaw_deg", cell, "yaw_deg|cells under|not a table") for cell in ("nan", "inf", "", "x", LONG)),
     *(("sigma_m", cell, "no position is known") for cell in ("inf", "1e300", "0.2")),
 ]  # fmt: skip
 
@@ -51,7 +51,7 @@ ROUTES = [
 def _routes() -> Iterator[Case]:
     for column, cell, says in ROUTES:
         lines = [ROUTE | {"stamp_s": f"{100 + k / 10:.1f}", "x_m": str(k)} for k in range(20)]
-        wrong = range(20) if "sure" in says else [19]
+        wrong = range(20) if "known" in says else [19]
         rows = [line | ({column: cell} if k in wrong else {}) for k, line in enumerate(lines)]
         text = "\n".join(",".join(row.values()) for row in (dict(zip(ROUTE, ROUTE, strict=True)), *rows))
         yield checked(

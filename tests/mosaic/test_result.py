@@ -98,7 +98,7 @@ def said_of_drive(folder, **values):
     [
         (lambda folder: (folder / METRICS).unlink(), "has no metrics.json"),
         (lambda folder: (folder / METRICS).write_text("[]"), "metrics.json"),
-        (lambda folder: said_of_drive(folder, limit="x"), "is damaged"),
+        (lambda folder: said_of_drive(folder, limit="x"), "are damaged"),
         (lambda folder: said_of_drive(folder, paths=["gone"]), "give its folder with --drive"),
         (lambda folder: said_of_drive(folder, name="other"), "the result is of drive other"),
         (lambda folder: (folder / "calibration_front.yaml").unlink(), "no calibration_"),

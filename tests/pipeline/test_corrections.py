@@ -77,7 +77,7 @@ def test_a_class_is_fixed_and_a_dragged_corner_is_where_it_was_put(corrected):
 
 def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
     (finding,) = [one for one in corrected[2].verdict.findings if one.check == "corrections"]
-    assert "1 of 5 have found no candidate" in finding.says
+    assert "1 of 5 match no candidate" in finding.says
     assert "diamond at (500.00, 500.00)" in finding.says
 
 

@@ -112,7 +112,7 @@ def test_two_processes_of_a_machine_do_not_upload_one_result_at_once(config, mem
 def test_what_is_not_ours_is_reported_before_any_work(config, memory):
     memory.write("results/example/notes", b"mine")
     work = Work()
-    with pytest.raises(ConfigError, match="did not write"):
+    with pytest.raises(ConfigError, match="not results of V2HDM"):
         take_or_make(config, work, True, quiet)
     assert not work.done
 
