@@ -101,7 +101,7 @@ def test_a_source_that_does_not_fit_is_named(folder):
         ({"folder": "front/images", "stamps": "times.txt"}, "2 times for 7 images in"),
         ({"folder": "front/images", "unit": "h"}, "unit: expected one of s, ms, us, ns"),
         ({"folder": "nowhere"}, "no such folder"),
-        ({"folder": "front"}, "no image .* in this folder"),
+        ({"folder": "front"}, "no images .* in this folder"),
         ({"list": "a"}, "name one source"),
         ({"topic": "/image"}, "the drive has no bag; add the key bag"),
         (7, "images: expected a text, got 7|expected 'key: value' entries"),

@@ -130,7 +130,7 @@ def test_an_id_that_is_gone_is_never_given_again(tmp_path, updated):
 def test_a_map_of_another_place_is_refused(base, updated):
     elsewhere = [replace(one, corners_map=one.corners_map + 2.4) for one in base.hd_map.markings]
     wrong = replace(base, hd_map=replace(base.hd_map, markings=tuple(elsewhere)))
-    with pytest.raises(MappingError, match="is the map of this site and frame"):
+    with pytest.raises(MappingError, match="is the map of this site and in this frame"):
         run_methods(updated[0].drive, updated[0].detections, ("front", "rear"), base=wrong)
 
 

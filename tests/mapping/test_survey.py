@@ -179,7 +179,7 @@ def test_options_that_cannot_be_used_are_refused(options, message):
 
 
 def test_a_survey_that_is_still_a_file_is_refused(scene):
-    with pytest.raises(ConfigError, match=r"survey\.file is 'points.csv': read it first"):
+    with pytest.raises(ConfigError, match=r"survey\.file is 'points.csv': read it and give its points"):
         mapped(scene, scene.drive, MappingOptions(survey=SurveyOptions(file="points.csv")))
 
 
