@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from v2hdm.geometry.least_squares import Normal, gauss_newton
 from v2hdm.geometry.planar import cross
@@ -111,7 +110,10 @@ def adjust(
         tolerance: factor on the length of residual from which on a match loses its weight.
         near: a solution for the same images, without the parameter, to start from instead.
     """
-    problem = _Problem(observations, prior, free, tolerance)
+    # Steps move the ground by too little for it to be elsewhere beside the path.
+    hits = (hit_ground(start, px, prior.poses[image]) for image, px in _both(observations))
+    lower_m = tuple(_beside_m(prior.course_map, one.points_map) - _HALF_TRACK_M for one in hits)
+    problem = _Problem(observations, prior, free, tolerance, lower_m)
     damping = 0.0
     begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS), 0.0)
     if near is not None:
@@ -162,13 +164,15 @@ def _short(step: FloatArray) -> FloatArray:
 class _Problem:
     """Unknowns, in order: turn, centre, bends, roof, a freed parameter if any, six errors of every pose.
 
-    ``sigma_px`` is the standard deviation of the pixels, None to estimate it anew with every step.
+    ``lower_m`` (N,) is by how much a unit of roof lowers the ground, in both images; ``sigma_px`` is the
+    standard deviation of the pixels, None to estimate it anew with every step.
     """
 
     observations: Observations
     prior: Prior
     free: str | None
     tolerance: float
+    lower_m: tuple[FloatArray, ...]
     sigma_px: float | None = None
 
     @property
@@ -248,13 +252,13 @@ class _Problem:
         seen, poses = self.observations, self.poses(now)
         points, known, pose, slopes = [], [], [], []
         spread = np.zeros((len(seen.first), 2, 2))
-        both = (seen.first, seen.first_px), (seen.second, seen.second_px)
-        for (image, seen_px), off_px in zip(both, noise_px or (0 * seen.first_px,) * 2, strict=True):
+        off = noise_px or (0 * seen.first_px,) * 2
+        for (image, seen_px), off_px, lower_m in zip(_both(seen), off, self.lower_m, strict=True):
             px = seen_px - off_px
             hits = hit_ground(now.mount, px, poses[image])
             by_px = by_pixel(now.mount, hits)
             bending = _bending(now.mount, px, by_px)
-            falling = hits.by_fall(self._beside_m(hits.points_map) - _HALF_TRACK_M)
+            falling = hits.by_fall(lower_m)
             columns = [hits.by_mount(), bending, falling[:, :, None]]
             if self.free is not None:
                 columns.append(self._by_parameter(now.mount, hits, px, poses[image], image)[:, :, None])
@@ -276,15 +280,6 @@ class _Problem:
             return self._differences(now, [np.clip(one[..., 0], -limit_px, limit_px) for one in likeliest])
         jacobian = np.concatenate([known[0] - known[1], pose[0], -pose[1]], axis=2)
         return points[0] - points[1], jacobian, root
-
-    def _beside_m(self, points_map: FloatArray) -> FloatArray:
-        """How far (N,) points (N, 2) lie beside the driven path; nan of none."""
-        known, out = np.isfinite(points_map).all(axis=1), np.full(len(points_map), np.nan)
-        course = self.prior.course_map
-        _, near = cKDTree(course).query(points_map[known])
-        ahead = np.gradient(course, axis=0)[near]
-        out[known] = np.abs(cross(ahead, points_map[known] - course[near])) / np.linalg.norm(ahead, axis=1)
-        return out
 
     def _by_parameter(
         self, mount: Mount, hits: GroundHits, px: FloatArray, poses: FloatArray, image: IntArray
@@ -331,6 +326,23 @@ class _Problem:
         information[place, place] += stiffness
         gradient[place] += stiffness * off
         return cost + 0.5 * float(stiffness @ off**2)
+
+
+def _both(seen: Observations) -> tuple[tuple[IntArray, FloatArray], tuple[IntArray, FloatArray]]:
+    """The image (N,) and the pixel (N, 2) of each match, of its first image and of its second."""
+    return (seen.first, seen.first_px), (seen.second, seen.second_px)
+
+
+def _beside_m(course_map: FloatArray, points_map: FloatArray) -> FloatArray:
+    """How far (N,) points (N, 2) lie beside the driven path (P, 2)."""
+    ahead = np.gradient(course_map, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)  # of a vehicle that stands
+    out = []
+    for points in np.array_split(points_map, len(points_map) // 1000 + 1):
+        off = points[:, None] - course_map[None]
+        near = np.argmin(np.square(off).sum(axis=2), axis=1)
+        out.append(np.abs(cross(ahead[near], off[np.arange(len(near)), near])))
+    return np.concatenate(out)
 
 
 def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
