@@ -47,7 +47,7 @@ _SLOPE_SIGMA = 0.03
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
 _GRADE_SIGMA = 0.1
-"""Standard deviation of the grade of all the ground: the steepest roads rise by 10 to 15 %."""
+"""Standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %."""
 
 _GRADES, _HINGES = 2, 1 + 2 * len(KNOTS_M)
 _SHAPE = _GRADES + _HINGES  # parameters before the spline's
@@ -485,7 +485,7 @@ class Surface:
     def _meet(
         self, view: _View, frame: IntArray, pixels: FloatArray, seen_height_m: Heights
     ) -> tuple[FloatArray, BoolArray]:
-        """Where the ground is seen (K, 2) at pixels (K, 2), its heights given, and which (K,) show it.
+        """Points (K, 2) of the ground of these heights that pixels (K, 2) show, and which (K,) show it.
 
         Rays that meet it nowhere, or far away, stay on the plane.
         """

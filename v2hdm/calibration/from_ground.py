@@ -86,7 +86,7 @@ def _lines(estimate: GroundEstimate) -> Iterator[str]:
     calibration = estimate.calibration
     if calibration is None or calibration.covariance is None:
         reading = estimate.reading
-        other = "" if reading is Reading.AS_GIVEN else f"; it does if the poses are read as:  {reading.value}"
+        other = "" if reading is Reading.AS_GIVEN else f"; it does if the poses are read as: {reading.value}"
         yield f"{estimate.camera}: {_WHY[estimate.status]}{other}"
         return
     angles, place = mounting_words(calibration.cam_from_vehicle, calibration.covariance)

@@ -110,7 +110,7 @@ def adjust(
         tolerance: factor on the length of residual from which on a match loses its weight.
         near: a solution for the same images, without the parameter, to start from instead.
     """
-    # Steps move the ground by too little for it to be elsewhere beside the path.
+    # Steps move a ground point by centimetres: its distance from the path is taken once.
     hits = (hit_ground(start, px, prior.poses[image]) for image, px in _both(observations))
     lower_m = tuple(_beside_m(prior.course_map, one.points_map) - _HALF_TRACK_M for one in hits)
     problem = _Problem(observations, prior, free, tolerance, lower_m)
