@@ -35,6 +35,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
+from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
 
@@ -170,7 +171,7 @@ class Paths:
         at, ahead, sense = self.at(station)
         off = points_map - at
         beyond = np.einsum("ki,ki->k", off, ahead) * sense
-        return station + beyond, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]
+        return station + beyond, cross(ahead, off)
 
     def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points (K, 2) of the path at stations (K,), unit vectors of the heading there, and its sense."""
@@ -187,7 +188,7 @@ class Paths:
         """Points (K, 2) of the map at stations (K,), to the left (K,); the path goes on beyond its ends."""
         at, ahead, sense = self.at(station_m)
         beyond = sense * (station_m - np.clip(station_m, *self.station_m[[0, -1]]))
-        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        left = turned_left(ahead)
         return np.asarray(at + beyond[:, None] * ahead + left_m[:, None] * left)
 
     def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
@@ -271,7 +272,7 @@ class Surface:
         """
         paths, (long, wide) = self.paths, _WHEELS_M
         frame, ahead = np.arange(len(paths.place)), paths.heading
-        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        left = turned_left(ahead)
         # In a bend the front wheels are beside the path that the rear axle takes.
         (right_rear, left_rear), (right_front, left_front) = (
             [self._columns(*paths.beside(paths.position_map + along * ahead + side * left, frame))
@@ -286,7 +287,7 @@ class Surface:
         """Points (K, 2) ahead and to the left of the vehicle at frames (K,), m."""
         off, ahead = points_map - self.paths.position_map[frame], self.paths.heading[frame]
         forwards = np.einsum("ki,ki->k", off, ahead)
-        return np.column_stack([forwards, off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]])
+        return np.column_stack([forwards, cross(ahead, off)])
 
     def _leaning(self, points_map: FloatArray, above_m: FloatArray, frame: IntArray) -> FloatArray:
         """How far (K, 2) from their places on the map points (K, 2), at heights (K,), are on frames' planes.
@@ -297,7 +298,7 @@ class Surface:
         (along, across), ahead = self._from(points_map, frame).T, self.paths.heading[frame]
         by_along = forwards * (forwards * along / 2 + sideways * across + above_m)
         by_across = sideways * (sideways * across / 2 + above_m)
-        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        left = turned_left(ahead)
         return np.asarray(by_along[:, None] * ahead + by_across[:, None] * left)
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
@@ -407,7 +408,7 @@ class Surface:
     def sentence(self) -> str:
         """One sentence on the heights of the ground."""
         at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
-        left, told = np.column_stack([-ahead[:, 1], ahead[:, 0]]), []
+        left, told = turned_left(ahead), []
         for away, where in (
             (10.0 * ahead, "10 m ahead"),
             (4.0 * left, "4 m to the left"),
@@ -467,7 +468,7 @@ class Surface:
         height, slope = recorded.at(self.paths.position_map[frame])
         ahead, station = self.paths.heading[frame], self.paths.station_m[self.paths.place[frame]]
         forwards = np.einsum("fi,fi->f", slope, ahead)
-        sideways = slope[:, 1] * ahead[:, 0] - slope[:, 0] * ahead[:, 1]
+        sideways = cross(ahead, slope)
         datum_m, apart_m = float(height.mean()), np.abs(station[:, None] - station)
         known, towards = np.zeros((size, size)), np.zeros(size)
         values = (height - datum_m, forwards, sideways)
@@ -535,9 +536,10 @@ class Surface:
         """The ground's points (K, 2) at pixels (K, 2), and which (K,) show it."""
         return self._meet(view, frame, pixels, partial(self.seen_height_m, frame=frame))
 
-    def _pixels_by_pixels(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
-        """The derivative (K, 2, 2) of :meth:`flattened_px`, over planes that touch the ground there."""
+    def _flat_with_jacobian(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
+        """:meth:`flattened_px` and rows of its derivative (K, 3, 2), by planes that touch the ground."""
         points, found = self._shown(view, frame, pixels)
+        flat = np.where(found[:, None], view.on_plane_px(points, found), pixels)
         height_m, slope = self.seen_height_m(points, frame), np.empty_like(points)
         for axis, step in enumerate(_TOUCH_M * np.eye(2)):
             rise_m = self.seen_height_m(points + step, frame) - self.seen_height_m(points - step, frame)
@@ -551,7 +553,7 @@ class Surface:
             return np.where((found & near)[:, None], view.on_plane_px(at, near), to_px)
 
         columns = [moved(pixels + step) - moved(pixels - step) for step in _STEP_PX * np.eye(2)]
-        return np.stack(columns, axis=2) / (2 * _STEP_PX)
+        return np.concatenate([flat[:, None], np.stack(columns, axis=2) / (2 * _STEP_PX)], axis=1)
 
     def flattened(self, sightings: Sightings, rig: Rig) -> Sightings:
         """``sightings`` as if all that they show lay on the plane z = 0, under the cameras of ``rig``."""
@@ -569,7 +571,8 @@ class Surface:
             return out
 
         corners = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4), pixels
-        jacobian = known(*corners, self._pixels_by_pixels).reshape(-1, 4, 2, 2)
+        flat = known(*corners, self._flat_with_jacobian).reshape(-1, 4, 3, 2)
+        jacobian = flat[..., 1:, :]
         symbols = sightings.symbols
         if len(symbols.camera):
             length = [len(outline) for outline in symbols.outlines_pinhole_px]
@@ -580,7 +583,7 @@ class Surface:
             symbols = replace(symbols, outlines_pinhole_px=tuple(parts))
         return replace(
             sightings,
-            corners_pinhole_px=known(*corners, self._flat_px).reshape(-1, 4, 2),
+            corners_pinhole_px=flat[..., 0, :],
             covariance_px=jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2),
             symbols=symbols,
         )

@@ -31,6 +31,11 @@ def cross(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
+def turned_left(vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 2) turned by 90 degrees from x towards y: to the left of headings in the map."""
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
+
+
 def signed_area(polygon: FloatArray) -> FloatArray:
     """Shoelace area (...) of polygons (..., N, 2): positive where they turn from the x towards the y axis.
 

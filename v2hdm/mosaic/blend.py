@@ -34,7 +34,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.planar import densified
+from v2hdm.geometry.planar import densified, turned_left
 from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
@@ -270,7 +270,7 @@ def _tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
     tiles = np.column_stack([columns.ravel(), rows.ravel()])
     along = np.roll(polygon, -1, axis=0) - polygon
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    normal = turned_left(along)
     normal *= np.sign(np.einsum("ni,ni->n", normal, polygon.mean(axis=0) - polygon))[:, None]
     corners = TILE_PX * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - 0.5
     reach = ((TILE_PX * tiles[:, None, None] + corners[:, None] - polygon) * normal).sum(axis=-1)

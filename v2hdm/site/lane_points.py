@@ -18,6 +18,7 @@ from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shar
 from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.planar import turned_left
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     LANE_BOUNDARY,
@@ -169,7 +170,7 @@ def collect_lane_points(
     ray = points_map - centre[:, :2]
     covariance = CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
     covariance += direction_covariance(ray, np.maximum(centre[:, 2], LEAST_HEIGHT_M), jitter_rad)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    normal = turned_left(tangent)
     variance = np.einsum("pi,pij,pj->p", normal, covariance, normal)
     with np.errstate(invalid="ignore"):
         keep = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
@@ -323,7 +324,7 @@ def _shift(
     spread = wxx - wx**2 / safe + 1e-3 * safe
     slope = np.clip((wxy - wx * wy / safe) / np.maximum(spread, 1e-12), -0.5, 0.5)
     offset = np.clip((wy - slope * wx) / safe, -HALF_WIDTH_M, HALF_WIDTH_M)
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    normal = turned_left(tangent)
     turned = tangent + slope[:, None] * normal
     return points + offset[:, None] * normal, turned / np.linalg.norm(turned, axis=1, keepdims=True)
 

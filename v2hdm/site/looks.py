@@ -22,7 +22,7 @@ from v2hdm.association.groups import near_pairs, squared_distances
 from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.planar import Quad
+from v2hdm.geometry.planar import Quad, turned_left
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
@@ -96,7 +96,7 @@ def learn_paint(
         extent_m = np.linalg.norm(every, axis=2)
         rows, longest = np.arange(len(every)), np.argmax(extent_m, axis=1)
         along = every[rows, longest] / extent_m[rows, longest, None]
-        across = _ASIDE_M * np.column_stack([-along[:, 1], along[:, 0]])[:, None]
+        across = _ASIDE_M * turned_left(along)[:, None]
         aside = np.concatenate([own - across, own + across])
         clear = paint.query(aside.reshape(-1, 2))[0].reshape(-1, 4).min(axis=1) > _CLEAR_M
         bare = observer.contrasts(aside[clear]) if clear.any() else np.zeros(0)

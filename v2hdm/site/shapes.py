@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 from scipy.stats import chi2
 
+from v2hdm.geometry.planar import turned_left
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates
 
@@ -157,7 +158,7 @@ def _turned(angle: FloatArray) -> FloatArray:
 def rigid_motions(corners: FloatArray) -> FloatArray:
     """Derivatives (N, 8, 3) of corners (N, 4, 2) by a shift and a turn about their centre."""
     arms = corners - corners.mean(axis=1, keepdims=True)
-    turning = np.stack([-arms[..., 1], arms[..., 0]], axis=-1).reshape(-1, 8, 1)
+    turning = turned_left(arms).reshape(-1, 8, 1)
     shifting = np.broadcast_to(np.tile(np.eye(2), (4, 1)), (len(corners), 8, 2))
     return np.concatenate([shifting, turning], axis=2)
 

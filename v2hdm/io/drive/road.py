@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.geometry.planar import length_along
+from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
 
@@ -259,7 +259,7 @@ def unevenness(road: Road, reach_m: float) -> Unevenness:
     station_m = length_along(road.points_map)
     # Unit vectors to the left of the path, zero where it is a point.
     ahead = np.gradient(road.points_map, axis=0) if len(station_m) > 1 else np.zeros((1, 2))
-    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    left = turned_left(ahead)
     left /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     worst = Unevenness(0.0, reach_m, road.points_map[0], 0.0)
     for k, here_m in enumerate(station_m):

@@ -8,7 +8,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from v2hdm.geometry.planar import length_along
+from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.records import FloatArray, IntArray
 
 LANE_WIDTH_M = (2.55, 5.1)
@@ -215,7 +215,7 @@ class _Segments:
     def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
         """The line first met left (1) or right (-1) of each vertex (N,), -1 for none; its vertex; m away."""
         tangent = np.gradient(line, axis=0)
-        normal = side * np.column_stack([-tangent[:, 1], tangent[:, 0]])
+        normal = side * turned_left(tangent)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         pieces = [
             self._met(number, line[at : at + _AT_ONCE], normal[at : at + _AT_ONCE])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from v2hdm.geometry.ipm import centre_sigmas
-from v2hdm.geometry.planar import length_along
+from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
@@ -121,7 +121,7 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     _, nearest = KDTree(poses[:, :2, 3]).query(places[0][first])
     forward = poses[nearest, :2, 0]
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    left = turned_left(forward)
     return np.stack([(apart * forward).sum(1), (apart * left).sum(1)], axis=1)
 
 
