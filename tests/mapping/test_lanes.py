@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.cameras import level, mounted
-from v2hdm.association.ground import images_with_symbol
+from v2hdm.association.ground import images_with_line, images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
 from v2hdm.records import CameraInfo, Marking
@@ -416,6 +416,22 @@ def test_what_is_far_seen_seldom_or_never_is_left_out():
     assert mapped(*scene(40.0)) == ()
     assert mapped(NO_SYMBOLS, rig) == ()
     assert images_with_symbol(NO_SYMBOLS, rig, np.zeros((4, 4, 2))).tolist() == [0, 0, 0, 0]
+
+
+def test_images_tell_that_a_solid_line_goes_on_behind_a_dash():
+    line, dash = (
+        np.array([[9.3, 0.5], [12.0, 0.5]]),
+        np.array([[7.0, 0.0], [9.0, 0.0], [9.0, 0.15], [7.0, 0.15]]),
+    )
+    symbols, rig = seen([line] * 3, ["lane_line"] * 3, [0.0, 1.0, 2.0])
+    crossing = np.array([[9.5, 0.0], [9.5, 3.0]])
+    across, _ = seen([crossing] * 3, ["lane_line"] * 3, [0.0, 1.0, 2.0])
+    beside = np.array([[0.0, shift] for shift in (0.0, 0.5 - 0.075, 1.5)])
+    ahead = np.array([5.0, 0.0])
+    places = np.concatenate([dash + beside[:, None], [dash + beside[1] - ahead]])
+    assert images_with_line(symbols, rig, places).tolist() == [0, 3, 0, 0]
+    assert images_with_line(across, rig, places).tolist() == [0, 0, 0, 0]
+    assert images_with_line(NO_SYMBOLS, rig, places).tolist() == [0, 0, 0, 0]
 
 
 def test_paint_that_is_a_marking_is_no_symbol():

@@ -243,11 +243,11 @@ def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it():
 
 
 def odd_and_seldom():
-    """Forty candidates, of which number 7 is of no marking's shape and seen in three images of many."""
+    """Forty candidates; number 7 has no marking's shape or look, and is seen in three images of many."""
     (_, candidates), counts = row(11, [DIAMOND] * 40), well_seen(40)
     candidates.corners_map[7] += np.random.default_rng(11).normal(0, 0.25, (4, 2))
     counts.found[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
-    counts.observations[7], counts.agreeing[7] = 12, 8
+    counts.observations[7], counts.agreeing[7], counts.log_odds[7] = 12, 8, 1.0
     return candidates, counts
 
 
@@ -286,7 +286,7 @@ def test_reasons_name_what_has_won():
     classified = verdict(without(candidates, 5, [0, 1, 2]), counts)
     reasons = {place: reason for place, reason in enumerate(classified.verdict) if reason is not None}
     assert set(reasons) == {3, 5, 7}
-    assert reasons[3] == "part of other paint, such as an arrow or a letter"
+    assert reasons[3] == "part of other paint, such as an arrow or a solid line"
     assert reasons[5] == "a corner was never seen twice"
     assert reasons[7] in ("found in too few of its images", "not shaped like a marking of its class")
     assert len(classified.markings()) == 37
@@ -416,7 +416,7 @@ def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_wor
     for never_easy in (counts.easy_views, counts.found, counts.pointed):
         never_easy[7:9] = 0
     assert verdict(candidates, counts).verdict[7:9] == [
-        "part of other paint, such as an arrow or a letter",
+        "part of other paint, such as an arrow or a solid line",
         None,
     ]
     counts.log_odds[7] = 7.0

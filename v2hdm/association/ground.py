@@ -17,7 +17,7 @@ from v2hdm.geometry.ipm import (
     ground_from_pinhole_px,
     project_ground,
 )
-from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.planar import cross, inside_convex
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
 from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
@@ -26,6 +26,13 @@ _HORIZON_M2 = 1e4  # variance of a ground point, in its better direction, from w
 
 OUTLINE_SIGMA_PX = 2.5
 """How far the network's outline is from the edge of paint, px: measured on renders, where it is 1 to 3."""
+
+_RUN_ON_M = 1.0  # beyond a dash, m, nothing is painted: gaps are at least as long as dashes
+_SURE_M = 0.2  # sigma up to which a point of a line tells on what line it is: a fifth of that
+_LONG, _PARALLEL = (
+    2.0,
+    0.9,
+)  # length by breadth of what may be a line's piece; cosine of two ways that are one
 
 BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
@@ -106,9 +113,7 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
     known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
-    centre, sides = corners_map.mean(axis=1), (corners_map + np.roll(corners_map, -1, axis=1)) / 2
-    across = sides[:, 2:] - sides[:, :2]
-    way = across[np.arange(len(across)), np.argmax(np.linalg.norm(across, axis=2), axis=1)]
+    centre, way, _ = _middle_lines(corners_map)
     points = centre[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None]
     for ground in outlines_on_ground(symbols, rig):
         if ground is None:
@@ -123,8 +128,56 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     return count
 
 
+def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
+    """In how many images a solid line goes on within a metre of an end of each long quadrilateral (G, 4, 2).
+
+    Worn through, the start of such a line is a dash to look at.
+    """
+    count, images = (
+        np.zeros(len(corners_map), dtype=np.int64),
+        lines.frame * len(rig.intrinsic) + lines.camera,
+    )
+    pieces = _pieces_on_ground(lines, rig)
+    if not pieces:
+        return count
+    points, sigma_m = (np.concatenate(one) for one in zip(*pieces, strict=True))
+    length = [len(piece) for piece, _ in pieces]
+    course = np.concatenate([np.gradient(piece, axis=0) for piece, _ in pieces])
+    sure, image = sigma_m < _SURE_M, np.repeat(images, length)
+    points, course, image = points[sure], course[sure], image[sure]
+    course /= np.maximum(np.linalg.norm(course, axis=1, keepdims=True), 1e-9)
+    tree = cKDTree(points)
+    centre, way, breadth_m = _middle_lines(corners_map)
+    long_m = np.linalg.norm(way, axis=1)
+    for group in np.flatnonzero(np.isfinite(long_m) & (long_m > _LONG * breadth_m)).tolist():
+        ahead = way[group] / long_m[group]
+        near = np.array(tree.query_ball_point(centre[group], long_m[group] / 2 + _RUN_ON_M), dtype=np.int64)
+        off = points[near] - centre[group]
+        goes_on = np.abs(off @ ahead) > long_m[group] / 2 + breadth_m[group] / 2
+        goes_on &= (np.abs(cross(ahead, off)) < breadth_m[group]) & (np.abs(course[near] @ ahead) > _PARALLEL)
+        count[group] = len(np.unique(image[near[goes_on]]))
+    return count
+
+
+def _middle_lines(corners_map: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of quadrilaterals (G, 4, 2) the centres, the longer middle lines (G, 2) and the breadths (G,), m."""
+    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
+    across = sides[:, 2:] - sides[:, :2]
+    length_m = np.linalg.norm(across, axis=2)
+    way = across[np.arange(len(across)), np.argmax(length_m, axis=1)]
+    return corners_map.mean(axis=1), way, length_m.min(axis=1)
+
+
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
     """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length."""
+    return [
+        outline if np.isfinite(outline).all() and 2 * own.max() < np.ptp(outline, axis=0).max() else None
+        for outline, own in _pieces_on_ground(symbols, rig)
+    ]
+
+
+def _pieces_on_ground(symbols: Symbols, rig: Rig) -> list[tuple[FloatArray, FloatArray]]:
+    """The outline (K, 2) of each symbol in the map, and the sigmas (K,) of its points, m."""
     if not len(symbols.camera):
         return []
     length = [len(outline) for outline in symbols.outlines_pinhole_px]
@@ -135,10 +188,7 @@ def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
     ground, by_px = (one[:, 0] for one in found)
     sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px, axis=(1, 2))
     ends = np.cumsum(length)[:-1]
-    return [
-        outline if np.isfinite(outline).all() and 2 * own.max() < np.ptp(outline, axis=0).max() else None
-        for outline, own in zip(np.split(ground, ends), np.split(sigma_m, ends), strict=True)
-    ]
+    return list(zip(np.split(ground, ends), np.split(sigma_m, ends), strict=True))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,16 @@ from scipy.special import logit
 from v2hdm.errors import MappingError
 from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre, exp
-from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
+from v2hdm.records import (
+    LANE_LINE,
+    BoolArray,
+    Camera,
+    CameraInfo,
+    Drive,
+    FloatArray,
+    ImageDetections,
+    IntArray,
+)
 
 LEAST_HEIGHT_M = 0.1  # least height of a camera, m, for what divides by it
 
@@ -73,21 +82,55 @@ def collect_symbols(
 ) -> Symbols:
     """The symbols that the images of some cameras show, lens distortion removed."""
     rows = [
-        (found.image, name, marking)
+        (found.image, marking)
         for found in detections
-        if (name := drive.images[found.image].camera) in camera_index
+        if drive.images[found.image].camera in camera_index
         for marking in found.markings
         if len(marking.outline_px) >= 3
     ]
+    outlines = [(image, marking.kind, marking.outline_px, marking.outline_seen) for image, marking in rows]
+    return _as_symbols(drive, outlines, camera_index, frame_of_image)
+
+
+def collect_lines(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    camera_index: Mapping[str, int],
+    frame_of_image: IntArray,
+) -> Symbols:
+    """The pieces of solid lines that the images show, their centre lines in the place of outlines."""
+    pieces = [
+        (found.image, lane.kind, lane.points_px.astype(np.float64), np.zeros(0, dtype=np.bool_))
+        for found in detections
+        if drive.images[found.image].camera in camera_index
+        for lane in found.lanes
+        if lane.kind == LANE_LINE and len(lane.points_px) >= 2
+    ]
+    return _as_symbols(drive, pieces, camera_index, frame_of_image)
+
+
+def _as_symbols(
+    drive: Drive,
+    outlines: Sequence[tuple[int, str, FloatArray, BoolArray]],
+    camera_index: Mapping[str, int],
+    frame_of_image: IntArray,
+) -> Symbols:
+    """Images, classes, recorded pixels and seen sides as :class:`Symbols`."""
+    image = np.array([one[0] for one in outlines], dtype=np.int64)
+    names = [drive.images[i].camera for i in image.tolist()]
+    infos = [drive.cameras[name].info for name in names]
     return Symbols(
-        camera=np.array([camera_index[name] for _, name, _ in rows], dtype=np.int64),
-        frame=frame_of_image[np.array([image for image, _, _ in rows], dtype=np.int64)],
+        camera=np.array([camera_index[name] for name in names], dtype=np.int64),
+        frame=frame_of_image[image],
         outlines_pinhole_px=tuple(
-            undistort_points(drive.cameras[name].info, marking.outline_px) for _, name, marking in rows
+            undistort_points(info, points_px)
+            for info, (_, _, points_px, _) in zip(infos, outlines, strict=True)
         ),
-        kinds=tuple(marking.kind for _, _, marking in rows),
-        row_shares=tuple(row_shares(drive.cameras[name].info, one.outline_px) for _, name, one in rows),
-        seen=tuple(marking.outline_seen for _, _, marking in rows),
+        kinds=tuple(kind for _, kind, _, _ in outlines),
+        row_shares=tuple(
+            row_shares(info, points_px) for info, (_, _, points_px, _) in zip(infos, outlines, strict=True)
+        ),
+        seen=tuple(seen for _, _, _, seen in outlines),
     )
 
 
@@ -110,6 +153,7 @@ class Sightings:
     row_share: FloatArray  # (S, 4) when in the read-out their rows were taken
     log_odds: FloatArray  # (S,) of being markings, by the detector
     symbols: Symbols = NO_SYMBOLS  # of the same images
+    lines: Symbols = NO_SYMBOLS  # pieces of solid lines in them: centre lines for outlines
 
     def __len__(self) -> int:
         return len(self.image)
@@ -197,6 +241,7 @@ def collect_sightings(
         row_share=row_share,
         log_odds=logit(np.clip([marking.score for _, marking in rows], 1e-4, 1 - 1e-4)),
         symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
+        lines=collect_lines(drive, detections, camera_index, frames.frame_of_image),
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)
     if not len(sightings):

@@ -33,7 +33,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array, diags_array, hstack
 from scipy.spatial import cKDTree
 
-from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.sightings import Rig, Sightings, Symbols
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
@@ -573,19 +573,22 @@ class Surface:
         corners = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4), pixels
         flat = known(*corners, self._flat_with_jacobian).reshape(-1, 4, 3, 2)
         jacobian = flat[..., 1:, :]
-        symbols = sightings.symbols
-        if len(symbols.camera):
+
+        def moved(symbols: Symbols) -> Symbols:
+            if not len(symbols.camera):
+                return symbols
             length = [len(outline) for outline in symbols.outlines_pinhole_px]
             of_point = np.repeat(np.arange(len(length)), length)
             outlines = np.concatenate(symbols.outlines_pinhole_px)
             outlines = known(symbols.camera[of_point], symbols.frame[of_point], outlines, self._flat_px)
-            parts = np.split(outlines, np.cumsum(length)[:-1])
-            symbols = replace(symbols, outlines_pinhole_px=tuple(parts))
+            return replace(symbols, outlines_pinhole_px=tuple(np.split(outlines, np.cumsum(length)[:-1])))
+
         return replace(
             sightings,
             corners_pinhole_px=flat[..., 0, :],
             covariance_px=jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2),
-            symbols=symbols,
+            symbols=moved(sightings.symbols),
+            lines=moved(sightings.lines),
         )
 
 

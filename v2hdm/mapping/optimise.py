@@ -25,7 +25,14 @@ from v2hdm.adjust import (
     predicts_better,
     select_model,
 )
-from v2hdm.association.ground import Located, Views, easy_views, images_with_symbol, locate
+from v2hdm.association.ground import (
+    Located,
+    Views,
+    easy_views,
+    images_with_line,
+    images_with_symbol,
+    locate,
+)
 from v2hdm.association.groups import (
     Association,
     attach,
@@ -290,7 +297,8 @@ class Optimiser:
             easy_views=np.bincount(easy[0], minlength=count),
             found=np.bincount(easy[0, found], minlength=count),
             pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
-            as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map),
+            as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
+            + images_with_line(self.sightings.lines, rig, corners_map),
         )
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:

@@ -80,7 +80,7 @@ class Counts:
     easy_views: IntArray  # images with the whole candidate in easy view
     found: IntArray  # of these, where it was found
     pointed: IntArray  # (G, 4) of these, where each corner is a point that agrees
-    as_symbol: IntArray  # images in which a symbol lies on it
+    as_symbol: IntArray  # images in which a symbol lies on it, or a solid line goes on behind it
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
         """The candidates at ``rows``."""

@@ -21,7 +21,7 @@ from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CLUTTER, CORNERS_OF_IMAGE, PART_OF_SYMBOL, Posterior, posterior
 
-OF_SYMBOL = "part of other paint, such as an arrow or a letter"
+OF_SYMBOL = "part of other paint, such as an arrow or a solid line"
 COVERED = "overlaps a better supported marking"
 _CLUTTER_BY = (
     "not shaped like a marking of its class",

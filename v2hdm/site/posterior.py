@@ -75,6 +75,11 @@ _CLUTTER_FOUND = (0.5, 2.0)
 _BARE_FOUND = (0.05, 10.0)
 """Beta distribution of how often bare ground is taken for a given marking: in one view of two hundred."""
 
+_LIKE_CLASS, _LIKE_SHARE = 0.9, 0.2
+"""Share of other paint and of clutter that is shaped like the class it was taken for, of any length, and how
+far its corners lie off, as a share of the breadth: what a detector takes for a class is nearly one to look
+at, and is fitted as one."""
+
 _CLUTTER_REPEATS = 0.7  # probability that clutter which some images have shown is shown by one more
 
 _AGREEING = (0.93, 0.6)  # share of the observations of a marking, and of clutter, that agree with the solve
@@ -165,7 +170,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
         if space.series is not None and number < _PASSES:
             believed = _mixture(hypotheses, joint, paint)
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
-    by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
+    by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER].max(axis=0)
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
     like_others = [one.fit[2] for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
     # A paint error has the tails of Student's t distribution, its square those of Fisher's.
@@ -349,8 +354,9 @@ def _hypotheses(
     own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own
     any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
     space.add(OWN_SHAPE, 1.0, own, any_size)
-    space.add(PART_OF_SYMBOL, 1.0, own, any_size, beside=ragged)
-    space.add(CLUTTER, 1.0, own, any_size + _MISPLACED_M**2 * np.eye(8), beside=ragged)
+    unlike = 1 - _LIKE_CLASS if shapes else 1.0
+    space.add(PART_OF_SYMBOL, unlike, own, any_size, beside=ragged)
+    space.add(CLUTTER, unlike, own, any_size + _MISPLACED_M**2 * np.eye(8), beside=ragged)
     return space
 
 
@@ -383,8 +389,11 @@ def _add_shape(
         space.add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
     _add_pieces(space, part, laid, scatter, ends)
     none = np.zeros(len(candidates))
+    sides_m = np.linalg.norm(np.roll(shape.corners, -1, axis=0) - shape.corners, axis=1)
+    alike = scatter + (_LIKE_SHARE * sides_m.min()) ** 2 * np.eye(8)
     if not shape.is_elongated:
         _add_wrong_ends(space, part, laid, [(1.0, scatter)], ends, [[_NOTHING]] * 4, [none] * 4)
+        _add_alike(space, part, laid, alike, none)
         return none
     worn = [
         ragged + np.sum(end.reshape(-1, 4, 2).any(axis=2) * vague, axis=1) / 2
@@ -400,7 +409,16 @@ def _add_shape(
     for each, one, about in ways:
         _add_wrong_ends(space, each, one, [(1 - other, about), (other, longer)], ends, angles, worn)
     # Of what is no marking any end is as likely ragged as not.
-    return np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
+    ragged = np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
+    _add_alike(space, part, laid, alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter), ragged)
+    return ragged
+
+
+def _add_alike(space: _Space, part: float, laid: Laid, scatter: FloatArray, beside: FloatArray) -> None:
+    """Add other paint and clutter that are shaped like the class."""
+    ragged = scatter + _MISPLACED_M**2 * np.eye(8)
+    for kind, about in ((PART_OF_SYMBOL, scatter), (CLUTTER, ragged)):
+        space.add(kind, part * _LIKE_CLASS, laid, about, beside=beside)
 
 
 def _add_wrong_ends(
