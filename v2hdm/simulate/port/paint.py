@@ -135,7 +135,9 @@ class _Painter:
         for start, end in self._straight_pieces():
             around = np.array([max(start - _PIECE_OVERLAP_M, 0.0), min(end + _PIECE_OVERLAP_M, length_m)])
             turn_rad = float(np.ptp(self.route.yaw_at(around)))
-            stations_m = np.linspace(*around, max(int(np.ceil(turn_rad / _CHORD_TURN_RAD)), 1) + 1)
+            stations_m = np.linspace(
+                around[0], around[1], max(int(np.ceil(turn_rad / _CHORD_TURN_RAD)), 1) + 1
+            )
             self._paint(LANE_LINE, self._ribbon(stations_m, offset_m), worn, seed)
 
     def _straight_pieces(self) -> list[tuple[float, float]]:
