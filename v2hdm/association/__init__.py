@@ -1,1 +1,1 @@
-"""association."""
+"""Detections of one marking, associated across images, cameras and sessions."""

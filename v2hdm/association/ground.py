@@ -1,4 +1,4 @@
-"""Where sightings and symbols lie on the ground under a rig, how certainly, and which images show what."""
+"""Sightings and symbols on the ground under a rig, with covariances, and the images that show a marking."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
 from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
 
-_HORIZON_M2 = 1e4  # variance of a ground point, in its better direction, from which it is on the horizon, m^2
+_HORIZON_M2 = 1e4  # smaller variance of a ground point, m^2, from which it counts as on the horizon
 
 OUTLINE_SIGMA_PX = 2.5
-"""How far the network's outline is from the edge of paint, px: measured on renders, where it is 1 to 3."""
+"""Standard deviation of the network's outline from the edge of paint, px: 1 to 3 on renders."""
 
 _RUN_ON_M = 1.0  # beyond a dash, m, nothing is painted: gaps are at least as long as dashes
 _SURE_M = 0.2  # sigma up to which a point of a line tells on what line it is: a fifth of that
@@ -42,11 +42,11 @@ class Located:
     """Ground positions of S sightings."""
 
     corners_map: FloatArray  # (S, 4, 2) m
-    covariance_m2: FloatArray  # (S, 4, 2, 2) by the pixel noise alone
-    ray_map: FloatArray  # (S, 4, 2) from below the camera to the corner
+    covariance_m2: FloatArray  # (S, 4, 2, 2) from the pixel noise alone
+    ray_map: FloatArray  # (S, 4, 2) from the camera's nadir to the corner
     height_m: FloatArray  # (S,) of the camera
-    valid: BoolArray  # (S, 4) points, without those that miss the ground
-    informs: BoolArray  # (S, 4) all corners that say something, as sightings have them
+    valid: BoolArray  # (S, 4) corners that are points and meet the ground
+    informs: BoolArray  # (S, 4) corners with information, see ``Sightings.informs``
 
     @property
     def range_m(self) -> FloatArray:
@@ -55,7 +55,7 @@ class Located:
 
 
 def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> FloatArray:
-    """Ground points (N, K, 2), m, of pixels (N, K, 2) by IPMs (N, 3, 3); nan at and above the horizon."""
+    """Ground points (N, K, 2), m, of pixels (N, K, 2) under IPMs (N, 3, 3); nan on and above the horizon."""
     points = back_project(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
     return np.asarray(points.numpy())
 
@@ -63,7 +63,7 @@ def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> Fl
 def ground_points_with_jacobian(
     map_from_pinhole_px: FloatArray, pinhole_px: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`ground_points` and their derivatives (N, K, 2, 2), m/px, by the pixels; nan where they are."""
+    """:func:`ground_points` and their Jacobians (N, K, 2, 2), m/px, by the pixels; nan together."""
     found = back_project_with_jacobian(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
     points, jacobian = (one.numpy() for one in found)
     return points, jacobian
@@ -72,7 +72,7 @@ def ground_points_with_jacobian(
 def _on_ground(
     rig: Rig, camera: IntArray, frame: IntArray, pinhole_px: FloatArray, row_share: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`ground_points_with_jacobian` of pixels (N, K, 2), each by the pose at which its row was read."""
+    """:func:`ground_points_with_jacobian` of pixels (N, K, 2), each under the pose at its row's read-out."""
     if rig.read_out_s is None:
         ipms = ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
         return ground_points_with_jacobian(ipms, pinhole_px)
@@ -106,10 +106,9 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
 
 
 def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
-    """In how many images a symbol mostly covers the middle line of each quadrilateral (G, 4, 2).
+    """Number (G,) of images in which a symbol covers most of the middle line of quadrilaterals (G, 4, 2).
 
-    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; others show
-    it whole.
+    The visible shaft of an arrow looks like a dash in some images; others show the whole arrow.
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
     known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
@@ -169,7 +168,7 @@ def _middle_lines(corners_map: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
-    """The outline (K, 2) of each symbol in the map, None where it is vague beside the symbol's length."""
+    """Outline (K, 2) of each symbol in the map, None if too uncertain for the symbol's length."""
     return [
         outline if np.isfinite(outline).all() and 2 * own.max() < np.ptp(outline, axis=0).max() else None
         for outline, own in _pieces_on_ground(symbols, rig)
@@ -177,7 +176,7 @@ def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
 
 
 def _pieces_on_ground(symbols: Symbols, rig: Rig) -> list[tuple[FloatArray, FloatArray]]:
-    """The outline (K, 2) of each symbol in the map, and the sigmas (K,) of its points, m."""
+    """Outline (K, 2) of each symbol in the map, and standard deviations (K,) of its points, m."""
     if not len(symbols.camera):
         return []
     length = [len(outline) for outline in symbols.outlines_pinhole_px]
@@ -193,7 +192,7 @@ def _pieces_on_ground(symbols: Symbols, rig: Rig) -> list[tuple[FloatArray, Floa
 
 @dataclass(frozen=True)
 class Views:
-    """The images of the mapped cameras: ``image`` (V,), ``camera`` (V,) and ``frame`` (V,)."""
+    """Images of the mapped cameras: ``image``, ``camera`` and ``frame``, (V,) each."""
 
     image: IntArray
     camera: IntArray
@@ -201,7 +200,7 @@ class Views:
 
 
 def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
-    """All images that ``cameras`` took, whether anything was detected in them or not."""
+    """All images of ``cameras``, with or without detections."""
     index = {name: c for c, name in enumerate(cameras)}
     rows = [i for i, image in enumerate(drive.images) if image.camera in index]
     return Views(
@@ -214,10 +213,10 @@ def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
 def easy_views(
     views: Views, rig: Rig, cameras: Sequence[Camera], corners_map: FloatArray, within_m: float | None = None
 ) -> tuple[IntArray, IntArray]:
-    """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
+    """Pairs (group, image) with a whole marking (G, 4, 2) inside the region of interest and the image.
 
-    ``cameras`` are the rig's, for image sizes and regions of interest, in whose place ``within_m`` of
-    distance from the camera counts if given; markings (G, 4, 2) with nan corners are in no view.
+    ``within_m``, a distance from the camera, replaces the region of interest of ``cameras``, which are the
+    rig's.
     """
     whole = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
     groups, images = [], []

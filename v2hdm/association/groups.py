@@ -1,9 +1,8 @@
-"""Which sightings belong together, where the groups lie, and groups that turn out to be one marking.
+"""Groups of sightings: their positions, and merging and attaching under a trusted extrinsic.
 
-Tracks break at occlusions and shadows, and each lap and each camera makes its own. Under an extrinsic that
-can be trusted they coincide in the map, up to their covariances. A dash that runs through the image from
-border to border is two lines, which look alike wherever the vehicle is: such sightings are attached last, to
-the one marking of the map that they fit.
+Tracks break at occlusions and shadows, and every lap and camera starts new ones; those of one marking
+coincide in the map, up to their covariances. A dash that crosses the whole image is two parallel lines, which
+look alike along it: such sightings are attached last, to the one marking that fits them.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _LEAST_DEPTH_M = 1.0
-"""Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
+"""Least depth, m, of a corner on a line to be projected: nearer, the line leaves the image steeply."""
 
-LEAST_TOLERANCE_M = 0.05  # how far corners of one shape may deviate, m, however small the marking is
+LEAST_TOLERANCE_M = 0.05  # least tolerance, m, of corners of one shape, for small markings
 
-_CORNER_FLOOR_M = 0.001  # floor of a corner's sigma where groups are fused, m
-_HUBER_SIGMAS = 2.0  # residual in sigmas from which a sighting's weight in its group falls
+_CORNER_FLOOR_M = 0.001  # floor of a corner's standard deviation in fusion, m
+_HUBER_SIGMAS = 2.0  # residual in sigmas beyond which a sighting is down-weighted in its group
 
-_OPEN_END_M = 10.0  # sigma, m, of where along its side a corner is that is no point: markings may be so long
+_OPEN_END_M = 10.0  # standard deviation, m, along its side, of a corner on a line: a marking's length
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,11 @@ class Association:
     """Groups of sightings: tracks of one camera, or markings of the map."""
 
     group: IntArray  # (S,) from 0, -1 for sightings that belong to none
-    shift: IntArray  # (S,) corner c of the group is corner (c + shift) mod 4 of the sighting
-    count: int  # of groups
+    shift: IntArray  # (S,) corner c of the group is the sighting's (c + shift) mod 4
+    count: int  # number of groups
 
     def corner_order(self) -> IntArray:
-        """Which of each sighting's corners is corner c of its group (S, 4)."""
+        """Index (S, 4) of the sighting's corner that is corner c of its group."""
         return np.asarray((np.arange(4) + self.shift[:, None]) % 4)
 
     def in_group_order(self, per_corner: NDArray[_Scalar]) -> NDArray[_Scalar]:
@@ -52,7 +51,7 @@ class Association:
 
 
 def keep_rows(association: Association, rows: BoolArray) -> Association:
-    """The association restricted to the sightings marked in ``rows`` (S,), groups renumbered."""
+    """The association restricted to ``rows`` (S,), groups renumbered."""
     kept = rows & (association.group >= 0)
     numbers, group = np.unique(association.group[kept], return_inverse=True)
     full = np.full(len(association.group), -1, dtype=np.int64)
@@ -61,7 +60,7 @@ def keep_rows(association: Association, rows: BoolArray) -> Association:
 
 
 def same_groups(a: Association, b: Association) -> bool:
-    """Whether ``a`` and ``b`` divide the sightings that both of them group in the same way."""
+    """Whether ``a`` and ``b`` partition the sightings that both group in the same way."""
     common = (a.group >= 0) & (b.group >= 0)
     pairs = len(np.unique(np.stack([a.group[common], b.group[common]]), axis=1).T)
     return pairs == len(np.unique(a.group[common])) == len(np.unique(b.group[common]))
@@ -69,23 +68,23 @@ def same_groups(a: Association, b: Association) -> bool:
 
 @dataclass(frozen=True)
 class FusedGroups:
-    """Where G groups lie; corners of which nothing is known are nan."""
+    """Positions of G groups; unknown corners are nan."""
 
     corners_map: FloatArray  # (G, 4, 2) m
-    covariance_m2: FloatArray  # (G, 4, 2, 2), large along a line that a corner is known to lie on
-    seen: IntArray  # (G, 4) sightings that show a corner as a point
+    covariance_m2: FloatArray  # (G, 4, 2, 2), large along the line of a corner that is no point
+    seen: IntArray  # (G, 4) number of sightings that show the corner as a point
 
     @property
     def valid(self) -> BoolArray:
-        """Which corners (G, 4) were seen as points."""
+        """Corners (G, 4) seen as points."""
         return np.asarray(self.seen > 0)
 
 
 def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
-    """Corners (S, 4) that a sighting knows only across their side, and others of its group as points.
+    """Corners (S, 4) that a sighting has on a line only, while others of its group have them as points.
 
-    Images that other paint, a shadow or the border cut alike are wrong alike: as soon as another image shows
-    the corner, only its line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
+    Images cut alike by other paint, a shadow or the border share one error: once another image shows the
+    corner, only its line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
     """
     grouped = (association.group >= 0)[:, None]
     number = 4 * association.group[:, None] + np.arange(4)
@@ -99,17 +98,17 @@ def known_elsewhere(association: Association, point: BoolArray, informs: BoolArr
 
 
 def line_only(covariance: FloatArray, sigma: float) -> FloatArray:
-    """Covariances (..., 2, 2) whose longer axis is made at least ``sigma`` long."""
+    """Covariances (..., 2, 2) with the standard deviation of the longer axis raised to at least ``sigma``."""
     value, vector = np.linalg.eigh(covariance)
     value[..., 1] = np.maximum(value[..., 1], sigma**2)
     return np.asarray((vector * value[..., None, :]) @ np.swapaxes(vector, -1, -2))
 
 
 def fuse_groups(association: Association, located: Located, jitter_rad: float) -> FusedGroups:
-    """Information-weighted mean of each group's corners, with Huber weights from its own median.
+    """Information-weighted mean of each group's corners, Huber-reweighted about itself.
 
-    A sighting's covariance is that of its pixels plus what ``jitter_rad`` of viewing direction
-    makes of it at its range, so that one far sighting cannot ruin the mean of near ones.
+    Covariances add ``jitter_rad`` of viewing direction to the pixel noise, so that one far sighting cannot
+    spoil the mean of near ones.
     """
     corners = association.in_group_order(located.corners_map)
     grouped = (association.group >= 0)[:, None]
@@ -145,9 +144,9 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
 def in_view(
     association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float
 ) -> BoolArray:
-    """Which corners (S, 4) the adjustment may use: points, and those on lines in front of the camera.
+    """Corners (S, 4) that the adjustment may use: points, and those on lines in front of the camera.
 
-    A dash that passes under the vehicle is cut by the image's border, and its corner behind the camera has no
+    A dash that passes under the vehicle is cut by the image border; its corner behind the camera has no
     projection.
     """
     fused = fuse_groups(association, located, jitter_rad)
@@ -174,21 +173,21 @@ def merge_groups(
 ) -> Association:
     """Merge groups of one class and shape that coincide in the map, nearest pairs first.
 
-    Two groups with a sighting in the same image are two markings and are never merged. Groups coincide within
-    ``gate_sigmas`` and ``max_distance_m``, where ``floor_m`` is added to each position's sigma for what
-    shifts whole groups (extrinsic, RTK drift); ``shape_tolerance`` is the largest deviation of a corner as a
-    fraction of the marking's diameter.
+    Groups with sightings in one image are different markings. Others coincide within ``gate_sigmas`` and
+    ``max_distance_m``; ``floor_m`` is added to each position's sigma for shifts of whole groups (extrinsic,
+    RTK drift). ``shape_tolerance`` is the largest deviation of a corner as a fraction of the marking's
+    diameter.
     """
     usable = np.flatnonzero(fused.valid.sum(axis=1) >= 2)
     centre = np.nanmean(fused.corners_map[usable], axis=1)
-    # Of a drive of a few images the extrinsic is hardly known, and rays may meet the ground nowhere.
+    # In a drive of a few images the extrinsic is poorly known, and rays may miss the ground.
     somewhere = np.isfinite(centre).all(axis=1)
     usable, centre = usable[somewhere], centre[somewhere]
     if not len(usable):
         return association
     kind = group_kinds(association, sightings)
     size_m = diameters(fused.corners_map, fused.valid)
-    # Centres over different valid corners differ by up to half a diameter.
+    # Centres of different valid corners differ by up to half a diameter.
     reach_m = max_distance_m + 0.5 * float(np.max(size_m[usable]))
     a, b = usable[cKDTree(centre).query_pairs(reach_m, output_type="ndarray")].T
     found = align(fused.corners_map[a], fused.valid[a], fused.corners_map[b], fused.valid[b])
@@ -229,18 +228,18 @@ def group_kinds(association: Association, sightings: Sightings) -> IntArray:
 
 
 def _mean_covariance(fused: FusedGroups, groups: IntArray) -> FloatArray:
-    """Mean covariance (P, 2, 2) of the seen corners of ``groups``."""
+    """Mean covariance (P, 2, 2) of the corners of ``groups`` that are points."""
     valid = fused.valid[groups][..., None, None]
     covariance = np.where(valid, fused.covariance_m2[groups], 0.0)
     return np.asarray(covariance.sum(axis=1) / np.maximum(valid.sum(axis=1), 1))
 
 
-_REACH_M = 4.0  # how far, m, a sighting's middle may be from its marking's centre: dashes are up to 6 m long
+_REACH_M = 4.0  # largest distance, m, from a sighting's centre to its marking's: dashes are up to 6 m long
 
 _MOST_SQUARED = 16.0
-"""Squared distance, in sigmas, up to which a sighting fits: four corners on lines have as many freedoms."""
+"""Largest squared Mahalanobis distance of a match: four corners on lines have four degrees of freedom."""
 
-_CLEARER_BY = 9.0  # how much worse any other marking, or order of corners, must fit, in squared sigmas
+_CLEARER_BY = 9.0  # least margin in squared distance to any other marking or corner order
 
 
 def attach(
@@ -251,10 +250,9 @@ def attach(
     fused: FusedGroups,
     jitter_rad: float,
 ) -> Association:
-    """Give each sighting without a group to the one that alone fits it; an image shows a group once.
+    """Attach each ungrouped sighting to the only marking that fits; an image shows a marking once.
 
-    Of the groups only those of four known corners in ``fused`` are looked at; the recorded attitude is off by
-    ``jitter_rad``.
+    Candidates are groups with four known corners in ``fused``; ``jitter_rad`` is the attitude's noise.
     """
     rows = np.flatnonzero((association.group < 0) & (located.informs.sum(axis=1) >= 2))
     whole = np.flatnonzero(fused.valid.all(axis=1))
@@ -282,7 +280,7 @@ def attach(
 def near_pairs(
     located: Located, rows: IntArray, centres_map: FloatArray, reach_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Pairs (P,), (P,) of sightings, out of ``rows``, and places (G, 2) within reach of their middles."""
+    """Pairs (P,), (P,) of sightings, out of ``rows``, and centres (G, 2) within ``reach_m``."""
     informs = located.informs[rows][..., None]
     middle = np.where(informs, located.corners_map[rows], 0.0).sum(axis=1) / informs.sum(axis=1)
     near = cKDTree(centres_map).query_ball_point(middle, reach_m)
@@ -298,9 +296,9 @@ def squared_distances(
     corners_map: FloatArray,
     jitter_rad: float,
 ) -> FloatArray:
-    """Squared distances (P, 4), in sigmas, of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
+    """Squared Mahalanobis distances (P, 4) of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
     camera = sightings.camera[row]
-    # By the pose at which the row of each seen corner was read, where shutters roll.
+    # A rolling shutter reads each corner's row at a pose of its own.
     seen = camera[:, None], sightings.frame[row][:, None], sightings.row_share[row]
     cam_from_map = rig.cam_from_map(*np.broadcast_arrays(*seen))
     expected, depth_m = project_ground(rig.intrinsic[camera][:, None], cam_from_map, corners_map[:, None])

@@ -1,4 +1,4 @@
-"""Detections as one table of arrays, and the rig that took them: every later step works on these."""
+"""Detections of a drive as one table of arrays, and the rig that took them: the input of all later steps."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from v2hdm.records import (
     IntArray,
 )
 
-LEAST_HEIGHT_M = 0.1  # least height of a camera, m, for what divides by it
+LEAST_HEIGHT_M = 0.1  # floor of a camera's height, m, in divisions
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras and frames as the mapping currently believes them to be."""
+    """Present estimate of cameras and frames."""
 
     intrinsic: FloatArray  # (C, 3, 3)
     cam_from_vehicle: FloatArray  # (C, 4, 4)
     map_from_vehicle: FloatArray  # (F, 4, 4)
-    read_out_s: FloatArray | None = None  # (C,) where a camera's shutter rolls
-    twist_vehicle: FloatArray | None = None  # (F, 6) the vehicle's motion then, m/s, rad/s
+    read_out_s: FloatArray | None = None  # (C,), None for global shutters
+    twist_vehicle: FloatArray | None = None  # (F, 6) vehicle velocity, m/s, rad/s
 
     def cam_from_map(
         self, camera: IntArray, frame: IntArray, row_share: FloatArray | None = None
     ) -> FloatArray:
-        """The poses (..., 4, 4) of cameras (...) at frames (...), when rows ``row_share`` (...) are read."""
+        """Poses (..., 4, 4) of cameras (...) at frames (...), at the read-out of rows ``row_share`` (...)."""
         cam_from_vehicle, poses = self.cam_from_vehicle[camera], self.map_from_vehicle[frame]
         if row_share is not None and self.read_out_s is not None and self.twist_vehicle is not None:
             late_s = self.read_out_s[camera] * np.nan_to_num(row_share)
@@ -47,20 +47,20 @@ class Rig:
 
     @property
     def height_m(self) -> FloatArray:
-        """Heights (C,) of the camera centres above the ground of the vehicle."""
+        """Heights (C,), m, of the camera centres above the vehicle's ground."""
         return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], LEAST_HEIGHT_M))
 
 
 def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
-    """When in the read-out the rows of points (..., 2) were taken: -1/2 for the first to 1/2 for the last."""
+    """Read-out time of the rows of points (..., 2): from -1/2 for the first row to 1/2 for the last."""
     return np.asarray(np.clip(points_px[..., 1] / max(info.height - 1, 1), 0.0, 1.0) - 0.5)
 
 
 @dataclass(frozen=True)
 class Symbols:
-    """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines and their row shares, classes.
+    """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines, row shares and classes.
 
-    ``seen`` says which sides, each from its point to the next, lie along an edge of the paint.
+    ``seen`` flags the sides, each from its point to the next, that lie along an edge of the paint.
     """
 
     camera: IntArray
@@ -80,7 +80,7 @@ def collect_symbols(
     camera_index: Mapping[str, int],
     frame_of_image: IntArray,
 ) -> Symbols:
-    """The symbols that the images of some cameras show, lens distortion removed."""
+    """Symbols in the images of some cameras, lens distortion removed."""
     rows = [
         (found.image, marking)
         for found in detections
@@ -136,7 +136,7 @@ def _as_symbols(
 
 @dataclass(frozen=True)
 class Sightings:
-    """S quadrilateral detections of a drive, by image; images taken together share a frame."""
+    """S quadrilateral detections of a drive, by image; simultaneous images share a frame."""
 
     cameras: tuple[str, ...]
     stamp_s: FloatArray  # (F,) distinct times, sorted by visit, then time
@@ -147,11 +147,11 @@ class Sightings:
     kind: IntArray  # (S,) into ``kinds``, the names of the classes
     corners_pinhole_px: FloatArray  # (S, 4, 2)
     covariance_px: FloatArray  # (S, 4, 2, 2), px^2
-    valid: BoolArray  # (S, 4) which are points, small in every direction
+    valid: BoolArray  # (S, 4) corners that are points: small in every direction
     kinds: tuple[str, ...]
     visit: IntArray  # (F,) as in ``Image.visit``
-    row_share: FloatArray  # (S, 4) when in the read-out their rows were taken
-    log_odds: FloatArray  # (S,) of being markings, by the detector
+    row_share: FloatArray  # (S, 4) read-out time of the corners' rows, see :func:`row_shares`
+    log_odds: FloatArray  # (S,) log-odds of being a marking, from the detector
     symbols: Symbols = NO_SYMBOLS  # of the same images
     lines: Symbols = NO_SYMBOLS  # pieces of solid lines in them: centre lines for outlines
 
@@ -160,7 +160,7 @@ class Sightings:
 
     @property
     def informs(self) -> BoolArray:
-        """Which corners (S, 4) have a place and a covariance: each weighs what that says, points or not."""
+        """Corners (S, 4) with a position and a covariance, points or not: both weigh by their information."""
         finite = np.isfinite(self.covariance_px).all(axis=(2, 3))
         return np.asarray(finite & np.isfinite(self.corners_pinhole_px).all(axis=2))
 
@@ -173,7 +173,7 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Frames:
-    """Distinct times of visits and the recorded poses then, (F,) each, indexed by ``frame_of_image`` (I,)."""
+    """Distinct times of sessions and the recorded poses, (F,) each, indexed by ``frame_of_image`` (I,)."""
 
     frame_of_image: IntArray
     visit: IntArray
@@ -182,7 +182,7 @@ class Frames:
 
 
 def frames_of(drive: Drive) -> Frames:
-    """Number the distinct times of ``drive``; images of one visit that were taken together share a frame."""
+    """Number the distinct times of ``drive``; simultaneous images of one session share a frame."""
     taken = np.array([(image.visit, image.taken_s) for image in drive.images])
     distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
@@ -193,9 +193,9 @@ def frames_of(drive: Drive) -> Frames:
 def collect_sightings(
     drive: Drive, detections: Sequence[ImageDetections], cameras: Sequence[str]
 ) -> Sightings:
-    """Put the quadrilateral detections of ``cameras`` into one table, lens distortion removed.
+    """Quadrilateral detections of ``cameras`` in one table, lens distortion removed.
 
-    Raises MappingError where the drive has no such camera, or its images hold no usable marking.
+    Raises MappingError for an unknown camera, or if its images hold no usable marking.
     """
     infos = [camera_of(drive, name).info for name in cameras]
     camera_index, frames = {name: c for c, name in enumerate(cameras)}, frames_of(drive)
@@ -250,7 +250,7 @@ def collect_sightings(
 
 
 def camera_of(drive: Drive, name: str) -> Camera:
-    """The camera ``name`` of ``drive``; raises MappingError where there is none."""
+    """The camera ``name`` of ``drive``; raises MappingError if unknown."""
     if name not in drive.cameras:
         known = ", ".join(drive.cameras)
         raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")
@@ -260,7 +260,7 @@ def camera_of(drive: Drive, name: str) -> Camera:
 def _undistort(
     info: CameraInfo, corners_px: FloatArray, covariance_px: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners (S, 4, 2) and covariances (S, 4, 2, 2) moved from recorded to pinhole pixels."""
+    """Corners (S, 4, 2) and covariances (S, 4, 2, 2) from recorded to pinhole pixels."""
     if not has_distortion(info):
         return corners_px, covariance_px
     step_px = 0.5

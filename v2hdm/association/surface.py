@@ -1,22 +1,20 @@
-r"""The ground where it is no plane: its heights along and beside the path, and pixels as of a plane.
+r"""Ground that is not a plane: heights along and beside the path, and sightings reduced to the plane.
 
-Everything else of the mapping knows the plane z = 0 on which the vehicle stands. The ground's height at the
-way s along the path, d to its left, is
+The rest of the mapping assumes the plane z = 0 under the vehicle. At arc length s along the path and offset
+d to its left, the ground's height is
 
 .. math:: H(s, d) = g x(s, d) - a_0 |d| - \sum_k a_k \max(0, \pm d - d_k) + \sum_{ij} c_{ij} B_i(s) B_j(d),
 
-a grade of the whole map, a cross-section alike along the route, whose slopes change at the path and at
-knots beside it (a crown), and a bicubic spline: bank, ramps, crests and dips. The grade stands apart: where
-the path begins to bend, a plane has a kink in s. Of the priors, slopes a are 0 +- 3 %; second differences of
-c along, across and both ways have a standard deviation each, estimated from the drive by its marginal
-likelihood, so that a plane is what is left where nothing speaks against it; on the path heights and slopes
-are the recorded ones (:mod:`v2hdm.io.drive.road`), within their noise.
+a grade g of the whole map, a cross-section whose slopes change at the path and at knots beside it (a crown),
+and a bicubic spline: bank, ramps, crests and dips. The grade is a term of its own, as a plane has a kink in s
+where the path begins to bend. Priors: slopes a are 0 +- 3 %; second differences of c along, across and mixed
+have one standard deviation each, estimated by marginal likelihood, so that without evidence the ground is a
+plane; heights and slopes on the path are the recorded ones (:mod:`v2hdm.io.drive.road`) within their noise.
 
-A frame sees heights above the plane on which the vehicle stands there, which touches H: planes are none of
-it.
-So that no engine, association or lane fit has to know of H, pixels are moved to where the image would show
-the same place of the map on that plane (:meth:`Surface.flattened`), covariances with them. Under the
-poses by which they are moved, a corner then fits its pixels exactly where its point on the ground does.
+A frame sees heights above the plane on which its vehicle stands, which touches H: planes drop out. Pixels and
+their covariances are moved to where the image would show the same map point on that plane
+(:meth:`Surface.flattened`), so that engines, association and lane fits need not know H. Under the poses of
+that reduction a corner fits its pixels exactly where its ground point does.
 """
 
 from __future__ import annotations
@@ -40,8 +38,8 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
 
 KNOTS_M = (1.75, 3.5, 5.25)
-"""Where beside the path the slope may change: every half lane of 3.5 m. A crown lies along a lane line, half
-a lane or one and a half from the middle of the vehicle's own; one elsewhere is smoothed by 2 cm at most."""
+"""Offsets from the path at which the slope may change: every half lane of 3.5 m. A crown follows a lane line;
+one elsewhere is smoothed by 2 cm at most."""
 
 _SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
@@ -52,28 +50,28 @@ _GRADE_SIGMA = 0.1
 
 _GRADES, _HINGES = 2, 1 + 2 * len(KNOTS_M)
 _SHAPE = _GRADES + _HINGES  # parameters before the spline's
-_ALONG_M, _ACROSS_M = 6.0, 5.0  # between the spline's knots: a third of a camera's reach, a lane with margins
+_ALONG_M, _ACROSS_M = 6.0, 5.0  # knot spacing of the spline: a third of a camera's range, a lane with margins
 
-_GRID_M, _STRIP_M = 0.5, 8.0  # of the ground as it is written: its grid, and how far to either side it goes
-_SIDE_M = 12.5  # ground farther beside the path is as high as there, but for the grade
+_GRID_M, _STRIP_M = 0.5, 8.0  # grid and half width of the ground as written
+_SIDE_M = 12.5  # farther beside the path the ground continues at this height, except for the grade
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
-_MOST_ALONG = 120  # knots along the route; on longer ones they lie farther apart
+_MOST_ALONG = 120  # largest number of knots along the route; longer routes have wider spacing
 _WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
 
-_CURVATURE = 1e-3  # usual second differences, 1/m: a crest of 1 km radius, a bank that changes by 1 % in 10 m
-_SIZES = 2.0  # standard deviation of the logarithm of their size, over all roads
+_CURVATURE = 1e-3  # typical second difference, 1/m: a crest of 1 km radius, bank changing by 1 % in 10 m
+_SIZES = 2.0  # standard deviation of their logarithm, over all roads
 
-_STATION_M = 1.0  # nearer frames are one place of the path: a vehicle that stands drives none in its noise
-_AHEAD_M = 30.0  # beyond this way, ahead or behind, the path is another time's
-_REACH_M = 40.0  # ground farther from the camera stays as it is: H is known beside the path alone
-_TURN_M = 10.0  # by which places count as apart for a heading that differs by a radian
-_STEPS = 12  # of the secant method, where four to six are enough
-_SURE_M = 1e-7  # of its end
-_STEP_PX, _TOUCH_M = 0.5, 0.01  # of the differences by pixel, and of heights by place
-_LEAN = (0.003, 1e4)  # of a sensor's roll on the vehicle, which only turns tell from the road's, all the way
-_MOST_RECORDED = 500  # places of the path whose records are taken, evenly
-_FORGOTTEN = 1e-2  # share of the variance of all heights that is left out with the many errors that are small
-_RIDGE_M = 30.0  # heights above the mean that roads do not exceed within a drive's reach of them, say
+_STATION_M = 1.0  # least distance of places on the path: the noise of a standing vehicle is no motion
+_AHEAD_M = 30.0  # range along the path that a frame may see; beyond, the route may pass again
+_REACH_M = 40.0  # ground farther from the camera is not corrected: H is known near the path alone
+_TURN_M = 10.0  # distance that a heading difference of 1 rad counts as
+_STEPS = 12  # of the secant method; four to six suffice
+_SURE_M = 1e-7  # its tolerance
+_STEP_PX, _TOUCH_M = 0.5, 0.01  # finite differences: by pixel, and of heights by position
+_LEAN = (0.003, 1e4)  # roll of the sensor on the vehicle, constant: only turns separate it from bank
+_MOST_RECORDED = 500  # largest number of evenly spaced path points whose records are used
+_FORGOTTEN = 1e-2  # fraction of the total height variance that is dropped with the smallest errors
+_RIDGE_M = 30.0  # standard deviation of the spline's coefficients: keeps the information matrix regular
 
 Heights = Callable[[FloatArray], FloatArray]
 """Heights (K,) at points (K, 2)."""
@@ -81,23 +79,22 @@ Heights = Callable[[FloatArray], FloatArray]
 FILE = "ground.json"  # in a result folder
 
 _STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")
-"""Of the paths; their frames are another matter."""
+"""Fields of the paths that are stored; frames are assigned on reading."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The heights and slopes recorded on the path; errors are sums of processes: sigma, way to fade."""
+    """Heights and slopes recorded on the path, with errors that are sums of correlated processes."""
 
-    road: Road | None  # None where it is level
-    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)  # m, m
-    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)  # 1, m
+    road: Road | None  # None on a level road
+    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)  # sigma, m, and correlation length, m
+    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)  # sigma, and correlation length, m
 
     @classmethod
     def of(cls, road: Road | None, noise: PoseNoise) -> Recorded:
-        """Of a drive: satellite heights are half again as uncertain as positions; level ground is a guess.
+        """From a drive: GNSS heights are 1.5 times as uncertain as positions; a level road is a weak guess.
 
-        The road's heights and slopes are means over ten metres: of what scatters from pose to pose, a third
-        is left.
+        The road's heights and slopes are means over 10 m, which leaves a third of the poses' white noise.
         """
         if road is None:
             return cls(None)
@@ -107,7 +104,7 @@ class Recorded:
         return cls(road, heights, ((0.004, 10.0),))
 
     def at(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Heights (N,) and slopes (N, 2) by map x and y at points (N, 2) of the path."""
+        """Heights (N,) and slopes (N, 2) along map x and y at points (N, 2) of the path."""
         if self.road is None:
             return np.zeros(len(points_map)), np.zeros((len(points_map), 2))
         _, near = cKDTree(self.road.points_map).query(points_map)
@@ -117,21 +114,21 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Paths:
-    """The paths of a drive's visits through F frames."""
+    """The paths of a drive's sessions through F frames."""
 
-    place: IntArray  # (F,) the place, of N, that each frame is at
+    place: IntArray  # (F,) index of each frame's place, of N
     points_map: FloatArray  # (N, 2) m
     ahead: FloatArray  # (N, 2) unit vectors of the vehicle's heading
-    sense: FloatArray  # (N,) 1 where it drives that way, -1 backwards
-    station_m: FloatArray  # (N,) the way, rising with it, through one visit after the other
-    bounds_m: FloatArray  # (F, 2) stations between which a frame's ground is looked for
-    position_map: FloatArray  # (F, 2) m, of the vehicle
+    sense: FloatArray  # (N,) 1 when driving forwards, -1 backwards
+    station_m: FloatArray  # (N,) arc length, continued from session to session
+    bounds_m: FloatArray  # (F, 2) range of stations that a frame may see
+    position_map: FloatArray  # (F, 2) m, the vehicle's
     heading: FloatArray  # (F, 2) unit vectors
-    visit_ends: FloatArray  # (V, 2) stations at which each visit begins and ends
+    visit_ends: FloatArray  # (V, 2) stations of each session's begin and end
 
     @classmethod
     def of(cls, map_from_vehicle: FloatArray, visit: IntArray) -> Paths:
-        """Of poses (F, 4, 4) of the frames of visits (F,), each in driving order."""
+        """Paths of poses (F, 4, 4) of sessions (F,), each in driving order."""
         points, first = map_from_vehicle[:, :2, 3], [0]
         for frame in range(1, len(points)):
             last = first[-1]
@@ -142,10 +139,10 @@ class Paths:
         place = np.cumsum(place)
         at, ahead = points[first], map_from_vehicle[first][:, :2, 0]
         step, begins = np.diff(at, axis=0), np.append(True, np.diff(visit[first]) != 0)
-        # Visits lie apart, so that none reaches into the ground of the next.
+        # A gap between sessions keeps each out of the ground of the next.
         way_m = np.where(begins[1:], 2 * _AHEAD_M, np.linalg.norm(step, axis=1))
         station = np.concatenate([[0.0], np.cumsum(way_m)])
-        # The step that a place ends has its sense, or where a visit begins the one that follows.
+        # A place has the sense of the step before it, at a session's start of the step after it.
         forwards = np.where(np.einsum("ni,ni->n", step, ahead[1:]) < 0, -1.0, 1.0)
         sense = np.where(begins, np.append(forwards, 1.0), np.append(1.0, forwards))
         span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
@@ -159,10 +156,7 @@ class Paths:
         )
 
     def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
-        """The stations of points (K, 2) on the path near frames (K,), and how far (K,) they lie to the left.
-
-        Beyond the path's ends it goes on straight.
-        """
+        """Stations (K,) and left offsets (K,), m, of points (K, 2) near frames (K,)."""
         station, bounds = self.station_m[self.place[frame]], self.bounds_m[frame].T
         for _ in range(4):
             at, ahead, sense = self.at(station)
@@ -174,7 +168,7 @@ class Paths:
         return station + beyond, cross(ahead, off)
 
     def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points (K, 2) of the path at stations (K,), unit vectors of the heading there, and its sense."""
+        """Points (K, 2), unit headings (K, 2) and senses (K,) of the path at stations (K,)."""
         columns, last = np.hstack([self.points_map, self.ahead]), len(self.station_m) - 1
         near = np.searchsorted(self.station_m, station_m).clip(max=last)
         before = np.maximum(near - 1, 0)
@@ -185,17 +179,17 @@ class Paths:
         return at[:, :2], ahead, self.sense[near]
 
     def places(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Points (K, 2) of the map at stations (K,), to the left (K,); the path goes on beyond its ends."""
+        """Map points (K, 2) at stations (K,) and left offsets (K,); straight beyond the ends."""
         at, ahead, sense = self.at(station_m)
         beyond = sense * (station_m - np.clip(station_m, *self.station_m[[0, -1]]))
         left = turned_left(ahead)
         return np.asarray(at + beyond[:, None] * ahead + left_m[:, None] * left)
 
     def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
-        """The same paths with the frames of vehicles at poses (F, 4, 4), in any order."""
+        """The same paths for frames at poses (F, 4, 4), in any order."""
         position, ahead = map_from_vehicle[:, :2, 3], map_from_vehicle[:, :2, 0]
         ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-        # Where a route crosses itself, the place that was passed in this direction.
+        # Where a route crosses itself, the place passed in this direction.
         passed = cKDTree(np.hstack([self.points_map, _TURN_M * self.ahead]))
         _, place = passed.query(np.hstack([position, _TURN_M * ahead]))
         station = self.station_m[place]
@@ -210,14 +204,14 @@ class Paths:
 
 
 def _hinges(left_m: FloatArray) -> FloatArray:
-    """The heights (K, B) that a unit of each slope of a cross-section gives to points (K,) to the left."""
+    """Heights (K, B) at left offsets (K,) per unit of each slope of the cross-section."""
     left_m = np.clip(left_m, -_SIDE_M, _SIDE_M)
     sides = [np.maximum(side * left_m - knot, 0.0) for side in (1.0, -1.0) for knot in KNOTS_M]
     return -np.column_stack([np.abs(left_m), *sides])
 
 
 def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntArray, FloatArray]:
-    """The four of ``count`` uniform cubic B-splines (K, 4) that places (K,) lie in, with their values."""
+    """Indices and values (K, 4) of the four of ``count`` uniform cubic B-splines that cover ``at`` (K,)."""
     within = np.clip(at, first, first + (count - 3 - 1e-9) * step)
     knots = first + step * np.arange(-3.0, count + 1)
     design = BSpline.design_matrix(within, knots, 3)
@@ -229,21 +223,19 @@ class Surface:
     """The ground along the ``paths``."""
 
     paths: Paths  # of the visits
-    # (B,) g, then the slopes a, left ones first, then c, across within along
-    parameters: FloatArray
-    covariance: FloatArray  # (B, B) of them
-    # the spline's first along the way, m, the way between two, m, and how many functions they make
-    knots: tuple[float, float, int]
-    datum_m: float = 0.0  # what is added to all heights
+    parameters: FloatArray  # (B,) grade g, slopes a, left ones first, then c, across varying fastest
+    covariance: FloatArray  # (B, B) of the parameters
+    knots: tuple[float, float, int]  # along the path: first and spacing, m, and number of functions
+    datum_m: float = 0.0  # added to all heights
     _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Lay the plane on which the vehicle stands at each frame."""
+        """Cache the plane of each frame's vehicle."""
         object.__setattr__(self, "_stands", tuple(one @ self.parameters for one in self._footprints()))
 
     @classmethod
     def level(cls, paths: Paths) -> Surface:
-        """A plane, to begin with."""
+        """A plane, the start value."""
         begin_m, end_m = (paths.station_m[[0, -1]] + [-_AHEAD_M, _AHEAD_M]).tolist()
         step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
         along = int(np.ceil((end_m - begin_m) / step_m)) + 3
@@ -251,7 +243,7 @@ class Surface:
         return cls(paths, np.zeros(size), np.zeros((size, size)), (begin_m, step_m, along))
 
     def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
-        """The derivative (K, B) by the parameters of heights at stations (K,), to the left (K,)."""
+        """Jacobian (K, B) by the parameters of heights at stations (K,) and left offsets (K,)."""
         i, by_way = _cubic(station_m, *self.knots)
         j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
         index = (i[:, :, None] * _ACROSS + j[:, None, :]).reshape(-1)
@@ -262,18 +254,18 @@ class Surface:
         return csr_array(hstack([csr_array(shape), spline]))
 
     def _off_middle(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Map x and y (K, 2) of places at stations (K,), to the left (K,), from the middle of the path."""
+        """Map x and y (K, 2), from the path's mean point, at stations (K,) and left offsets (K,)."""
         return np.asarray(self.paths.places(station_m, left_m) - self.paths.points_map.mean(axis=0))
 
     def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
-        """Height, slope along the heading and to the left (F, B each) of frames' planes by the parameters.
+        """Jacobians (F, B) by the parameters of the height and slopes, ahead and left, of frames' planes.
 
-        A plane touches the ground under the wheels: on a crown its origin is lower than the ground there.
+        A plane touches the ground under the wheels: on a crown its origin lies below the ground.
         """
         paths, (long, wide) = self.paths, _WHEELS_M
         frame, ahead = np.arange(len(paths.place)), paths.heading
         left = turned_left(ahead)
-        # In a bend the front wheels are beside the path that the rear axle takes.
+        # In a bend the front wheels leave the path of the rear axle.
         (right_rear, left_rear), (right_front, left_front) = (
             [self._columns(*paths.beside(paths.position_map + along * ahead + side * left, frame))
              for side in (-wide, wide)]
@@ -284,15 +276,15 @@ class Surface:
         return rear, (front - rear) / long, sideways
 
     def _from(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
-        """Points (K, 2) ahead and to the left of the vehicle at frames (K,), m."""
+        """Forward and left offsets (K, 2), m, of points (K, 2) from the vehicle at frames (K,)."""
         off, ahead = points_map - self.paths.position_map[frame], self.paths.heading[frame]
         forwards = np.einsum("ki,ki->k", off, ahead)
         return np.column_stack([forwards, cross(ahead, off)])
 
     def _leaning(self, points_map: FloatArray, above_m: FloatArray, frame: IntArray) -> FloatArray:
-        """How far (K, 2) from their places on the map points (K, 2), at heights (K,), are on frames' planes.
+        """Horizontal shifts (K, 2) of map points (K, 2), at heights (K,), on inclined planes at frames (K,).
 
-        Ways along a slope are longer than on the map by half of its square, and what rises from it leans.
+        A length along a slope exceeds its map length by half the slope squared; heights lean with the plane.
         """
         forwards, sideways = (one[frame] for one in self._stands[1:])
         (along, across), ahead = self._from(points_map, frame).T, self.paths.heading[frame]
@@ -302,7 +294,7 @@ class Surface:
         return np.asarray(by_along[:, None] * ahead + by_across[:, None] * left)
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
-        """The derivative (K, B) of :meth:`seen_height_m` by the parameters."""
+        """Jacobian (K, B) of :meth:`seen_height_m` by the parameters."""
         stands, away = self._footprints(), self._from(points_map, frame)
         plane = stands[0][frame]
         for axis in (0, 1):
@@ -310,7 +302,7 @@ class Surface:
         return csr_array(self._columns(*self.paths.beside(points_map, frame)) - plane)
 
     def seen_errors_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
-        """Independent errors (K, B), one sigma each, of :meth:`seen_height_m`: those that matter of them."""
+        """Independent errors (K, B) of :meth:`seen_height_m`, one sigma each, the largest alone."""
         values, vectors = np.linalg.eigh(self.covariance)
         errors = self.seen_columns(points_map, frame) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         squared, ways = np.linalg.eigh(errors.T @ errors)
@@ -318,13 +310,13 @@ class Surface:
         return np.asarray(errors @ ways[:, rest])
 
     def seen_height_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
-        """Heights (K,) of the ground at points (K, 2) above the planes that frames (K,) stand on."""
+        """Heights (K,) of the ground at points (K, 2) above the planes of the vehicle at frames (K,)."""
         away, (height, forwards, sideways) = self._from(points_map, frame), self._stands
         plane = height[frame] + away[:, 0] * forwards[frame] + away[:, 1] * sideways[frame]
         return np.asarray(self._height_m(*self.paths.beside(points_map, frame)) - plane)
 
     def _height_m(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Heights (K,) at stations (K,), to the left (K,)."""
+        """Heights (K,) at stations (K,) and left offsets (K,)."""
         i, by_way = _cubic(station_m, *self.knots)
         j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
         around = self.parameters[_SHAPE:].reshape(-1, _ACROSS)[i[:, :, None], j[:, None, :]]
@@ -342,14 +334,11 @@ class Surface:
         return columns @ self.parameters + self.datum_m, np.sqrt(np.maximum(variance, 0.0))
 
     def seen_from(self, map_from_vehicle: FloatArray) -> Surface:
-        """The same ground for what vehicles at poses (F, 4, 4) on the flat road see of it."""
+        """The same ground for frames at poses (F, 4, 4) on the flat road."""
         return replace(self, paths=self.paths.seen_from(map_from_vehicle))
 
     def on_plane(self, points_map: FloatArray, cam_from_map: FloatArray, frame: int) -> FloatArray:
-        """Points (K, 2) of the plane z = 0 that are seen where the ground's points (K, 2) are.
-
-        By a camera at ``cam_from_map`` (4, 4) at a frame; the other way round than :meth:`flattened_px`.
-        """
+        """Points (K, 2) of z = 0 on a camera's rays to the ground's (K, 2): inverts :meth:`flattened_px`."""
         height_m = self.seen_height_m(points_map, np.full(len(points_map), frame))
         centre = camera_centre(cam_from_map)
         place, frames = points_map, np.full(len(points_map), frame)
@@ -360,14 +349,14 @@ class Surface:
         return points_map + off * np.where(known, height_m / (centre[2] - height_m), 0.0)[:, None]
 
     def stored(self) -> dict[str, Any]:
-        """The content of a file for :meth:`from_stored`, without the covariance."""
+        """File content for :meth:`from_stored`, without the covariance."""
         arrays = {name: getattr(self.paths, name).tolist() for name in _STORED}
         parameters = {"parameters": self.parameters.tolist(), "knots": self.knots, "datum_m": self.datum_m}
         return arrays | parameters
 
     @classmethod
     def from_stored(cls, content: Mapping[str, Any], map_from_vehicle: FloatArray) -> Surface:
-        """The ground under vehicles at poses (F, 4, 4); raises ValueError where anything is missing."""
+        """The ground under vehicles at poses (F, 4, 4); raises ValueError if unusable."""
         try:
             points, ahead, sense, station, ends, parameters = (
                 np.array(content[name], dtype=np.float64) for name in (*_STORED, "parameters")
@@ -390,7 +379,7 @@ class Surface:
         return cls(paths.seen_from(map_from_vehicle), parameters, unknown, knots, datum_m)
 
     def strips(self) -> tuple[GroundStrip, ...]:
-        """The ground by session, half a metre to half a metre."""
+        """The ground by session, on a grid of 0.5 m."""
         paths, out = self.paths, []
         left_m = np.arange(-_STRIP_M, _STRIP_M + _GRID_M / 2, _GRID_M)
         for begin_m, end_m in paths.visit_ends.tolist():
@@ -406,7 +395,7 @@ class Surface:
 
     @property
     def sentence(self) -> str:
-        """One sentence on the heights of the ground."""
+        """One sentence on the range of the ground's heights."""
         at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
         left, told = turned_left(ahead), []
         for away, where in (
@@ -421,10 +410,10 @@ class Surface:
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded
     ) -> tuple[Surface, float]:
-        """The surface that a drive makes likeliest, and its gain: how far the cost falls, less noise's share.
+        """Maximum a posteriori surface of a drive, and its gain: the fall of the cost beyond that by noise.
 
-        ``information`` (B, B) is on the parameters, all else being estimated with them, ``score`` (B,) the
-        gradient of the cost by them, where they are now.
+        ``information`` (B, B) and ``score`` (B,), the cost's gradient, hold at the present parameters, all
+        else eliminated.
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score
@@ -450,7 +439,7 @@ class Surface:
         return found, float(gain)
 
     def _smoothness(self, sizes: FloatArray) -> FloatArray:
-        """The prior's information (B, B), by the logarithms of the sizes (3,) of second differences."""
+        """Prior information (B, B) for log standard deviations (3,) of the second differences."""
         _, step_m, along = self.knots
         ways = [[np.eye(n), np.diff(np.eye(n), axis=0) / h, np.diff(np.eye(n), 2, axis=0) / h**2]
                 for n, h in ((along, step_m), (_ACROSS, _ACROSS_M))]  # fmt: skip
@@ -462,7 +451,7 @@ class Surface:
         return np.asarray(block_diag(np.diag(slopes**-2), spline))
 
     def _recorded(self, recorded: Recorded) -> tuple[FloatArray, FloatArray, float]:
-        """Information (B, B) of what was recorded on the path, that times its values, and the mean height."""
+        """Information (B, B) and information vector (B,) of the records on the path, and mean height, m."""
         size = len(self.parameters)
         frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
         height, slope = recorded.at(self.paths.position_map[frame])
@@ -486,9 +475,9 @@ class Surface:
     def _meet(
         self, view: _View, frame: IntArray, pixels: FloatArray, seen_height_m: Heights
     ) -> tuple[FloatArray, BoolArray]:
-        """Points (K, 2) of the ground of these heights that pixels (K, 2) show, and which (K,) show it.
+        """Ground points (K, 2), for ground of these heights, at pixels (K, 2), and whether (K,) they exist.
 
-        Rays that meet it nowhere, or far away, stay on the plane.
+        Rays that miss the ground, or meet it far away, keep their point of the plane.
         """
         rays, centre_map = view.rays(pixels), view.centre
         with np.errstate(all="ignore"):
@@ -522,10 +511,7 @@ class Surface:
     def flattened_px(
         self, intrinsic: FloatArray, cam_from_map: FloatArray, frame: IntArray, pixels: FloatArray
     ) -> FloatArray:
-        """Where images would show on the plane what they show at pinhole ``pixels`` (K, 2) of the ground.
-
-        Each is of a camera ``intrinsic`` (K, 3, 3) at ``cam_from_map`` (K, 4, 4), taken at ``frame`` (K,).
-        """
+        """Pinhole ``pixels`` (K, 2), each with its camera and frame, as if their ground were z = 0."""
         return self._flat_px(_View(intrinsic, cam_from_map), frame, pixels)
 
     def _flat_px(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
@@ -533,7 +519,7 @@ class Surface:
         return np.where(found[:, None], view.on_plane_px(points, found), pixels)
 
     def _shown(self, view: _View, frame: IntArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """The ground's points (K, 2) at pixels (K, 2), and which (K,) show it."""
+        """Ground points (K, 2) at pixels (K, 2), and whether (K,) they exist."""
         return self._meet(view, frame, pixels, partial(self.seen_height_m, frame=frame))
 
     def _flat_with_jacobian(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
@@ -556,13 +542,13 @@ class Surface:
         return np.concatenate([flat[:, None], np.stack(columns, axis=2) / (2 * _STEP_PX)], axis=1)
 
     def flattened(self, sightings: Sightings, rig: Rig) -> Sightings:
-        """``sightings`` as if all that they show lay on the plane z = 0, under the cameras of ``rig``."""
+        """``sightings`` as if all paint lay on the plane z = 0, under the cameras of ``rig``."""
         pixels = sightings.corners_pinhole_px.reshape(-1, 2)
 
         def known(
             camera: IntArray, frame: IntArray, pixels: FloatArray, of: Callable[..., FloatArray]
         ) -> FloatArray:
-            """``of`` the pixels (N, 2) that are known, else nan."""
+            """``of`` the finite pixels (N, 2), nan for others."""
             seen = np.isfinite(pixels).all(axis=1)
             camera, frame = camera[seen], frame[seen]
             found = of(_View(rig.intrinsic[camera], rig.cam_from_map(camera, frame)), frame, pixels[seen])
@@ -606,6 +592,6 @@ class _View:
         return np.asarray((self._map_from_px @ homogeneous[..., None])[..., 0])
 
     def on_plane_px(self, points_map: FloatArray, found: BoolArray) -> FloatArray:
-        """Where points (K, 2) of the plane are seen; meaningless where not ``found``."""
+        """Pixels (K, 2) of points (K, 2) of the plane; meaningless unless ``found``."""
         shown = np.where(found[:, None], points_map, 0.0)
         return np.asarray(apply_homography(self._px_from_plane, shown[:, None])[:, 0])

@@ -1,8 +1,8 @@
 """Sightings of one marking, linked from image to image of one camera.
 
-A wrong IPM puts every marking in the wrong place, metres off at range, but in nearly the same wrong
-place in two consecutive images. So sightings are first linked along the drive, with a gate that
-grows with the motion between the images, and only later compared across gaps, laps and cameras.
+A wrong IPM displaces every marking, by metres at range, but nearly equally in consecutive images. Sightings
+are therefore linked along the drive first, with a gate that grows with the motion between images, and
+compared across gaps, laps and cameras later.
 """
 
 from __future__ import annotations
@@ -20,23 +20,22 @@ from v2hdm.geometry.planar import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
-IPM_SIGMA_RAD = 0.015  # of the direction of an initial IPM: how far markings may seem to move between images
-REFINED_SIGMA_RAD = 0.002  # of the same once the extrinsic has been optimised
+IPM_SIGMA_RAD = 0.015  # direction error of an initial IPM: markings may seem to move between images
+REFINED_SIGMA_RAD = 0.002  # the same once the extrinsic has been optimised
 GATE_SIGMAS, MAX_GATE_M = 4.0, 1.5  # size of every gate, and its limit
-SHAPE_TOLERANCE = 0.25  # of corners, from another sighting of the same shape, as a share of its diameter
+SHAPE_TOLERANCE = 0.25  # corner deviation of sightings of one shape, as a fraction of the marking's diameter
 LEAST_SIGHTINGS = 3
-"""Images that must show a marking where nothing else is weighed: in the naive methods, and of a track before
-the incremental map takes it up."""
+"""Sightings required of a marking by the naive methods, and of a track by the incremental map."""
 
-_MAX_GAP_M = 4.0  # of travel that a track survives without a sighting
-_REFUSED = 1e9  # cost of a pair that the assignment must not make
+_MAX_GAP_M = 4.0  # largest travel without a sighting within a track
+_REFUSED = 1e9  # cost of a forbidden pair in the assignment
 _POSITION_FLOOR_M = 0.02
-"""Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
+"""Floor of a sighting's sigma, m: keeps the gate open where the stated noise is nil."""
 
 
 @dataclass
 class _Track:
-    """The latest state of one track: ``row`` of its last sighting, corners in the track's order."""
+    """Latest state of a track: ``row`` of its last sighting, corners in the track's order."""
 
     number: int
     row: int
@@ -44,7 +43,7 @@ class _Track:
     valid: BoolArray
 
     def extend(self, row: int, shift: int, located: Located) -> None:
-        """Take in the sighting at ``row``, whose corners are ``shift`` behind the track's."""
+        """Append the sighting at ``row``, whose corners are ``shift`` behind the track's."""
         valid = located.valid[row][SHIFTS[shift]]
         self.corners_map[valid] = located.corners_map[row][SHIFTS[shift]][valid]
         self.valid |= valid
@@ -54,11 +53,10 @@ class _Track:
 def build_tracks(
     sightings: Sightings, located: Located, rig: Rig, direction_rad: float, noise: PoseNoise
 ) -> Association:
-    """Link the ``sightings``, in image order and ``located`` under ``rig``, by camera and visit.
+    """Link the ``sightings``, in image order and ``located`` under ``rig``, by camera and session.
 
-    ``direction_rad`` is how far an extrinsic is off, ``noise`` how far poses are. A sighting continues at
-    most one track and a track takes at most one sighting of an image; with fewer than two valid corners it
-    has none.
+    ``direction_rad`` is the extrinsic's error, ``noise`` that of poses. Tracks and sightings of an image are
+    assigned one to one; sightings need two valid corners.
     """
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
@@ -113,14 +111,14 @@ class _Linker:
         return bool(self._sightings.visit[now] == self._sightings.visit[last] and gap_m <= _MAX_GAP_M)
 
     def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
-        """For each row that continues a track: the track and the shift of the row's corners."""
+        """Track and corner shift of each row that continues a track."""
         if not tracks:
             return {}
         last = np.array([track.row for track in tracks])
         corners = np.stack([track.corners_map for track in tracks])
         valid = np.stack([track.valid for track in tracks])
         size_m = diameters(corners, valid)
-        # Pairs of one class that are no farther apart than their sizes.
+        # Pairs of one class no farther apart than their sizes.
         apart_m = np.linalg.norm(mean_corners(corners, valid)[:, None] - self._centre_map[rows], axis=-1)
         reach_m = MAX_GATE_M + size_m[:, None] + self._size_m[rows]
         alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
@@ -141,10 +139,10 @@ class _Linker:
         return {int(rows[d]): (tracks[t], int(shift[t, d])) for t, d in picked if costs[t, d] < _REFUSED}
 
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
-        """The covariance that a wrong extrinsic adds between the images of two sightings (P, 2, 2).
+        """Covariance (P, 2, 2) that a wrong extrinsic adds between the images of two sightings.
 
-        The error along the ray is r^2 / h * d and one across it r * d; between the images both
-        change by their derivative times the motion, and the turn of the vehicle swings the first.
+        The error along the ray is r^2 / h * d, across it r * d: both change by their derivative times the
+        motion, and the vehicle's turn rotates the first.
         """
         frame = self._sightings.frame
         moved_m = np.abs(self._odometer_m[frame[rows]] - self._odometer_m[frame[last]])
@@ -157,7 +155,7 @@ class _Linker:
 
 
 def _noise_covariances(located: Located, ray: FloatArray, noise: PoseNoise) -> FloatArray:
-    """Covariance (S, 2, 2) of a sighting's mean position, at the end of ``ray``: pixels, jitter, position."""
+    """Covariance (S, 2, 2) of the mean position, at the end of ``ray``: pixels, attitude, position."""
     range_m, height_m = np.linalg.norm(ray, axis=1), located.height_m
     jitter_m = noise.roll_pitch_rad * (range_m**2 + height_m**2) / height_m
     weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)

@@ -1,9 +1,7 @@
-"""Between a local east-north-up frame, geodetic coordinates and, by PROJ (pyproj), projected ones.
+"""Between the local east-north-up frame, geodetic coordinates and, by PROJ (pyproj), projected ones.
 
-Datums are kept, never shifted: ETRS89 coordinates stay ETRS89. Datums whose ellipsoid is WGS84's to within a
-millimetre on the ground count as satellite datums (WGS84, ETRS89, NAD83, GDA2020, JGD2011); others are
-refused, since without grid files of their country nobody takes them to satellite positions better than by
-metres.
+Datums are never transformed. Those whose ellipsoid is WGS84's to a millimetre are satellite datums (WGS84,
+ETRS89, NAD83, GDA2020, JGD2011); others are refused: without national grid files they are metres off.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from v2hdm.records import FloatArray, GeodeticOrigin
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
 _SAME_ELLIPSOID_M = 1e-3  # GRS80's semi-minor axis is 0.1 mm longer than WGS84's
-_CONFORMAL_DEG = 1e-3  # angles of a conformal grid are as true as this, for rounding
+_CONFORMAL_DEG = 1e-3  # tolerance of a conformal grid's angles, for rounding
 
 
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
@@ -37,7 +35,7 @@ def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArra
 
 
 def enu_axes(geodetic: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3), earth-centred from local, with the columns east, north, up at (N, 3) places."""
+    """Rotations (N, 3, 3), earth-centred from local, with columns east, north, up at points (N, 3)."""
     lat, lon = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
     east = np.column_stack([-np.sin(lon), np.cos(lon), np.zeros(len(lat))])
     north = np.column_stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
@@ -46,10 +44,9 @@ def enu_axes(geodetic: FloatArray) -> FloatArray:
 
 
 def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
-    """Geodetic (N, 3), in its own datum, of points (N, 3) of a projected system.
+    """Geodetic (N, 3), in its own datum, of easting, northing in the system's unit and ellipsoidal height, m.
 
-    The points are easting and northing in its unit and the height in m above the ellipsoid. Raises ``error``
-    when the system is unknown, geographic or of no satellite datum, or the points lie outside of it.
+    Raises ``error`` if the system is unknown, geographic or of no satellite datum, or points lie outside it.
     """
     system = _system(crs, where, error)
     if not system.is_projected:
@@ -62,18 +59,18 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     return geodetic
 
 
-LOCAL = "local"  # the name of the map's own frame where a coordinate system is asked for
+LOCAL = "local"  # name of the map's own frame as a coordinate system
 
-_GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # .1 mm on the ground
-_BESIDE_DEG = 1.0  # surveyors use a zone's grid a little beyond its edges
+_GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # 0.1 mm on the ground
+_BESIDE_DEG = 1.0  # a zone's grid is in use a little beyond its edges
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The coordinate system ``crs`` that a user asks for, :data:`LOCAL` or one that PROJ knows, of one map.
+    """The coordinate system ``crs`` of a map's exports: :data:`LOCAL` or one that PROJ knows.
 
-    Its coordinates are east before north, rounded to 0.1 mm, the third the height in m above the ellipsoid,
-    or above the local z = 0. The datum stays that of the ``origin``.
+    Coordinates are easting, northing, rounded to 0.1 mm, and height in m above the ellipsoid, or the local z.
+    The datum is the ``origin``'s.
     """
 
     crs: str
@@ -88,9 +85,9 @@ class Grid:
     def of(
         cls, crs: str, origin: GeodeticOrigin | None, where: str, error: type[V2hdmError], metres: str = ""
     ) -> Grid:
-        """The system for a map with this ``origin``; ``metres`` names a format that knows nothing else.
+        """The system for a map with this ``origin``; ``metres`` names a format that only holds metres.
 
-        Raises ``error`` where the system is unknown, of another datum, or cannot hold the site.
+        Raises ``error`` if the system is unknown, of another datum, or does not cover the site.
         """
         if crs == LOCAL:
             return cls(crs, origin)
@@ -120,7 +117,7 @@ class Grid:
 
     @property
     def stated(self) -> dict[str, str]:
-        """The system, its datum and the epoch, as texts."""
+        """The system, its datum and its epoch, as text."""
         about = {"crs": self.crs}
         if self.origin is not None:
             about["datum"] = self.origin.datum
@@ -144,7 +141,7 @@ class Grid:
         return np.column_stack([across, np.round(geodetic[:, 2], _GRID_DECIMALS)])
 
     def geodetic(self, positions: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
-        """Longitude, latitude, height (N, 3) of positions on the earth: :meth:`positions` undone."""
+        """Longitude, latitude, height (N, 3) of positions on the earth: :meth:`positions` inverted."""
         assert self.origin is not None
         if self.is_local:
             return geodetic_from_enu(self.origin, positions)[:, [1, 0, 2]]
@@ -167,11 +164,10 @@ _ENGINEERING = (
 
 
 def crs_of(origin: GeodeticOrigin | None) -> str:
-    """The coordinate system of the map frame, as PROJ or WKT text.
+    """PROJ or WKT text of the map frame.
 
-    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
-    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
-    frame is an engineering system: metres that belong nowhere on the earth.
+    With an origin, a transverse Mercator projection about it, scaled to its ellipsoidal height, which every
+    GIS knows: within 1 mm of the tangent plane up to 2 km away. Without, an engineering system.
     """
     if origin is None:
         return _ENGINEERING
@@ -183,7 +179,7 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
 
 
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
-    """Angles (N,), clockwise, from true to grid north at points; ``error`` also if it is not conformal."""
+    """Grid convergence (N,), clockwise from true to grid north; raises ``error`` also if not conformal."""
     here = geodetic_from_grid(crs, points, where, error)
     pyproj = need("pyproj", "map", f"{where}: crs", error)
     factors = pyproj.Proj(_horizontal(crs)).get_factors(here[:, 1], here[:, 0])
@@ -193,13 +189,13 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
 
 
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
-    """Name of the satellite datum that coordinates of ``crs`` refer to, ``WGS84`` written like that."""
+    """Satellite datum of the coordinates of ``crs``, WGS84 spelt ``WGS84``."""
     name = str(_system(crs, where, error).geodetic_crs.name)
     return "WGS84" if name.replace(" ", "") == "WGS84" else name
 
 
 def has_height_datum(crs: str, where: str, error: type[V2hdmError]) -> bool:
-    """Whether heights of ``crs`` count from the sea (a compound system) and not from the ellipsoid."""
+    """Whether ``crs`` is a compound system, with heights above sea level rather than the ellipsoid."""
     return bool(_system(crs, where, error).is_compound)
 
 
@@ -229,13 +225,13 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
 
 @lru_cache(maxsize=8)
 def _inverse_of(crs: str) -> Any:
-    """The transformer from a projected system to its own longitude and latitude."""
+    """The transformer from a projected system to its longitude and latitude."""
     pyproj, horizontal = need("pyproj", "map", "a projected system", MapFileError), _horizontal(crs)
     return pyproj.Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
 
 
 def _horizontal(crs: str) -> Any:
-    """A system without its heights."""
+    """The horizontal part of a system."""
     system = _system(crs, crs, MapFileError)
     return system.sub_crs_list[0] if system.is_compound else system
 
@@ -254,7 +250,7 @@ def _ecef_from_geodetic(geodetic: FloatArray) -> FloatArray:
 
 
 def _geodetic_from_ecef(points: FloatArray) -> FloatArray:
-    """Bowring's iteration (Survey Review 23, 1976), which is within nanometres after two rounds."""
+    """Bowring's iteration (Survey Review 23, 1976): accurate to nanometres after two rounds."""
     x, y, z = points.T
     out_m = np.hypot(x, y)
     minor_m = _SEMI_MAJOR_M * (1 - _FLATTENING)

@@ -1,10 +1,9 @@
-"""The camera over the ground plane: inverse perspective mapping (IPM), projection, and both back again.
+"""Cameras over the ground plane: inverse perspective mapping (IPM), projection, and mounting angles.
 
-``vehicle_from_pinhole_px`` (3 x 3) is the paper's H: it takes pinhole pixels to the plane z = 0 of the
-vehicle. Its inverse has the columns K [r1 r2 t] of ``cam_from_vehicle`` (Hartley and Zisserman, Multiple
-View Geometry, 2nd ed., eq. 8.1). A homography has no sign of its own. Those of
-:func:`pinhole_px_from_ground` and :func:`ground_from_pinhole_px` have a positive third coordinate for
-ground in front of the camera: the depth in m, or its inverse.
+``vehicle_from_pinhole_px`` (3 x 3), the paper's H, maps pinhole pixels to the vehicle's plane z = 0; its
+inverse is K [r1 r2 t] of ``cam_from_vehicle`` (Hartley and Zisserman, Multiple View Geometry, 2nd ed.,
+eq. 8.1). :func:`pinhole_px_from_ground` and :func:`ground_from_pinhole_px` are signed so that the third
+coordinate of ground in front of the camera is positive: the depth in m, or its inverse.
 """
 
 from __future__ import annotations
@@ -23,23 +22,17 @@ from v2hdm.records import CameraInfo, FloatArray
 
 
 def pinhole_px_from_ground(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
-    """The homography (..., 3, 3) from the plane z = 0 of a frame to pinhole pixels: K [r1 r2 t].
-
-    ``intrinsic`` is K, (..., 3, 3) px, ``cam_from_ground`` (..., 4, 4) the camera's pose in that frame.
-    """
+    """Homography K [r1 r2 t] (..., 3, 3) from the plane z = 0 of a frame to pinhole pixels; K in px."""
     return np.asarray(intrinsic @ cam_from_ground[..., :3, :][..., [0, 1, 3]])
 
 
 def ground_from_pinhole_px(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
-    """The inverse (..., 3, 3) of :func:`pinhole_px_from_ground`; LinAlgError of a centre on the ground."""
+    """Inverse (..., 3, 3) of :func:`pinhole_px_from_ground`; LinAlgError for a centre on the ground."""
     return np.asarray(np.linalg.inv(pinhole_px_from_ground(intrinsic, cam_from_ground)), dtype=np.float64)
 
 
 def ipm_from_extrinsic(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
-    """The IPM ``vehicle_from_pinhole_px`` (3 x 3, unit norm) of a camera at ``cam_from_vehicle`` (4 x 4).
-
-    Raises numpy.linalg.LinAlgError when the camera's centre lies on the ground plane.
-    """
+    """IPM ``vehicle_from_pinhole_px`` (3 x 3, unit norm); LinAlgError for a camera centre on the ground."""
     ipm = ground_from_pinhole_px(info.intrinsic, cam_from_vehicle)
     return np.asarray(ipm / np.linalg.norm(ipm))
 
@@ -47,10 +40,9 @@ def ipm_from_extrinsic(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatA
 def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
     """The rigid ``cam_from_vehicle`` (4 x 4) nearest to an IPM (3 x 3), its camera above the ground.
 
-    A homography solved from clicked points is not exactly K [r1 r2 t]. Its first two columns are replaced
-    by their polar factor, the orthonormal pair nearest to them in the Frobenius norm (Zhang, A flexible
-    new technique for camera calibration, 2000, appendix C). The scale is the one that brings the two
-    nearest: the mean of their singular values. Of the two solutions, one has its camera below the ground.
+    A homography from clicked points is not exactly K [r1 r2 t]. Its first two columns are replaced by their
+    polar factor, the nearest orthonormal pair in the Frobenius norm (Zhang, A flexible new technique for
+    camera calibration, 2000, appendix C), and the scale is the mean of their singular values.
     """
     columns = np.linalg.solve(info.intrinsic, np.linalg.inv(ipm))
     left, singular, right = np.linalg.svd(columns[:, :2], full_matrices=False)
@@ -63,33 +55,33 @@ def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
 
 
 def facing_ipm(ipm: FloatArray, seen_vehicle: FloatArray) -> FloatArray:
-    """The IPM (3 x 3) of the sign that puts the ground point ``seen_vehicle`` (2,) m before the camera."""
+    """The IPM (3 x 3) signed so that ground point ``seen_vehicle`` (2,), m, is in front of the camera."""
     # With ipm @ (u, v, 1) = w * ground, the solution is (u, v, 1) / w.
     in_front = np.linalg.solve(ipm, np.append(seen_vehicle, 1.0))[2] > 0
     return np.asarray(ipm if in_front else -ipm)
 
 
 def flat_motion(dst_from_src: FloatArray) -> FloatArray:
-    """A rigid motion (..., 4, 4) of the ground plane taken as planar: a homography (..., 3, 3)."""
+    """Homography (..., 3, 3) that a planar motion (..., 4, 4) induces on the ground plane."""
     return np.asarray(dst_from_src[..., [0, 1, 3], :][..., [0, 1, 3]])
 
 
 def apply_homography(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
-    """Points (..., N, 2) mapped by a homography (..., 3, 3); points at infinity come out as inf or nan."""
+    """Points (..., N, 2) mapped by a homography (..., 3, 3); at infinity inf or nan."""
     homogeneous = _homogeneous(dst_from_src, points_src)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
 
 
 def apply_in_front(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
-    """Points (..., N, 2) by a homography (..., 3, 3); nan at, above and behind the horizon (third <= 0)."""
+    """:func:`apply_homography` for ground in front of the camera: nan on and above the horizon."""
     homogeneous = _homogeneous(dst_from_src, points_src)
     third = homogeneous[..., 2:]
     return np.asarray(homogeneous[..., :2] / np.where(third > 0, third, np.nan))
 
 
 def homography_jacobian(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
-    """Derivative (..., N, 2, 2) of :func:`apply_in_front` with respect to the points; nan where that is."""
+    """Derivative (..., N, 2, 2) of :func:`apply_in_front` by the points; nan where the point is."""
     homogeneous = _homogeneous(dst_from_src, points_src)
     third = np.where(homogeneous[..., 2:] > 0, homogeneous[..., 2:], np.nan)
     mapped = (homogeneous[..., :2] / third)[..., None]
@@ -102,8 +94,7 @@ def project_ground(
 ) -> tuple[FloatArray, FloatArray]:
     """Pinhole pixels (..., N, 2) and depths (..., N), m, of ground points (..., N, 2), m.
 
-    Camera and frame are those of :func:`pinhole_px_from_ground`. The pixels of points behind the camera,
-    whose depth is negative, are those of their mirror images; at depth zero they are inf or nan.
+    Behind the camera, at negative depth, they are pixels of the mirror image; at depth zero inf or nan.
     """
     homogeneous = _homogeneous(pinhole_px_from_ground(intrinsic, cam_from_ground), points_ground)
     depth_m = homogeneous[..., 2]
@@ -112,18 +103,18 @@ def project_ground(
 
 
 def direction_covariance(ray_ground: FloatArray, height_m: FloatArray, sigma_rad: float) -> FloatArray:
-    """Covariance (..., 2, 2), m^2, of a ground point whose viewing direction is uncertain.
+    """Covariance (..., 2, 2), m^2, of a ground point from an uncertain viewing direction.
 
-    ``ray_ground`` (..., 2) m leads from below the camera, which is ``height_m`` (...) up, to the point;
-    ``sigma_rad`` is that of pitch and yaw. At height h a change of pitch by d moves a point at range r along
-    the ray by (r^2 + h^2) / h * d, one of yaw across it by r * d.
+    ``ray_ground`` (..., 2), m, leads from the camera's nadir to the point; ``sigma_rad`` is that of pitch and
+    yaw. At height h and range r a pitch by d moves the point along the ray by (r^2 + h^2) / h * d,
+    a yaw across it by r * d.
     """
     range_m = np.linalg.norm(ray_ground, axis=-1)
     return ray_covariance(ray_ground, (range_m**2 + height_m**2) / height_m * sigma_rad, range_m * sigma_rad)
 
 
 def ray_covariance(ray_ground: FloatArray, along_m: FloatArray, across_m: FloatArray) -> FloatArray:
-    """Covariances (..., 2, 2) of points with these sigmas (...) along and across rays (..., 2)."""
+    """Covariances (..., 2, 2) of points with standard deviations (...) along and across rays (..., 2)."""
     along = ray_ground / np.maximum(np.linalg.norm(ray_ground, axis=-1, keepdims=True), 1e-9)
     outer = along[..., :, None] * along[..., None, :]
     along_m2, across_m2 = np.square(along_m)[..., None, None], np.square(across_m)[..., None, None]
@@ -137,11 +128,11 @@ def _homogeneous(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray
 
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Columns: the right, down and forward of a camera that looks along x, in a frame of forward, left and up."""
+"""Columns: right, down and forward of a camera that looks along x, in forward-left-up axes."""
 
 
 def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
-    """Roll, pitch (down) and yaw (left), rad, about x, y, z: 0 where it looks along the vehicle's x axis."""
+    """Roll, pitch (down) and yaw (left), rad, about x, y, z: 0 for a camera looking along the vehicle's x."""
     return euler_from_rotation(cam_from_vehicle[:3, :3].T @ LEVEL.T)
 
 
@@ -152,7 +143,7 @@ def cam_from_mounting(xyz_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
 
 
 def angle_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (3,) of :func:`mounting_angles`, rad, from the left tangent's covariance (6, 6)."""
+    """Standard deviations (3,) of :func:`mounting_angles`, rad; ``covariance`` (6, 6) of the left tangent."""
     step = 1e-6
     moved = [mounting_angles(exp(step * axis) @ cam_from_vehicle) for axis in np.eye(6)[3:]]
     jacobian = (np.array(moved) - mounting_angles(cam_from_vehicle)).T / step
@@ -160,14 +151,14 @@ def angle_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> FloatA
 
 
 def centre_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (3,) of the camera's centre along the vehicle's axes, m; arguments as above."""
+    """Standard deviations (3,) of the centre in vehicle axes, m; ``covariance`` is the left tangent's."""
     # A left perturbation (v, w) of cam_from_vehicle moves the centre by -R'v.
     to_vehicle = cam_from_vehicle[:3, :3].T
     return np.asarray(np.sqrt(np.diag(to_vehicle @ covariance[:3, :3] @ to_vehicle.T)))
 
 
 def mounting_words(cam_from_vehicle: FloatArray, covariance: FloatArray) -> tuple[list[str], list[str]]:
-    """Roll, pitch and yaw, and the place forward, left and height, each with its standard deviation."""
+    """Roll, pitch and yaw, and forward, left and height of the centre, each with its standard deviation."""
     angles = np.degrees(mounting_angles(cam_from_vehicle))
     angle_sigma = np.degrees(angle_sigmas(cam_from_vehicle, covariance))
     centre, centre_sigma = camera_centre(cam_from_vehicle), centre_sigmas(cam_from_vehicle, covariance)

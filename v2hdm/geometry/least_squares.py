@@ -1,9 +1,8 @@
-"""Gauss-Newton with Levenberg's damping, for least-squares problems of a few dozen to a few hundred unknowns.
+"""Gauss-Newton with Levenberg-Marquardt damping for problems of a few dozen to a few hundred unknowns.
 
-A problem is a function that linearises it: it returns its :class:`Normal` equations at an estimate of any
-type. Steps live in the tangent space of that estimate and ``retract`` applies them, so that rotations, lenses
-and lists of poses need no common vector. Robust problems put their weights into the equations and so are
-iteratively reweighted.
+A problem is a function that returns its :class:`Normal` equations at an estimate of any type. Steps live in
+the tangent space of the estimate and ``retract`` applies them. Robust problems weight their equations and so
+are iteratively reweighted.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from v2hdm.records import FloatArray
 X = TypeVar("X")
 N = TypeVar("N", bound="Normal")
 
-_RANK = 1e-12  # relative size below which an eigenvalue of the scaled information is rounding
+_RANK = 1e-12  # relative eigenvalue of the scaled information matrix below which it is rounding
 
-_GIVE_UP = 1e8  # damping from which a cost that still grows is at its minimum but for rounding
+_GIVE_UP = 1e8  # damping from which a cost that still rises is at its minimum up to rounding
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations at an estimate, of residuals r, their derivative J and inverse covariance W."""
+    """Normal equations at an estimate: residual r, Jacobian J, inverse covariance W."""
 
     information: FloatArray  # (U, U) J'WJ
     gradient: FloatArray  # (U,) J'Wr
@@ -35,7 +34,7 @@ class Normal:
 
 
 def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatArray | None = None) -> Normal:
-    """The equations of residuals (N, D), their derivatives (N, D, U) and weights (N, D, D), by default 1."""
+    """Normal equations of residuals (N, D), Jacobians (N, D, U) and weights (N, D, D), default 1."""
     weighted = jacobian if weight is None else weight @ jacobian
     moved = residual if weight is None else (weight @ residual[..., None])[..., 0]
     return Normal(
@@ -47,12 +46,12 @@ def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatAr
 
 @dataclass(frozen=True)
 class Fit(Generic[X, N]):
-    """Where an iteration ended."""
+    """The end of an iteration."""
 
     x: X
     last: N
-    step: FloatArray  # (U,) the last one, as limited, from the equations ``last``
-    converged: bool  # it was short enough; else steps were used up, or the problem was not finite
+    step: FloatArray  # (U,) the last, after ``limit``, from the equations ``last``
+    converged: bool  # the step was short enough; False: out of steps, or not finite
     steps: int
 
     @property
@@ -79,13 +78,12 @@ def gauss_newton(
     limit: Callable[[FloatArray], FloatArray] | None = None,
     settled: Callable[[FloatArray], bool] | None = None,
 ) -> Fit[X, N]:
-    """Minimise a sum of squares from ``x0`` in at most so many ``steps``.
+    """Minimise a sum of squares from ``x0`` in at most ``steps`` steps.
 
-    ``linearise`` gives the normal equations at an estimate, ``retract`` an estimate moved by a step (U,), by
-    default their sum. A step that is below ``tolerance`` conditional standard deviations of every unknown, or
-    that is ``settled``, is the last; ``limit`` shortens one to what the linearisation holds for. With a
-    ``damping``, a share of the information's diagonal, steps that raise the cost are undone and taken again
-    with ten times of it; at 0 every step is taken whole.
+    ``retract`` applies a step (U,) to an estimate, by default their sum; ``limit`` shortens steps to the
+    range of the linearisation. It ends on a step below ``tolerance`` conditional standard deviations of every
+    unknown, or once ``settled``. ``damping`` is a fraction of the information's diagonal: a step that raises
+    the cost is rejected and the damping raised tenfold; at 0 every step is accepted whole.
     """
     move: Callable[[X, FloatArray], X] = retract or add
     x, last, damped = x0, linearise(x0), damping
@@ -112,7 +110,7 @@ def gauss_newton(
 
 
 def solve_normal(equations: Normal, damping: float = 0.0) -> FloatArray:
-    """The step (U,) to the minimum; the shortest, in scaled unknowns, of a rank-deficient problem."""
+    """The step (U,) to the minimum; in a rank-deficient problem the shortest, in scaled unknowns."""
     scale, scaled = _scaled(equations.information)
     scaled = scaled + damping * np.eye(len(scale))
     pull = -equations.gradient / scale
@@ -124,7 +122,7 @@ def solve_normal(equations: Normal, damping: float = 0.0) -> FloatArray:
 
 
 def covariance_of(information: FloatArray) -> FloatArray:
-    """The inverse (U, U) of an information; infinite variances, all of them, where it is singular."""
+    """Inverse (U, U) of an information matrix; all variances infinite if it is singular."""
     scale, scaled = _scaled(information)
     values, axes = np.linalg.eigh(scaled)
     if not (np.diag(information) > 0).all() or values[0] < _RANK * values[-1]:
@@ -133,7 +131,7 @@ def covariance_of(information: FloatArray) -> FloatArray:
 
 
 def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scales (U,), and the information with them divided out: its diagonal is 1, or 0."""
+    """Scales (U,), and the information matrix scaled to a diagonal of 1, or 0."""
     diagonal = np.diag(information)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     return scale, information / np.outer(scale, scale)

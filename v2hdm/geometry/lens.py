@@ -16,7 +16,7 @@ _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-1
 
 
 def has_distortion(info: CameraInfo) -> bool:
-    """Whether the lens of ``info`` departs from a pinhole at all."""
+    """Whether ``info`` departs from a pinhole."""
     return info.distortion_model == "equidistant" or any(info.distortion)
 
 
@@ -46,10 +46,9 @@ def distort_points(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArra
 
 
 def _brown_conrady(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArray:
-    """Recorded pixels (N, 2) under OpenCV's ``calib3d`` model of up to eight coefficients.
+    """Recorded pixels (N, 2) by OpenCV's ``calib3d`` model of up to eight coefficients; skew is in K alone.
 
-    OpenCV's own function works out derivatives besides, which takes several times as long. As there, skew
-    is one of the pinhole image only.
+    OpenCV's own function also computes derivatives, which takes several times as long.
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = (*info.distortion, *(0.0,) * (8 - len(info.distortion)))
     (fx, skew, cx), (_, fy, cy), _ = info.intrinsic

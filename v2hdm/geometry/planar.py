@@ -1,9 +1,9 @@
 """Geometry in a plane: polygons, polylines, angles and quadrilaterals.
 
-Quadrilaterals (..., 4, 2) have corners that run counter-clockwise as seen from above the ground, in the map
-as on the screen; the first is arbitrary. In the map, where y points up, their shoelace area is positive. In
-an image, where v points down, it is negative: there :func:`order_corners` and :func:`is_convex_px` apply, in
-the map :func:`is_convex`. Other functions hold for both. Side ``e`` runs from corner ``e`` to ``e + 1``.
+Corners of quadrilaterals (..., 4, 2) run counter-clockwise as seen from above the ground, in the map and on
+the screen, from any first one. The shoelace area is positive in the map, where y points up, and negative in
+an image, where v points down: use :func:`is_convex` there, :func:`order_corners` and :func:`is_convex_px`
+here. Side ``e`` runs from corner ``e`` to ``e + 1``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
-    """Whether points (..., 2) lie inside a convex polygon (N, 2) of either turning; nan is outside."""
+    """Whether points (..., 2) lie inside a convex polygon (N, 2) of either orientation; False for nan."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     offsets = np.asarray(points)[..., None, :] - polygon
     cross = edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0]
@@ -37,16 +37,16 @@ def turned_left(vectors: FloatArray) -> FloatArray:
 
 
 def signed_area(polygon: FloatArray) -> FloatArray:
-    """Shoelace area (...) of polygons (..., N, 2): positive where they turn from the x towards the y axis.
+    """Shoelace area (...) of polygons (..., N, 2): positive if they turn from the x towards the y axis.
 
-    That is counter-clockwise in the map and clockwise on the screen, whose v axis points down.
+    That is counter-clockwise in the map, clockwise on the screen, whose v axis points down.
     """
     ahead = np.concatenate([polygon[..., 1:, :], polygon[..., :1, :]], axis=-2)
     return np.asarray(cross(polygon, ahead).sum(axis=-1) / 2)
 
 
 def winding(polygon: FloatArray) -> int:
-    """The turning of a convex polygon (N, 2), 1 or -1 as :func:`signed_area` has it; 0 if it is not convex.
+    """Orientation of a convex polygon (N, 2), 1 or -1 with :func:`signed_area`'s sign; 0 if not convex.
 
     Straight corners are fine; a star turns one way at every corner but goes around twice.
     """
@@ -65,14 +65,14 @@ def is_simple(polygon: FloatArray) -> bool:
     ends = np.roll(polygon, -1, axis=0)
     side, apart = ends - polygon, polygon[:, None] - polygon
     beyond = ends[:, None] - polygon
-    # Where side i begins and ends, (N, N), beside side j: on different sides where it crosses j's line.
+    # Signed areas (N, N) of the ends of side i beside side j: of opposite signs where i crosses j's line.
     begin, end = (one[..., 0] * side[:, 1] - one[..., 1] * side[:, 0] for one in (apart, beyond))
     crosses = begin * end < 0
     return not (crosses & crosses.T).any()
 
 
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
-    """A polygon (N, 2) cut to a convex window (M, 2); OpenCV gives nothing where they nearly coincide."""
+    """A polygon (N, 2) clipped to a convex window (M, 2), unlike OpenCV also if nearly coincident."""
     inside = window.mean(axis=0)
     for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
         along = end - start
@@ -98,19 +98,19 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
 
 
 def densified(polygon: FloatArray, pieces: int) -> FloatArray:
-    """A polygon (N, 2) with every side cut into ``pieces``, as lenses bend straight lines."""
+    """A polygon (N, 2) with every side cut into ``pieces``: lenses bend straight lines."""
     part = np.arange(pieces)[:, None] / pieces
     sides = np.roll(polygon, -1, axis=0) - polygon
     return (polygon[:, None] + part * sides[:, None]).reshape(-1, 2)
 
 
 def length_along(line: FloatArray) -> FloatArray:
-    """How far along a polyline (N, D) each of its vertices (N,) lies."""
+    """Arc length (N,) along a polyline (N, D) to each vertex."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def points_along(line: FloatArray, at: FloatArray) -> FloatArray:
-    """Points (M, D) as far along a polyline (N, D) as ``at`` (M,) says, from end to end of it."""
+    """Points (M, D) at arc lengths ``at`` (M,) along a polyline (N, D), clamped to its ends."""
     return np.column_stack([np.interp(at, length_along(line), axis) for axis in line.T])
 
 
@@ -121,7 +121,7 @@ def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:
-    """Length and width of the smallest rectangle around points (N, 2); nan for fewer than three not nan."""
+    """Length and width of the smallest rectangle around points (N, 2); nan for fewer than three finite."""
     seen = points[np.isfinite(points[:, 0])]
     if len(seen) < 3:
         return float("nan"), float("nan")
@@ -129,7 +129,7 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
     return float(max(size)), float(min(size))
 
 
-# Faster than np.roll by far, and there are many of them in the fit of a few markings.
+# Much faster than np.roll, which the fit of a few markings would call very often.
 _NEXT, _LAST = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 _TURN = np.array([-1.0, 1.0])
 
@@ -137,14 +137,14 @@ _CORNER = np.arange(4)
 SHIFTS = (_CORNER[:, None] + _CORNER[None, :]) % 4
 """Row s lists, for corner c of one quadrilateral, corner (c + s) mod 4 of the other."""
 
-_LEAST_SINE = 1e-3  # of the angle of two sides that meet; parallel ones meet nowhere
-# Each corner is the start of its own side and the end of the one before, in this place among the moves.
+_LEAST_SINE = 1e-3  # of the angle between adjacent sides; parallel ones do not intersect
+# A corner starts its own side and ends the one before: the index of that end among the side moves.
 _END = 4 + (_CORNER - 1) % 4
 
 
 @dataclass(frozen=True)
 class Quad:
-    """Quadrilaterals (..., 4, 2) with all that follows, each once; normals point outwards in an image."""
+    """Quadrilaterals (..., 4, 2) with cached properties; normals point outwards in an image."""
 
     corners: FloatArray
 
@@ -169,7 +169,7 @@ class Quad:
 
     @cached_property
     def area(self) -> FloatArray:
-        """Area (...)."""
+        """Area (...) of each quadrilateral."""
         return np.asarray(np.abs(signed_area(self.corners)))
 
     @cached_property
@@ -185,19 +185,19 @@ class Quad:
 
     @cached_property
     def outward(self) -> FloatArray:
-        """Rows (..., 4, 3) that take (x, y, 1) of an image to the distance outside each side."""
+        """Rows (..., 4, 3) that take (x, y, 1) of an image to the signed distance outside each side."""
         offset = -(self.normal * self.corners).sum(axis=-1)
         return np.concatenate([self.normal, offset[..., None]], axis=-1)
 
     @cached_property
     def corner_from_side(self) -> FloatArray:
-        """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
+        """Jacobian (M, 8, 8) of the corners by moves of the sides' starts and ends along their normals."""
         tangent = self.tangent
         before = tangent.take(_LAST, axis=-2)
         determinant = cross(before, tangent)
         determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
         jacobian = np.zeros((len(tangent), 4, 2, 8))
-        # Each lies along the other's line.
+        # Moving one side slides the corner along the other.
         jacobian[:, _CORNER, :, _CORNER] = (-before / determinant).swapaxes(0, 1)
         jacobian[:, _CORNER, :, _END] = (tangent / determinant).swapaxes(0, 1)
         return jacobian.reshape(-1, 8, 8)
@@ -207,22 +207,22 @@ class Quad:
         return Quad(self.corners + (self.corner_from_side @ by_side[..., None]).reshape(-1, 4, 2))
 
     def long_first(self, lengthwise: BoolArray | None = None) -> Quad:
-        """The corners from a longer side on, or from the second where not ``lengthwise`` (M,)."""
+        """The quadrilaterals from a longer side on, or from the second side where not ``lengthwise`` (M,)."""
         along = self.lengthwise if lengthwise is None else lengthwise
         return Quad(np.where(along[..., None, None], self.corners, following(self.corners)))
 
     def at(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Points (..., N, 2) at shares ``a`` (N,) along the first side and ``b`` (N,) along the fourth."""
+        """Points (..., N, 2) at fractions ``a`` (N,) along the first side and ``b`` (N,) along the fourth."""
         weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
         return np.asarray(weight @ self.corners)
 
 
 class Alignment(NamedTuple):
-    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift."""
+    """Quadrilaterals b aligned to quadrilaterals a under the best cyclic shift."""
 
     shift: IntArray  # corner c of a matches (c + shift) mod 4 of b
     offset: FloatArray  # (..., 2) mean displacement of b's corners
-    deformation_m: FloatArray  # largest deviation from that, infinite for fewer than two common corners
+    deformation_m: FloatArray  # largest deviation from ``offset``, infinite for fewer than two common corners
 
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
@@ -236,13 +236,13 @@ def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
 
 
 def order_corners(corners: FloatArray) -> FloatArray:
-    """Corners (4, 2) of a convex quadrilateral of an image, counter-clockwise on the screen."""
+    """Corners (4, 2) of a convex quadrilateral of an image, sorted counter-clockwise on the screen."""
     outward = corners - corners.mean(axis=0)
     return np.asarray(corners[np.argsort(np.arctan2(-outward[:, 1], outward[:, 0]))])
 
 
 def following(values: np.ndarray, axis: int = -2) -> np.ndarray:
-    """Values of four corners or sides, each replaced by that of the next one round the quadrilateral."""
+    """Values of four corners or sides, each replaced by the next one's."""
     return np.asarray(values.take(_NEXT, axis=axis))
 
 
@@ -266,7 +266,7 @@ def is_convex_px(corners_px: FloatArray) -> BoolArray:
 
 
 def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) -> Alignment:
-    """Align ``b`` (..., 4, 2) to ``a`` by that shift which brings the common valid corners nearest."""
+    """Align ``b`` (..., 4, 2) to ``a`` by the cyclic shift that brings the common valid corners nearest."""
     both = valid_a[..., None, :] & valid_b[..., SHIFTS]
     difference = np.where(both[..., None], b[..., SHIFTS, :] - a[..., None, :, :], 0.0)
     common = both.sum(axis=-1)
@@ -303,7 +303,7 @@ def _turns(corners: FloatArray) -> FloatArray:
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:
-    """(M, 4, 2, 2) blocks, one a corner, to (M, 8, 8)."""
+    """Blocks (M, 4, 2, 2), one per corner, as block-diagonal matrices (M, 8, 8)."""
     full = np.zeros((len(blocks), 4, 2, 4, 2))
     full[:, _CORNER, :, _CORNER] = blocks.swapaxes(0, 1)
     return full.reshape(-1, 8, 8)

@@ -1,7 +1,6 @@
-"""Rigid motions in numpy: transforms, their tangents, angles and quaternions of rotations, trajectories.
+"""Rigid motions in numpy: transforms, tangents, Euler angles, quaternions and trajectories.
 
-Frames, names and tangents are those of :mod:`v2hdm.geometry`; unit quaternions are in the order x, y, z, w
-(TUM's and ROS').
+Frames and tangents are those of :mod:`v2hdm.geometry`; unit quaternions are x, y, z, w (as in TUM and ROS).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, Trajectory
 
-SERIES_TERMS = 15  # terms of the power series of theta^2: for float64, up to pi, as pi^(2 * 15) / 31! < 1e-18
+SERIES_TERMS = 15  # terms in theta^2: exact in float64 for theta up to pi, as pi^(2 * 15) / 31! < 1e-18
 
 EXP_SERIES = tuple(tuple(1 / factorial(2 * n + offset) for offset in (1, 2, 3)) for n in range(SERIES_TERMS))
 """Coefficients (terms, 3) of (-theta^2)^n in sin(theta) / theta, (1 - cos(theta)) / theta^2 and
@@ -37,13 +36,13 @@ def inverse(dst_from_src: FloatArray) -> FloatArray:
 
 
 def camera_centre(cam_from_frame: FloatArray) -> FloatArray:
-    """Where the origin of ``cam`` lies in the other frame: (..., 3), m."""
+    """Origin (..., 3) of ``cam``, m, in the other frame."""
     rotation = cam_from_frame[..., :3, :3]
     return np.asarray(-(np.swapaxes(rotation, -1, -2) @ cam_from_frame[..., :3, 3:])[..., 0])
 
 
 def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
-    """Points (..., 2 or 3) m of the map's ground as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
+    """Ground points (..., 2 or 3), m, of the map as (..., 2) in the vehicle frame at a pose (4, 4)."""
     if points_map.shape[-1] == 2:
         points_map = np.concatenate([points_map, np.zeros((*points_map.shape[:-1], 1))], axis=-1)
     return np.asarray(((points_map - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
@@ -57,7 +56,7 @@ def make_transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
 
 
 def heading_rad(map_from_vehicle: FloatArray) -> FloatArray:
-    """Headings (...), to the left of the map's x axis, of poses (..., 4, 4)."""
+    """Headings (...), rad, of poses (..., 4, 4): counter-clockwise from the map's x axis."""
     return np.asarray(np.arctan2(map_from_vehicle[..., 1, 0], map_from_vehicle[..., 0, 0]))
 
 
@@ -69,7 +68,7 @@ def hat(vectors: FloatArray) -> FloatArray:
 
 
 def exp(tangents: FloatArray) -> FloatArray:
-    """The rigid motions (..., 4, 4) of tangents (..., 6), for rotations up to pi, by Rodrigues' formula."""
+    """Rigid motions (..., 4, 4) of tangents (..., 6), for rotations up to pi, by Rodrigues' formula."""
     omega = hat(tangents[..., 3:])
     squared = omega @ omega
     sine, cosine, third = _even_series(tangents[..., 3:], EXP_SERIES)
@@ -78,7 +77,7 @@ def exp(tangents: FloatArray) -> FloatArray:
 
 
 def log(dst_from_src: FloatArray) -> FloatArray:
-    """The tangents (..., 6) of rigid motions (..., 4, 4), with rotations of at most pi."""
+    """Tangents (..., 6) of rigid motions (..., 4, 4), with rotations of at most pi."""
     matrices = dst_from_src.reshape(-1, 4, 4)
     quaternion = quaternion_from_rotation(matrices[:, :3, :3])
     half_sine = np.linalg.norm(quaternion[:, :3], axis=1, keepdims=True)
@@ -93,7 +92,7 @@ def log(dst_from_src: FloatArray) -> FloatArray:
 
 
 def adjoint(dst_from_src: FloatArray) -> FloatArray:
-    """Matrices (..., 6, 6) that take tangents of ``src`` to ``dst``: ``A exp(x) = exp(adjoint(A) x) A``."""
+    """Matrices (..., 6, 6) that map tangents of ``src`` to ``dst``: ``A exp(x) = exp(adjoint(A) x) A``."""
     rotation = dst_from_src[..., :3, :3]
     out = np.zeros((*dst_from_src.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = rotation
@@ -102,10 +101,10 @@ def adjoint(dst_from_src: FloatArray) -> FloatArray:
 
 
 def left_jacobian(tangents: FloatArray) -> FloatArray:
-    """Derivatives (..., 6, 6) of :func:`exp`: ``exp(x + dx) = exp(left_jacobian(x) @ dx) @ exp(x)``.
+    """Left Jacobian (..., 6, 6) of SE(3): ``exp(x + dx) = exp(left_jacobian(x) @ dx) @ exp(x)``.
 
-    The series sum of ad^n / (n + 1)!, closed by ad^5 = -2 theta^2 ad^3 - theta^4 ad (Barfoot, State
-    Estimation for Robotics, 2nd ed., section 8.1.5), for rotations up to pi.
+    The sum of ad^n / (n + 1)!, closed by ad^5 = -2 theta^2 ad^3 - theta^4 ad (Barfoot, State Estimation for
+    Robotics, 2nd ed., section 8.1.5), for rotations up to pi.
     """
     ad = np.zeros((*tangents.shape[:-1], 6, 6))
     ad[..., :3, :3] = ad[..., 3:, 3:] = hat(tangents[..., 3:])
@@ -162,11 +161,11 @@ def rotation_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: Fl
 
 
 def euler_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Roll, pitch and yaw (3,) in rad of a rotation (3, 3), as :func:`rotation_from_euler` has them."""
+    """Roll, pitch and yaw (3,), rad, of a rotation (3, 3): :func:`rotation_from_euler` inverted."""
     flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
     pitch = np.arctan2(-rotation[2, 0], flat)
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0]) if flat > 0 else 0.0
-    # By its cosines with the other two axes turned, roll stays exact where the pitch is a right angle.
+    # Taken about the axis across the heading, roll stays exact at a pitch of 90 degrees.
     across = rotation.T @ [-np.sin(yaw), np.cos(yaw), 0.0]
     return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
 
@@ -184,11 +183,10 @@ def _even_series(rotation: FloatArray, coefficients: tuple[tuple[float, ...], ..
 def interpolate(
     trajectory: Trajectory, stamp_s: FloatArray, max_gap_s: float
 ) -> tuple[FloatArray, BoolArray]:
-    """The poses (N, 4, 4) at ``stamp_s`` (N,): position linear, rotation by slerp; and a flag per time.
+    """Poses (N, 4, 4) at ``stamp_s`` (N,), position linear, rotation by slerp, and their validity (N,).
 
-    Nothing is extrapolated. The flag is False, and the pose that of the nearest recorded one, before the
-    first pose, after the last and between two poses that are more than ``max_gap_s`` apart; the time of a
-    recorded pose itself is never in a gap.
+    Nothing is extrapolated: outside the recorded time, and strictly between two poses more than ``max_gap_s``
+    apart, the flag is False and the pose that of the nearest recorded one.
     """
     recorded = trajectory.stamp_s
     stamp_s = np.asarray(stamp_s, dtype=np.float64)
@@ -215,11 +213,11 @@ def in_order(image: Image) -> tuple[int, float, str]:
 def with_clock_offsets(
     drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, visit: int = 0
 ) -> Drive:
-    """The drive with the images of some cameras of a visit posed for when they were taken.
+    """The drive with images of a session re-posed by its cameras' clock offsets.
 
-    ``offset_s`` says, by camera, how much later than stamped its images were taken, s. Images whose time the
-    trajectory does not cover, up to gaps of ``max_gap_s`` between two poses, are left out. Raises DriveError
-    when the drive holds no trajectory, or no image of some camera is left.
+    ``offset_s`` is by camera the time of exposure minus the stamp, s. Images that fall outside the trajectory
+    or in a gap above ``max_gap_s`` are left out. Raises DriveError without a trajectory, or if a camera keeps
+    no image.
     """
     root, trajectory = drive.visits[visit].root, drive.visits[visit].trajectory
     if trajectory is None:

@@ -1,8 +1,7 @@
-"""IPM, depths and lenses in torch and kornia, for the mapping, the adjustment and the mosaic.
+"""IPM, depths and lenses in torch and kornia, for mapping, adjustment and the mosaic.
 
-Functions take any leading ``*batch`` dimensions, float32 or float64, and are differentiable everywhere
-within their stated domain. Points on the ground and their derivatives, and lenses, are kornia's.
-:func:`inverse` and :func:`inverse_depth` stand in the solver's inner loop and are written in closed form.
+Functions take any leading ``*batch`` dimensions, float32 or float64, and are differentiable on their domain.
+:func:`inverse` and :func:`inverse_depth` stand in the solver's inner loop: hence the closed form.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ NEAR_M = 0.1  # depth below which :func:`inverse_depth` leaves 1 / z: nothing a 
 def inverse_depth(depth_m: Tensor) -> tuple[Tensor, Tensor]:
     """1 / z and its derivative, continued below :data:`NEAR_M` by the tangent line.
 
-    An optimiser that throws a point behind the camera so meets a large, finite cost whose gradient
-    leads back to the front, instead of a pole and a mirror image.
+    A point that a step puts behind the camera then has a large, finite cost whose gradient leads back to the
+    front, without pole and mirror image.
     """
     reciprocal = 1 / depth_m.clamp(min=NEAR_M)
     slope = -reciprocal.square()
@@ -45,7 +44,7 @@ def back_project(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> Tensor:
 
 
 def back_project_with_jacobian(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`back_project`, and its derivative (N, K, 2, 2) by the pixels, nan where it is nan itself."""
+    """:func:`back_project` and its Jacobian (N, K, 2, 2) by the pixels, nan where the point is."""
     with torch.enable_grad():
         leaves = pinhole_px.detach().requires_grad_()
         points = back_project(ground_from_pinhole_px, leaves)
@@ -58,7 +57,7 @@ def back_project_with_jacobian(ground_from_pinhole_px: Tensor, pinhole_px: Tenso
 
 
 def distort_points(info: CameraInfo, points_pinhole_px: Tensor) -> Tensor:
-    """Pinhole pixels (n, 2) to recorded pixels (n, 2): as :func:`v2hdm.geometry.lens.distort_points`."""
+    """Pinhole to recorded pixels (n, 2): see :func:`v2hdm.geometry.lens.distort_points`."""
     intrinsic = torch.as_tensor(info.intrinsic).to(points_pinhole_px)
     coefficients = torch.tensor(info.distortion).to(points_pinhole_px)
     points_px: Tensor

@@ -1,4 +1,4 @@
-"""The ground speaks without any marking: mounting, clock, lens and poses judged from bare asphalt."""
+"""Mounting, clock, lens and poses estimated from bare asphalt, without any marking."""
 
 from v2hdm.ground.estimate import estimate_cameras, estimate_ground
 from v2hdm.ground.results import (

@@ -15,26 +15,24 @@ from v2hdm.ground.prior import Observations, Prior
 from v2hdm.records import FloatArray, IntArray
 
 PIXEL_SIGMA = 0.4
-"""Largest standard deviation of a patch's place in an image, px; the unit of the residuals."""
+"""Largest standard deviation of a patch's position in an image, px; the unit of the residuals."""
 
-_LEAST_PIXEL_SIGMA = 0.1  # interpolation and the grid itself limit the matches to this, px
-# Median length of a plane vector whose components have a standard deviation of one.
-_RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))
-_CAUCHY = 2.5  # length of a whitened residual from which on it loses its weight
-# How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
-# against a pixel, but thousands of matches share it.
+_LEAST_PIXEL_SIGMA = 0.1  # floor of the same, px, from interpolation and the grid
+_RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))  # median length of a 2D vector with unit standard deviations
+_CAUCHY = 2.5  # whitened residual at which Cauchy's weight is 1/2
+# Systematic error of a good lens model and of matching, px, smooth over the image and equal in all images:
+# small against a pixel, but common to thousands of matches.
 _LENS_SIGMA_PX = 0.1
-# Fall of a road to both sides of a crown beneath the vehicle, whose wheels stand half a track beside it: it
-# looks like a bent lens (AASHTO, A Policy on Geometric Design of Highways and Streets, 7th ed., 4.2.2).
+# Fall of a crowned road to both sides of the vehicle, whose wheels stand half a track beside the crown: it
+# looks like lens distortion (AASHTO, A Policy on Geometric Design of Highways and Streets, 7th ed., 4.2.2).
 _ROOF_SIGMA, _HALF_TRACK_M = 0.03, 0.8
-_BENDS = 6  # terms of a smooth error of each pixel coordinate: a polynomial of the second degree
-# Longer steps leave the range in which the equations are linear.
-_LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2
+_BENDS = 6  # coefficients of a smooth error of each pixel coordinate, a quadratic polynomial
+_LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2  # of a step, within which the equations are linear
 _STEPS = 20
-_CONVERGED = 0.02  # a step below so many standard deviations is the last
-_DAMPING = 1e-3  # without it, a focal length and a height that slide together overshoot for ever
-_LARGEST_NOISE_PX = 2.0  # what is further off is no noise of a pixel
-_STRETCHES = 12  # of the route: several metres each, longer than most errors go together
+_CONVERGED = 0.02  # step, in standard deviations, that ends the iteration
+_DAMPING = 1e-3  # damping against endless overshoot of a correlated focal length and height
+_LARGEST_NOISE_PX = 2.0  # limit of the removed noise: beyond is no noise of a pixel
+_STRETCHES = 12  # segments of the route, several metres each: longer than the correlation of most errors
 
 TURN, CENTRE, BENDS = slice(0, 3), slice(3, 6), slice(6, 6 + 2 * _BENDS)
 _ROOF = BENDS.stop
@@ -44,18 +42,13 @@ _ROOF = BENDS.stop
 class Adjusted:
     """The solution.
 
-    Attributes:
-        mount: with the lens as freed.
-        extra: the freed parameter's value, 0 without one.
-        covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
-        pose_errors: (I, 6) estimated :data:`~v2hdm.ground.prior.STATES`.
-        bends: (12,) estimated smooth error of the pixels, px.
-        roof: estimated fall of the ground to both sides of the path, m per m.
-        poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
-        residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
-        weight: (N,) 1 for a match that fits, 0 for one that does not.
-        data_variance: (K,) the part of the variances that comes from the matches and the poses.
-        stretch_variance: (K,) that part as the stretches of the route disagree.
+    The ``mount`` contains a freed lens; ``extra`` is the freed parameter, 0 without one. ``covariance``
+    (K, K) is of turn (3, rad), centre (3, m) and the freed parameter. ``pose_errors`` (I, 6) are
+    :data:`~v2hdm.ground.prior.STATES`, ``bends`` (12,), px, the smooth pixel error, ``roof`` the ground's
+    fall to both sides of the path, m per m. ``poses`` (I, 4, 4) are ``map_from_vehicle`` with their errors
+    and the parameter applied. ``residual`` (N,) is the norm over both pixels in units of :data:`PIXEL_SIGMA`,
+    ``weight`` (N,) its Cauchy weight. ``data_variance`` (K,) is the part of the variances from matches and
+    poses, ``stretch_variance`` (K,) the same, clustered by segments of the route.
     """
 
     mount: Mount
@@ -73,7 +66,7 @@ class Adjusted:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """The estimate: mounting, freed parameter, errors of the poses (I, 6) and of the pixels (12,), roof."""
+    """The estimate: mounting, freed parameter, errors of poses (I, 6) and pixels (12,), and roof."""
 
     mount: Mount
     extra: float
@@ -84,7 +77,7 @@ class _Unknowns:
 
 @dataclass(frozen=True)
 class _Weighted(Normal):
-    """The normal equations, lengths (N,) of residuals, weights (N,) and each match's ``score`` (N, U)."""
+    """Normal equations, residual norms (N,), weights (N,) and each match's ``score`` (N, U)."""
 
     length: FloatArray
     weight: FloatArray
@@ -100,17 +93,13 @@ def adjust(
     tolerance: float = 1.0,
     near: Adjusted | None = None,
 ) -> Adjusted:
-    """Find the mounting, beside one parameter ``free`` if any, with Cauchy's weights.
+    """Estimate the mounting, with the parameter ``free`` if given, with Cauchy weights.
 
-    Args:
-        observations: the matches.
-        prior: poses, survey and their noise.
-        start: where to start from.
-        free: ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``, or None.
-        tolerance: factor on the length of residual from which on a match loses its weight.
-        near: a solution for the same images, without the parameter, to start from instead.
+    ``free`` is ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``; ``tolerance`` multiplies the
+    residual at which weights fall. It starts from ``start``, or from ``near``, a solution for the same images
+    without the parameter.
     """
-    # Steps move a ground point by centimetres: its distance from the path is taken once.
+    # Steps move a ground point by centimetres: its distance from the path is computed once.
     hits = (hit_ground(start, px, prior.poses[image]) for image, px in _both(observations))
     lower_m = tuple(_beside_m(prior.course_map, one.points_map) - _HALF_TRACK_M for one in hits)
     problem = _Problem(observations, prior, free, tolerance, lower_m)
@@ -143,10 +132,10 @@ def adjust(
 
 
 def _by_stretch(moved: FloatArray, image: IntArray) -> FloatArray:
-    """Variances (U,) of unknowns that each match moves by (N, U), errors going together along the route.
+    """Cluster-robust variances (U,) of unknowns, each moved by (N, U) by the matches.
 
-    It is a cluster-robust variance (Liang and Zeger, Biometrika 73, 1986) whose clusters are stretches with
-    as many matches each; ``image`` (N,) says where on the route a match is.
+    The clusters are segments of the route with equally many matches (Liang and Zeger, Biometrika 73, 1986);
+    ``image`` (N,) orders the matches along it.
     """
     ends = np.quantile(image, np.arange(1, _STRETCHES) / _STRETCHES)
     stretches, place = np.unique(np.searchsorted(ends, image), return_inverse=True)
@@ -164,8 +153,8 @@ def _short(step: FloatArray) -> FloatArray:
 class _Problem:
     """Unknowns, in order: turn, centre, bends, roof, a freed parameter if any, six errors of every pose.
 
-    ``lower_m`` (N,) is by how much a unit of roof lowers the ground, in both images; ``sigma_px`` is the
-    standard deviation of the pixels, None to estimate it anew with every step.
+    A unit of roof lowers the ground by ``lower_m`` (N,), in both images; ``sigma_px`` is the pixels' standard
+    deviation, None to re-estimate it with every step.
     """
 
     observations: Observations
@@ -177,14 +166,14 @@ class _Problem:
 
     @property
     def known(self) -> int:
-        """The number of unknowns beside the poses' errors."""
+        """Number of unknowns without the poses' errors."""
         return _ROOF + 1 + (self.free is not None)
 
     @property
     def stiffness(self) -> FloatArray:
-        """Prior information (U,) of the unknowns beside the poses' errors."""
+        """Prior information (U,) of the unknowns without the poses' errors."""
         stiffness = np.zeros(self.known)
-        # Too few matches must not make it singular: an angle is known to a radian, a parameter to ten units.
+        # Weak priors keep few matches from being singular: 1 rad for an angle, ten units for a parameter.
         stiffness[TURN], stiffness[_ROOF + 1 :] = 1.0, 0.01
         stiffness[_ROOF] = _ROOF_SIGMA**-2
         stiffness[CENTRE], stiffness[BENDS] = self.prior.centre_sigma_m**-2, _LENS_SIGMA_PX**-2
@@ -204,7 +193,7 @@ class _Problem:
         return _Unknowns(mount, extra, errors, now.bends + step[BENDS], now.roof + float(step[_ROOF]))
 
     def poses(self, now: _Unknowns) -> FloatArray:
-        """The poses (I, 4, 4) with their estimated errors and the freed parameter taken in."""
+        """Poses (I, 4, 4) with their estimated errors and the freed parameter applied."""
         prior = self.prior
         turn, shift = now.errors[:, :3].copy(), now.errors[:, 3:].copy()
         if self.free == "clock_s":
@@ -218,7 +207,7 @@ class _Problem:
         return out
 
     def linearise(self, now: _Unknowns) -> _Weighted:
-        """The normal equations, the scale of the pixels' errors estimated from the residuals."""
+        """Normal equations, with the pixel noise estimated from the residuals."""
         residual, jacobian, root = self._differences(now)
         length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
         usable = np.isfinite(length)
@@ -242,12 +231,11 @@ class _Problem:
     def _differences(
         self, now: _Unknowns, noise_px: Sequence[FloatArray] | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Differences (N, 2) m, their derivatives by the unknowns and by both poses, whitening (N, 2, 2).
+        """Differences (N, 2), m, their Jacobians by unknowns and both poses, and whitening (N, 2, 2).
 
-        Once the pixels' scale is known they are taken where pixels would be without their likeliest noise:
-        derivatives at pixels as seen go with it, and thousands of matches add that up to a focal length up to
-        a per cent too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear
-        problems, 1972).
+        Once the noise is known they are linearised at pixels with the most likely noise removed. Jacobians at
+        observed pixels correlate with the noise: over thousands of matches, focal lengths come out up to 1 %
+        too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear problems, 1972).
         """
         seen, poses = self.observations, self.poses(now)
         points, known, pose, slopes = [], [], [], []
@@ -294,7 +282,7 @@ class _Problem:
     def _sum_pairs(
         self, rows: FloatArray, value: FloatArray, seen: Observations
     ) -> tuple[FloatArray, FloatArray]:
-        """Information (U, U) and gradient (U,) of the matches, a block of two poses per pair."""
+        """Information (U, U) and gradient (U,) of the matches, with a block of two poses per pair."""
         known = self.known
         size = known + 6 * len(self.prior.poses)
         information, gradient = np.zeros((size, size)), np.zeros(size)
@@ -310,7 +298,7 @@ class _Problem:
         return information, gradient
 
     def _add_priors(self, now: _Unknowns, information: FloatArray, gradient: FloatArray) -> float:
-        """Add what is stated to the normal equations, in place; returns its cost."""
+        """Add the priors to the normal equations, in place; returns their cost."""
         cost = 0.0
         for state in range(6):
             at = self.known + 6 * np.arange(len(self.prior.poses)) + state
@@ -329,12 +317,12 @@ class _Problem:
 
 
 def _both(seen: Observations) -> tuple[tuple[IntArray, FloatArray], tuple[IntArray, FloatArray]]:
-    """The image (N,) and the pixel (N, 2) of each match, of its first image and of its second."""
+    """Image (N,) and pixel (N, 2) of each match, for its first and its second image."""
     return (seen.first, seen.first_px), (seen.second, seen.second_px)
 
 
 def _beside_m(course_map: FloatArray, points_map: FloatArray) -> FloatArray:
-    """How far (N,) points (N, 2) lie beside the driven path (P, 2)."""
+    """Distance (N,), m, of points (N, 2) from the driven path (P, 2)."""
     ahead = np.gradient(course_map, axis=0)
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)  # of a vehicle that stands
     out = []
@@ -346,7 +334,7 @@ def _beside_m(course_map: FloatArray, points_map: FloatArray) -> FloatArray:
 
 
 def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
-    """Derivative (N, 2, 12) of ground points by the terms of a smooth error of the pixels, in px."""
+    """Jacobian (N, 2, 12) of ground points by the coefficients of the smooth pixel error, px."""
     u, v = (2 * px / [mount.info.width, mount.info.height] - 1).T
     terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
     return np.concatenate([by_px[:, :, k, None] * terms[:, None] for k in (0, 1)], axis=2)

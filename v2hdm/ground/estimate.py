@@ -1,4 +1,4 @@
-"""From a drive to what its bare ground says of its cameras: mounting, further parameters, their errors."""
+"""A camera's mounting, further parameters and their errors, estimated from a drive's bare ground."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ from v2hdm.records import Calibration, Drive, PoseNoise
 from v2hdm.workers import share_out
 
 STEEP_RAD = np.deg2rad(10)
-"""A camera that looks down less shows too short a stretch of ground: focal length and height are a product,
-and a bent lens looks like a bent road."""
+"""Least depression of a camera: seen flatter, focal length and height appear as a product, and lens
+distortion looks like a curved road."""
 
-# Axis of the centre, and how far from its survey it may be, m.
-_FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
+_FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}  # axis, prior sigma, m
 _STRAIGHT = "the vehicle drives straight: drive a turn"
 _FEW = "too few matches: drive farther"
-# Standard deviation above which a value says nothing, a third of the smallest fault worth reporting, and
-# which drive would make it smaller.
+# Largest standard deviation of an observable value, a third of the smallest error worth reporting, and the
+# drive that would reduce it.
 _OBSERVABLE = {
     "clock_s": (0.015, "speed and direction hardly change: drive a turn"),
     "focal_scale": (0.01, "the camera looks too level and the vehicle drives straight: drive a turn"),
@@ -48,29 +47,25 @@ _OBSERVABLE = {
     "left_m": (0.1, _STRAIGHT),
 }  # fmt: skip
 
-# Change of the yaw rate within a pair's length that shows 15 ms over the noise of 20 pairs.
-_LEAST_TURN_RADPS = 0.05
-_STRETCHES = 8  # enough to estimate a spread, few enough that each has several pairs
-_WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two are mostly the survey's
-# Distance between the images of a pair: the error of a position weighs the less the longer it is; beyond, the
-# ground changes its looks and leaves the region that both images show.
+_LEAST_TURN_RADPS = 0.05  # change of yaw rate within a pair that shows 15 ms over the noise of 20 pairs
+_STRETCHES = 8  # enough to estimate a variance, with several pairs in each
+_WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two come mostly from the survey
+# Baseline of a pair: errors of position weigh less the longer it is; beyond, the ground changes its
+# appearance and leaves the region common to both images.
 _APART_M = (2.0, 4.0)
 _GRID_M = 0.04  # spacing of the resampled ground
-# Distance between the images of a pair that shows the clock: motion changes within it.
-_CLOCK_APART_M = (0.8, 4.0)
-_CLOCK_LOOSENED = 2.0  # factor on the stated noise of headings up to which a clock is separable from them
-_LEAST_MATCHES = 60  # ten for each of the six quantities of a mounting
-# How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge, as EN
-# 13036-7 measures it.
-_FLATNESS_M = 0.003
-_LEAST_PATCHES = 200  # fewer in view of all pairs say nothing, matched or not
+_CLOCK_APART_M = (0.8, 4.0)  # baseline of a pair for the clock: motion changes within it
+_CLOCK_LOOSENED = 2.0  # factor on the stated heading noise up to which a clock offset is separable from it
+_LEAST_MATCHES = 60  # ten for each degree of freedom of a mounting
+_FLATNESS_M = 0.003  # roads are laid to 3 to 5 mm under a straightedge, as EN 13036-7 measures it
+_LEAST_PATCHES = 200  # fewer in view of all pairs are no evidence, matched or not
 
 
 class _Stage(NamedTuple):
-    """One round: how far matches are searched, on how wide a grid, in every how manieth pair.
+    """One round: search radius, factor on the grid's spacing, and the step between the pairs used.
 
-    ``loosened`` is how much further off than stated the poses' heading and sideways place may be, so that the
-    few pairs which show a wrong clock do not count as outliers.
+    ``loosened`` scales the noise of heading and lateral position, so that the few pairs which show a clock
+    offset are no outliers.
     """
 
     search_m: float
@@ -104,7 +99,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     if readings.best is Reading.AS_GIVEN:
         solved = None
         if start.mount is not None:
-            # Few pairs do not hold poses that may be far off.
+            # Few pairs cannot hold poses that may be far off.
             solved = _solve(matcher, stated, start.mount, options, _STAGES)
             solved = solved or _solve(matcher, stated, start.mount, options, _HELD_STAGES)
         if solved is not None:
@@ -116,7 +111,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
 
 @dataclass(frozen=True)
 class _Solved:
-    """The last round's matches, what the drive states of them, and the solution."""
+    """The last round's matches, their prior and the solution."""
 
     matched: Round
     stated: Stated
@@ -127,7 +122,7 @@ class _Solved:
 def _solve(
     matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions, stages: Sequence[_Stage]
 ) -> _Solved | None:
-    """Match and adjust in turn, each round from the last one's solution; None where too little matches."""
+    """Match and adjust in turn, each round from the last solution; None with too few matches."""
     path_m = stated.path_m()
     pairs = spread_pairs(path_m, options.pairs, *_APART_M)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
@@ -140,7 +135,7 @@ def _solve(
         if len(matched) < _LEAST_MATCHES:
             return None
         used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
-        # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
+        # With loose headings nothing would hold the camera's yaw against a free clock.
         freed = free if stage.loosened <= _CLOCK_LOOSENED else None
         adjusted = adjust(used, prior, mount, freed, max(stage.loosened / 2, 1.0))
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
@@ -161,10 +156,10 @@ def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> G
     mount, matched, adjusted = solved.adjusted.mount, solved.matched, solved.adjusted
     seen = matched.observations
     factor = _scatter(seen, solved.stated, adjusted)
-    # Ground that is no plane is tilted and lifted for all pairs alike.
+    # Uneven ground tilts and lifts all pairs alike.
     tilt, pitch = _FLATNESS_M / (2 * STRIP_M), _FLATNESS_M / (2 * _APART_M[1])
     flatness = np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
-    # The left tangent of ``cam_from_vehicle``, shift and turn, by turn and centre in vehicle axes.
+    # Left tangent of ``cam_from_vehicle`` (translation, rotation) by turn and centre in vehicle axes.
     by_own = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
     covariance = by_own @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_own.T
     return replace(
@@ -203,12 +198,11 @@ def _innovations(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:
 
 
 def _scatter(observations: Observations, stated: Stated, solved: Adjusted) -> float:
-    """The factor, at least 1, by which the variances of ``solved`` are too small.
+    """Variance inflation factor of ``solved``, at least 1.
 
-    A road is no plane, poses err otherwise than stated, and neighbouring matches share their errors. All that
-    makes stretches disagree. Each is left out in turn (Efron and Stein, The jackknife estimate of variance,
-    1981); the variance of the answers, over the one that they should have, is averaged over the angles and
-    the height.
+    Uneven roads, mis-stated pose noise and errors shared by neighbouring matches make segments of the route
+    disagree. Each segment is left out in turn (Efron and Stein, The jackknife estimate of variance, 1981);
+    the factor is the jackknife variance over the formal one, averaged over the angles and the height.
     """
     pairs, at = np.unique(observations.pair, return_index=True)
     ordered = pairs[np.argsort(observations.first[at], kind="stable")]
@@ -229,7 +223,7 @@ def _scatter(observations: Observations, stated: Stated, solved: Adjusted) -> fl
 
 
 def clock_shows(motion: Motion) -> bool:
-    """Whether the yaw rate really changes along the drive, beyond the noise of smoothed poses."""
+    """Whether the yaw rate changes along the drive, beyond the noise of smoothed poses."""
     low, high = np.percentile(motion.velocity_at_images()[:, 2], (3, 97))
     return bool(high - low > _LEAST_TURN_RADPS)
 
@@ -237,7 +231,7 @@ def clock_shows(motion: Motion) -> bool:
 def _free_parameters(
     names: tuple[str, ...], observations: Observations, solved: _Solved, factor: float
 ) -> Mapping[str, Parameter]:
-    """Each of ``names`` freed alone; ``factor`` is that of all variances, see :func:`_scatter`."""
+    """Each of ``names`` freed alone; ``factor`` inflates all variances, see :func:`_scatter`."""
     turns = clock_shows(solved.stated.motion)
     widened = float(np.sqrt(factor))
     out = {}
@@ -247,7 +241,7 @@ def _free_parameters(
             continue
         value, adjusted, k = _free(name, observations, solved.stated, solved.adjusted)
         largest, why_not = _OBSERVABLE[name]
-        # a fault widens the scatter; that it shows must not hang on it.
+        # An error inflates the variance; whether it is observable must not depend on that.
         observable = name != "clock_s" and float(np.sqrt(adjusted.covariance[k, k])) < largest
         if name == "focal_scale":
             observable = observable and (turns or solved.adjusted.mount.depression_rad > STEEP_RAD)
@@ -259,7 +253,7 @@ def _free_parameters(
 def _free(
     name: str, observations: Observations, stated: Stated, solved: Adjusted
 ) -> tuple[float, Adjusted, int]:
-    """The parameter, the solution with it free, and its place in that one's covariance."""
+    """The parameter, the solution with it free, and its index in that covariance."""
     if name in _FREE_CENTRE:
         axis, sigma_m = _FREE_CENTRE[name]
         wider = replace(stated, centre_sigma_m={**stated.centre_sigma_m, axis: sigma_m})
@@ -274,10 +268,10 @@ def _free(
 
 
 def _sigma(adjusted: Adjusted, k: int, usual: float) -> float:
-    """By how far stretches of the route disagree on an unknown, moderated by what is ``usual`` in this drive.
+    """Standard deviation from the disagreement of the route's segments, shrunk to the drive's ``usual``.
 
-    The few stretches say little of their own noise (Smyth, Statistical Applications in Genetics and Molecular
-    Biology 3, 2004).
+    Variances of so few segments are themselves noisy (Smyth, Statistical Applications in Genetics and
+    Molecular Biology 3, 2004).
     """
     data = adjusted.data_variance[k]
     multiple = (usual + adjusted.stretch_variance[k] / max(data, 1e-300)) / 2
@@ -290,16 +284,10 @@ _worker_drive: Drive | None = None
 def estimate_cameras(
     drive: Drive, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, GroundEstimate]:
-    """Estimate every camera's mounting from bare ground, each in a process of its own.
+    """Estimate every camera's mounting from bare ground, in up to ``workers`` single-threaded processes.
 
-    Args:
-        drive: the drive.
-        workers: processes, one thread each; 1 stays in this process.
-        progress: called as ``progress(done, total)`` before the first camera and after each.
-
-    Raises:
-        DriveError: an image cannot be read.
-        WorkerError: a process died.
+    ``progress(done, total)`` is called before the first camera and after each; 1 worker is this process.
+    Raises DriveError for an unreadable image, WorkerError if a process died.
     """
     found: dict[str, GroundEstimate] = {}
 

@@ -1,4 +1,4 @@
-"""Where a mounted camera's pixels meet the ground, and the derivatives by all that may be wrong."""
+"""Intersection of a mounted camera's rays with the ground, and Jacobians by everything that may be wrong."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import hat, rotation_from_vector
 from v2hdm.records import Camera, CameraInfo, FloatArray
 
-_LENS_STEP = 1e-5  # of the differences by focal length, as a share of it, and by k1
+_LENS_STEP = 1e-5  # finite differences: of the focal length, relative, and of k1
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Mount:
 
     @property
     def depression_rad(self) -> float:
-        """How far the optical axis points below the horizon."""
+        """Angle of the optical axis below the horizon."""
         return float(np.arcsin(-self.vehicle_from_cam_rotation[2, 2]))
 
     def moved(self, turn_rad: FloatArray, shift_m: FloatArray) -> Mount:
-        """Turned about its centre by a rotation vector (3,) in vehicle axes, and shifted (3,) m."""
+        """The mount turned about its centre by a rotation vector (3,), vehicle axes, and shifted (3,), m."""
         return replace(
             self,
             vehicle_from_cam_rotation=rotation_from_vector(turn_rad) @ self.vehicle_from_cam_rotation,
@@ -56,14 +56,14 @@ class Mount:
         return replace(self, vehicle_from_cam_rotation=turn, centre_vehicle=half @ self.centre_vehicle)
 
     def with_focal_scale(self, scale: float) -> Mount:
-        """With focal lengths larger by the fraction ``scale``."""
+        """The mount with focal lengths longer by the fraction ``scale``."""
         intrinsic = self.info.intrinsic.copy()
         intrinsic[0, :2] *= 1 + scale
         intrinsic[1, 1] *= 1 + scale
         return replace(self, info=replace(self.info, intrinsic=intrinsic))
 
     def with_k1(self, change: float) -> Mount:
-        """With ``change`` added to the first coefficient of its distortion."""
+        """The mount with ``change`` added to k1."""
         first, *rest = self.info.distortion
         return replace(self, info=replace(self.info, distortion=(first + change, *rest)))
 
@@ -79,7 +79,7 @@ class Mount:
         pinhole, depth_m = project_ground(self.info.intrinsic, cam_from_map, ground_map)
         size = np.array([self.info.width, self.info.height])
         with np.errstate(invalid="ignore"):
-            # a lens model bends back points far outside the view.
+            # Far outside the image a lens model folds points back into it.
             low, high = -0.5 * size, 1.5 * size
             hidden = (depth_m <= 0) | ((pinhole < low) | (pinhole > high)).any(axis=1)
             pinhole[hidden] = size / 2
@@ -90,19 +90,17 @@ class Mount:
 
 
 def guessed_mount(camera: Camera) -> Mount:
-    """The mounting that a camera's initial IPM stands for."""
+    """The mounting of a camera's initial IPM."""
     return Mount.at(camera.info, extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]))
 
 
 @dataclass(frozen=True)
 class GroundHits:
-    """Where rays meet the ground z = 0 of the map.
+    """Intersections of rays with the ground z = 0 of the map.
 
-    Attributes:
-        points_map: (N, 2) m.
-        plane: (N, 2, 3): how the hit moves when the point that it shows is moved in vehicle axes.
-        arm: (N, 3) from the camera's centre to the ground point, vehicle axes, m.
-        point_vehicle: (N, 3) the ground point in the vehicle frame, m.
+    ``points_map`` (N, 2), m; ``plane`` (N, 2, 3) is their Jacobian by motion of the ground point in vehicle
+    axes, ``arm`` (N, 3), m, leads from the camera centre to the ground point in vehicle axes, and
+    ``point_vehicle`` (N, 3), m, is that point in the vehicle frame.
     """
 
     points_map: FloatArray
@@ -119,11 +117,11 @@ class GroundHits:
         return np.concatenate([self.plane @ -hat(self.point_vehicle), self.plane], axis=2)
 
     def by_fall(self, lower_m: FloatArray) -> FloatArray:
-        """How the hits move (N, 2) where the ground lies ``lower_m`` (N,) below the plane, to first order."""
+        """First-order shift (N, 2) of the points for ground ``lower_m`` (N,) below the plane."""
         return np.asarray(self.plane[:, :, 2] * lower_m[:, None])
 
     def by_motion(self, velocity: FloatArray) -> FloatArray:
-        """Derivative (N, 2) by time, the vehicle moving at ``velocity`` (N, 3): m/s, m/s, rad/s."""
+        """Derivative (N, 2) by time for ``velocity`` (N, 3) of the vehicle: m/s, m/s, rad/s."""
         moved = np.zeros((len(velocity), 3))
         moved[:, 0] = velocity[:, 0] - velocity[:, 2] * self.point_vehicle[:, 1]
         moved[:, 1] = velocity[:, 1] + velocity[:, 2] * self.point_vehicle[:, 0]
@@ -131,7 +129,7 @@ class GroundHits:
 
 
 def hit_ground(mount: Mount, points_px: FloatArray, poses: FloatArray) -> GroundHits:
-    """The ground that pixels (N, 2) show, the vehicle being at ``poses`` (N, 4, 4)."""
+    """Ground points at pixels (N, 2), from vehicle ``poses`` (N, 4, 4)."""
     rays_vehicle = mount.rays(points_px)
     turn, position = poses[:, :3, :3], poses[:, :3, 3]
     rays_map = (turn @ rays_vehicle[:, :, None])[..., 0]
@@ -147,16 +145,16 @@ def hit_ground(mount: Mount, points_px: FloatArray, poses: FloatArray) -> Ground
 
 
 def by_lens(mount: Mount, points_px: FloatArray, poses: FloatArray, name: str) -> FloatArray:
-    """Derivative (N, 2) of the ground points by ``focal_scale`` or ``distortion_k1``, by differences."""
+    """Derivative (N, 2) of ground points by ``focal_scale`` or ``distortion_k1``, by finite differences."""
     change = mount.with_focal_scale if name == "focal_scale" else mount.with_k1
     low, high = (hit_ground(change(step), points_px, poses) for step in (-_LENS_STEP, _LENS_STEP))
     return np.asarray((high.points_map - low.points_map) / (2 * _LENS_STEP))
 
 
 def by_pixel(mount: Mount, hits: GroundHits) -> FloatArray:
-    """Derivative (N, 2, 2) of the ground points by the pinhole pixels that show them.
+    """Jacobian (N, 2, 2) of the ground points by their pinhole pixels.
 
-    The lens stretches pixels by a few per cent at the most where the ground is; that is left out.
+    Neglects the lens: it scales pixels by a few per cent at most where the ground is.
     """
     depth = np.linalg.norm(hits.arm @ mount.vehicle_from_cam_rotation[:, 2:], axis=1)
     across = mount.vehicle_from_cam_rotation @ np.linalg.inv(mount.info.intrinsic)[:, :2]

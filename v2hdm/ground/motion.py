@@ -1,4 +1,4 @@
-"""Where the vehicle was at each image and how it moved, and which images are compared with each other."""
+"""Poses and motion of the vehicle at each image, and the choice of image pairs."""
 
 from __future__ import annotations
 
@@ -11,24 +11,20 @@ from v2hdm.geometry.rigid import heading_rad, interpolate, rotation_from_euler
 from v2hdm.ground.results import Reading
 from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
-# Half width of the parabola fitted to the poses: steering and pedals change the motion no faster.
-_SMOOTHING_S = 0.5
-_STANDING_MPS = 0.3  # below this a path has no direction: receivers wander by centimetres
+_SMOOTHING_S = 0.5  # half width of the parabola fitted to poses: steering and pedals act no faster
+_STANDING_MPS = 0.3  # below this a path has no direction: GNSS positions wander by centimetres
 _PATH_STEP_M = 0.5
-_BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
-ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
+_BEYOND_M = 30.0  # straight extension of the path beyond the drive's ends, the reach of a region
+ARM_M = 10.0  # a turn by 1 rad moves the visible ground by about this
 
 
 @dataclass(frozen=True)
 class Motion:
     """The vehicle at the images of one camera.
 
-    Attributes:
-        image: (I,) indices into ``Drive.images``.
-        stamp_s: (I,) their stamps.
-        trajectory: all recorded poses, under the reading.
-        path_m: (P,) distance driven at each pose of ``trajectory``.
-        velocity: (P, 3) forward and left in m/s and yaw rate in rad/s, smoothed, at each pose.
+    ``image`` (I,) indexes ``Drive.images``, ``stamp_s`` (I,) are their stamps. The ``trajectory`` has all
+    recorded poses, under the reading, ``path_m`` (P,) the distance driven and ``velocity`` (P, 3) the
+    smoothed forward and left speed, m/s, and yaw rate, rad/s, at each.
     """
 
     image: IntArray
@@ -38,11 +34,11 @@ class Motion:
     velocity: FloatArray
 
     def poses(self, clock_s: float = 0.0) -> FloatArray:
-        """``map_from_vehicle`` (I, 4, 4), the images being taken ``clock_s`` after their stamps."""
+        """``map_from_vehicle`` (I, 4, 4) at the images, taken ``clock_s`` after their stamps."""
         return interpolate(self.trajectory, self.stamp_s + clock_s, np.inf)[0]
 
     def course_map(self) -> FloatArray:
-        """Places (N, 2) of the driven path, half a metre apart, continued straight at both ends."""
+        """Points (N, 2) of the driven path, half a metre apart, extended straight at both ends."""
         poses = self.trajectory.map_from_vehicle
         at = np.arange(0.0, self.path_m[-1] + _PATH_STEP_M, _PATH_STEP_M)
         keep = np.concatenate([[True], np.diff(self.path_m) > 1e-9])
@@ -61,7 +57,7 @@ class Motion:
 
 
 def motion_of(drive: Drive, camera: str, reading: Reading) -> Motion:
-    """The motion of ``drive`` at the images of ``camera``, its poses read as ``reading`` says."""
+    """The motion of ``drive`` at the images of ``camera``, its poses read as ``reading``."""
     image = np.array([k for k, entry in enumerate(drive.images) if entry.camera == camera], dtype=np.int64)
     stamp_s = np.array([drive.images[k].stamp_s for k in image])
     trajectory = _read_as(drive.trajectory or trajectory_of_images(drive), reading)
@@ -70,7 +66,7 @@ def motion_of(drive: Drive, camera: str, reading: Reading) -> Motion:
 
 
 def trajectory_of_images(drive: Drive) -> Trajectory:
-    """The poses of a drive's images, for drives of which nothing else is kept."""
+    """The poses of a drive's images, for drives without any others."""
     stamp_s, first = np.unique([image.stamp_s for image in drive.images], return_index=True)
     return Trajectory(stamp_s, np.array([drive.images[k].map_from_vehicle for k in first]))
 
@@ -100,12 +96,12 @@ def _velocity(trajectory: Trajectory) -> FloatArray:
 
 
 def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
-    """Derivatives (P, K) of values (P, K): of parabolas fitted within :data:`_SMOOTHING_S` of each time."""
+    """Derivatives (P, K) of values (P, K) from parabolas fitted within :data:`_SMOOTHING_S`."""
     out = np.zeros_like(values)
     first = np.searchsorted(at, at - _SMOOTHING_S - 1e-9)
     last = np.searchsorted(at, at + _SMOOTHING_S + 1e-9)
     for k in range(len(at)):
-        # Three poses at least, even where they are further apart.
+        # Three poses at least, however far apart.
         low, high = max(min(first[k], k - 1), 0), min(max(last[k], k + 2), len(at))
         if high - low < 2:
             continue
@@ -116,13 +112,9 @@ def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: float) -> IntArray:
-    """Pairs (P, 2) of images, spread evenly along the path, no image used twice where that is possible.
+    """Pairs (P, 2) of images, spread evenly along ``path_m`` (I,), using no image twice if possible.
 
-    Args:
-        path_m: (I,) distance driven at each image, not falling.
-        count: how many pairs are wanted.
-        shortest_m: distance between the images of a pair, at least.
-        longest_m: and at most.
+    ``count`` pairs are wanted, their baselines between ``shortest_m`` and ``longest_m``.
     """
     chosen: list[tuple[int, int]] = []
     used: set[int] = set()
@@ -145,7 +137,7 @@ def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: f
 def changing_pairs(
     path_m: FloatArray, values: FloatArray, count: int, shortest_m: float, longest_m: float
 ) -> IntArray:
-    """Pairs (P, 2) of images between which values (I, K) change most, no image used twice."""
+    """Pairs (P, 2) of images with the largest change of ``values`` (I, K), using no image twice."""
     found: list[tuple[float, int, int]] = []
     for first in range(len(path_m)):
         away = path_m - path_m[first]

@@ -1,4 +1,4 @@
-"""Patches of ground that two images share: resampled from above, matched, and turned back into raw pixels."""
+"""Ground patches common to two images: rectified, matched, and mapped back to raw pixels."""
 
 from __future__ import annotations
 
@@ -21,22 +21,20 @@ from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
-STRIP_M = 2.0  # ground so far to either side of the driven path is taken for road
-_PATCH_M, _STEP_M = 0.9, 0.6  # side of a patch; distance of the next, which it overlaps by a third
-_LEAST_CORRELATION = 0.5  # normalised cross-correlation below which two patches are not the same ground
-# Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself.
-_LEAST_ROUNDNESS = 0.1
-_LEAST_LEAD = 0.1  # a second peak, elsewhere in the search, must stay so much below the best one
-_PEAK_CELLS = 3  # half width of what belongs to a peak, in cells of the grid
-# Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
-# with the light or the camera instead of the ground, m.
+STRIP_M = 2.0  # half width of the strip about the driven path that counts as road
+_PATCH_M, _STEP_M = 0.9, 0.6  # side of a patch; spacing, which leaves an overlap of a third
+_LEAST_CORRELATION = 0.5  # least normalised cross-correlation of two patches of the same ground
+_LEAST_ROUNDNESS = 0.1  # ratio of a peak's curvatures; below, the patch is an edge that slides along itself
+_LEAST_LEAD = 0.1  # least lead of the best peak over another one in the search window
+_PEAK_CELLS = 3  # half width of a peak, grid cells
+# Standard deviation, m, of the high-pass filter: highlights, shadows and wet sheen are wider, and move with
+# the light or the camera rather than the ground.
 _COARSEST_M = 0.1
-_LEAST_CONTRAST = 1.0  # grey levels; less than this is the noise of an even surface
-_ALL = 0.9999  # mean of flags that are all set, but for rounding
-# Matches of a pair lie on one plane to within this: off it are kerbs, shadows and moving things.
-_HOMOGRAPHY_PX = 2.0
-_LEAST_OF_A_PAIR = 8  # twice the four that a homography takes
-_AROUND_M = 2.0  # how far beyond a region its ground is looked for: neighbouring images are as far apart
+_LEAST_CONTRAST = 1.0  # grey levels; below is the noise of an even surface
+_ALL = 0.9999  # mean of flags that are all set, up to rounding
+_HOMOGRAPHY_PX = 2.0  # inlier threshold of a pair's plane; kerbs, shadows and moving things are off it
+_LEAST_OF_A_PAIR = 8  # twice the four of a homography
+_AROUND_M = 2.0  # search margin around a region: the spacing of neighbouring images
 _STILL_PX = (
     1.5  # what moves less between images far apart is bonnet, shadow of the vehicle, or dirt on the lens
 )
@@ -51,13 +49,13 @@ class View:
     map_from_vehicle: FloatArray
 
     def pixels(self, ground_map: FloatArray) -> FloatArray:
-        """Raw pixels (N, 2) of ground points (N, 2) of the map, nan where the image does not show them."""
+        """Raw pixels (N, 2) of ground points (N, 2) of the map, nan outside the image."""
         return self.mount.project_ground(ground_map, self.map_from_vehicle)
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of one pair: raw pixels (N, 2) in both images, and how many patches were looked for."""
+    """Matches of one pair: raw pixels (N, 2) in both images, and the number of patches sought."""
 
     first_px: FloatArray
     second_px: FloatArray
@@ -65,7 +63,7 @@ class Matches:
 
     @classmethod
     def none_of(cls, sought: int) -> Matches:
-        """No matches at all."""
+        """No matches."""
         return cls(np.empty((0, 2)), np.empty((0, 2)), sought)
 
     def __len__(self) -> int:
@@ -87,7 +85,7 @@ class Sheet:
     ) -> tuple[Sheet, IntArray]:
         """A sheet around points (N, 2) with a ``margin`` of cells, and their nearest cells (N, 2) in it.
 
-        It is aligned with a pose (4, 4): rows ahead, columns to the left.
+        Rows run ahead and columns to the left of a pose (4, 4).
         """
         forward = pose[:2, 0] / np.linalg.norm(pose[:2, 0])
         axes = np.array([forward, [-forward[1], forward[0]]])
@@ -104,11 +102,11 @@ class Sheet:
         return self.at(np.column_stack([ahead.ravel(), left.ravel()]))
 
     def at(self, cells: FloatArray | IntArray) -> FloatArray:
-        """Map points (N, 2) of grid places (N, 2): rows, columns."""
+        """Map points (N, 2) of grid positions (N, 2): row, column."""
         return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
 
     def resample(self, view: View) -> tuple[Float32Array, BoolArray]:
-        """The ground as ``view`` shows it (rows, columns), float32, and where it does."""
+        """The rectified ground (rows, columns) of ``view``, float32, and a mask of its pixels in view."""
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
         px[~seen] = -1
@@ -116,7 +114,7 @@ class Sheet:
         return grey, seen
 
     def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
-        """The same without anything wider than the texture of the ground."""
+        """:meth:`resample`, high-pass filtered to the ground's texture."""
         grey, seen = self.resample(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
@@ -126,9 +124,9 @@ def patch_centres(
     roi_vehicle: FloatArray,
     path_map: FloatArray,
 ) -> FloatArray:
-    """Centres (N, 2) in the map of patches within the region of both poses and beside the driven path.
+    """Centres (N, 2) in the map of patches within the region at both poses and near the driven path.
 
-    They lie on a lattice that is aligned with the first pose.
+    Their lattice is aligned with the first pose.
     """
     pose, lattice = poses[0], _lattice(roi_vehicle)
     centres = lattice @ pose[:2, :2].T + pose[:2, 3]
@@ -143,14 +141,14 @@ def patch_centres(
 
 
 def _lattice(roi_vehicle: FloatArray) -> FloatArray:
-    """Places (N, 2) of patches over the rectangle around a region."""
+    """Lattice points (N, 2) of patches over the bounding rectangle of a region."""
     low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
     ahead, left = np.meshgrid(*(np.arange(a, b, _STEP_M) for a, b in zip(low, high, strict=True)))
     return np.column_stack([ahead.ravel(), left.ravel()])
 
 
 def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, grid_m: float) -> Matches:
-    """Find patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
+    """Match patches at ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
     half = round(_PATCH_M / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
     sheet, cells = Sheet.around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
@@ -180,9 +178,9 @@ def match_pair(first: View, second: View, centres_map: FloatArray, search_m: flo
 
 
 def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, grid_m: float) -> Matches:
-    """Find patches of a region of the first image in the second wherever they are, by no pose at all.
+    """Match patches of a region of the first image anywhere in the second, without a pose.
 
-    The mounting only says how the ground is laid out; both views are at the same pose.
+    The mounting rectifies the ground; both views are at the same pose.
     """
     centres = _lattice(roi_vehicle)
     centres = centres[inside_convex(roi_vehicle, centres)]
@@ -209,12 +207,12 @@ def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, grid_m: f
 
 
 def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
-    """Means over squares of ``2 half + 1`` cells around each."""
+    """Means over squares of ``2 half + 1`` cells."""
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
 
 
 def _peak(score: Float32Array) -> tuple[float, float] | None:
-    """Row and column of the best place, refined by a paraboloid; None for no clear one."""
+    """Row and column of the best match, refined by a paraboloid; None if ambiguous."""
     _, best, _, (column, row) = cv2.minMaxLoc(score)
     rows, columns = score.shape
     if best < _LEAST_CORRELATION or not (0 < row < rows - 1 and 0 < column < columns - 1):
@@ -241,7 +239,7 @@ def _peak(score: Float32Array) -> tuple[float, float] | None:
 
 
 def _on_one_plane(matches: Matches) -> Matches:
-    """The matches that one homography of the two images explains: a plane seen twice."""
+    """The inliers of one homography between the images: a plane seen twice."""
     known = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
     first, second = matches.first_px[known], matches.second_px[known]
     if len(first) < _LEAST_OF_A_PAIR:
@@ -255,7 +253,7 @@ def _on_one_plane(matches: Matches) -> Matches:
 
 @dataclass(frozen=True)
 class Round:
-    """Matches of all pairs of one round; ``share`` of the patches in view that found a partner."""
+    """Matches of all pairs of one round; ``share`` is the matched fraction of the patches in view."""
 
     observations: Observations
     sought: int
@@ -266,7 +264,7 @@ class Round:
 
 
 class Matcher:
-    """Matches ground between images of one camera; images are read once and kept."""
+    """Matches ground between images of one camera; images are read once and cached."""
 
     def __init__(self, drive: Drive, camera: str, motion: Motion):
         self._drive = drive
@@ -284,7 +282,7 @@ class Matcher:
     def match(
         self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float
     ) -> Round:
-        """Match every pair (P, 2) of rows of ``poses`` on a grid that is laid out from ``mount``."""
+        """Match every pair (P, 2) of rows of ``poses`` on a grid rectified with ``mount``."""
         found: list[Matches] = []
         for first, second in pairs.tolist():
             centres = patch_centres((poses[first], poses[second]), self._roi, self._path)
@@ -299,22 +297,18 @@ class Matcher:
         return Round(observations, sought, len(pair) / sought if sought else 0.0)
 
     def match_anywhere(self, mount: Mount, pairs: IntArray, grid_m: float) -> list[Matches]:
-        """Patches of first images that are found again in the second ones, anywhere, by pair (P, 2)."""
+        """Patches of the first images matched anywhere in the second, by pair (P, 2)."""
         views = [[View(self._read(row), mount, np.eye(4)) for row in pair] for pair in pairs.tolist()]
         return [match_anywhere(first, second, self._roi, grid_m) for first, second in views]
 
     def _read(self, row: int) -> ImageArray:
-        """The image of a row of the motion, as grey values."""
+        """Grey values of the image at a row of the motion."""
         if row not in self._grey:
             self._grey[row] = read_grey(str(self._drive.images[int(self._image[row])].path))
         return self._grey[row]
 
 
 def read_grey(path: str) -> ImageArray:
-    """The image file at ``path`` as grey values (H, W), uint8.
-
-    Raises:
-        DriveError: it cannot be read.
-    """
-    # A JPEG decoded as grey is its luma, a level or two off the grey of the same pixels stored as PNG.
+    """The image file at ``path`` as grey values (H, W), uint8; raises DriveError if unreadable."""
+    # Decoding JPEG as grey yields its luma, a level or two off the grey of the same pixels in PNG.
     return np.asarray(cv2.cvtColor(read_pixels(Path(path), cv2.IMREAD_COLOR), cv2.COLOR_BGR2GRAY))

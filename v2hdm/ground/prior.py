@@ -1,4 +1,4 @@
-"""Matches of the ground, and what a drive states about the images that they are in."""
+"""Ground matches, and the drive's statements about their images, as a prior."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from v2hdm.ground.motion import Motion
 from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
 
 HEAVE_SIGMA_M = 0.01
-"""How far a vehicle's body moves up and down on its suspension on paved ground; the mapper's figure."""
+"""Vertical motion of the body on its suspension on paved ground, m; equal to the mapping's."""
 
 STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
 """Errors of a pose, rad and m, in vehicle axes."""
 
-_LEAST_POSE_SIGMA = 1e-6  # poses stated to be exact would make the covariance singular: m or rad
-# Largest factor on the error along the path: with more, distance and height slide together.
-_FORWARD_LOOSENED = 2.0
-_UNSURVEYED_M = 0.5  # how far the centre that follows from a guess may be off, m
-# The ground shows the height to millimetres; a survey's own sigma would only bias it, m.
-_HEIGHT_SIGMA_M = 0.2
+_LEAST_POSE_SIGMA = 1e-6  # m or rad; poses stated as exact would make the covariance singular
+_FORWARD_LOOSENED = 2.0  # largest factor on the error along the path; beyond, distance and height drift
+_UNSURVEYED_M = 0.5  # error of a camera centre from a guess, m
+_HEIGHT_SIGMA_M = 0.2  # the ground shows the height to millimetres; a survey's sigma would only bias it
 
 
 @dataclass(frozen=True)
 class Observations:
     """Matches of all pairs of one camera.
 
-    ``first`` and ``second`` (N,) are the images of each match, rows of the poses; ``first_px`` and
-    ``second_px`` (N, 2) its raw pixels there; ``pair`` (N,) the pair that it belongs to.
+    ``first`` and ``second`` (N,) are rows of the poses, ``first_px`` and ``second_px`` (N, 2) raw pixels,
+    ``pair`` (N,) the pair's index.
     """
 
     first: IntArray
@@ -39,7 +37,7 @@ class Observations:
     pair: IntArray
 
     def only(self, keep: BoolArray) -> Observations:
-        """The matches of a mask (N,)."""
+        """The matches selected by a mask (N,)."""
         return Observations(*(values[keep] for values in vars(self).values()))
 
 
@@ -47,14 +45,10 @@ class Observations:
 class Prior:
     """The statements of a drive about I images and their camera.
 
-    Attributes:
-        poses: (I, 4, 4) ``map_from_vehicle`` as recorded.
-        pose_information: (6, I, I) of the poses' errors; see :func:`pose_information`.
-        velocity: (I, 3) smoothed motion.
-        climb_m: (I,) by how much a grade of 1 has lifted the poses, m.
-        course_map: (N, 2) places of the driven path, m.
-        centre_vehicle: (3,) surveyed camera centre, m.
-        centre_sigma_m: (3,) its standard deviations.
+    ``poses`` (I, 4, 4) are ``map_from_vehicle`` as recorded, ``pose_information`` (6, I, I) that of their
+    errors, ``velocity`` (I, 3) the smoothed motion. A grade of 1 has lifted the poses by ``climb_m`` (I,), m.
+    ``course_map`` (N, 2), m, are points of the driven path; ``centre_vehicle`` and ``centre_sigma_m`` (3,),
+    m, the surveyed camera centre.
     """
 
     poses: FloatArray
@@ -70,8 +64,8 @@ class Prior:
 class Stated:
     """The statements of a drive about one camera, its poses under one reading.
 
-    ``clock_s`` is added to the stamps of its images, ``centre_sigma_m`` replaces the survey's own along
-    single axes, and without ``surveyed`` only the guess says where the centre is.
+    ``clock_s`` is added to image stamps, ``centre_sigma_m`` overrides the survey's by axis; without
+    ``surveyed`` the centre is the guess's.
     """
 
     drive: Drive
@@ -83,7 +77,7 @@ class Stated:
     surveyed: bool = True
 
     def with_surveyed_height(self) -> Stated:
-        """The same with the surveyed height as stated, which distance and focal length look like."""
+        """The same with the survey's own sigma of the height, which resembles distance and focal length."""
         prior = self.camera.centre_prior
         return self if prior is None else replace(self, centre_sigma_m={2: float(prior.sigma_m[2])})
 
@@ -98,11 +92,9 @@ class Stated:
     def prior_of(
         self, observations: Observations, loosened: float = 1.0
     ) -> tuple[Observations, Prior, IntArray]:
-        """The observations with their images renumbered, the prior of these images, and their rows.
+        """The observations with images renumbered, the prior of these images, and their rows of the motion.
 
-        Args:
-            observations: matches between rows of the motion.
-            loosened: factor on the stated errors of headings and of places across the path.
+        ``loosened`` multiplies the stated errors of heading and lateral position.
         """
         rows, place = np.unique(
             np.concatenate([observations.first, observations.second]), return_inverse=True
@@ -135,12 +127,9 @@ def state_sigmas(noise: PoseNoise) -> FloatArray:
 
 
 def pose_information(noise: PoseNoise, path_m: FloatArray, loosened: FloatArray) -> FloatArray:
-    """Inverse covariance (6, I, I) of each state's errors at the images.
+    """Inverse covariance (6, I, I) of each state's errors at images after driving ``path_m`` (I,).
 
-    Args:
-        noise: as the drive states it; drifts tie images together that are near to each other on the path.
-        path_m: (I,) distance driven at each image.
-        loosened: (6,) factors on the standard deviations.
+    Drift correlates images that are close on the path; ``loosened`` (6,) multiplies standard deviations.
     """
     apart_m = np.abs(path_m[:, None] - path_m[None])
     drifts = (

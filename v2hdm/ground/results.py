@@ -1,4 +1,4 @@
-"""Options and results of the ground's estimate, and the better start that they give the mapper."""
+"""Options and results of the ground's estimate, and the initial IPM that it gives the mapping."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import Calibration, Camera, Drive
 
 GROUND_IPM = "ground"
-"""Name of the IPM that the ground gives, beside those of the drive."""
+"""Name of the ground's IPM, beside those of the drive."""
 
 _SURE_RAD = np.deg2rad(0.5)  # an estimate with a larger standard deviation is no better than a guess
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundOptions:
-    """How the ground is matched.
+    """Options of ground matching.
 
-    Attributes:
-        pairs: image pairs that the mounting is found from.
-        clock_pairs: further pairs, where speed or yaw rate change, for the clock.
-        free: names of the parameters to free, one at a time, beside the mounting; see :class:`Parameter`.
-        readings: whether to try how else the poses could be read.
+    ``pairs`` of images fix the mounting, ``clock_pairs``, with changing speed or yaw rate, the clock.
+    ``free`` names parameters to free one at a time, see :class:`Parameter`; ``readings`` also tries other
+    readings of the poses.
     """
 
     pairs: int = 36
@@ -37,37 +35,37 @@ class GroundOptions:
 
 
 class GroundStatus(Enum):
-    """Whether the ground gave an answer."""
+    """Outcome of the estimate."""
 
     FOUND = "found"
     NO_MATCH = "no match"
-    """The ground moves between images otherwise than the poses as given say."""
+    """The ground's motion between images contradicts the poses as given."""
     TOO_LITTLE = "too little"
-    """Too little motion or ground in view."""
+    """Too little motion, or ground in view."""
     NO_TEXTURE = "no texture"
-    """Too few patches are found again to estimate a mounting, and none contradicts the poses."""
+    """Too few patches match to estimate a mounting, and none contradicts the poses."""
 
 
 class Reading(Enum):
-    """How the recorded poses can be read."""
+    """An interpretation of the recorded poses."""
 
     AS_GIVEN = "as given"
     HEADING_FROM_PATH = "heading from path"
-    """The vehicle heads along its path, whatever its recorded yaw."""
+    """The vehicle heads along its path; the recorded yaw is ignored."""
     MIRRORED = "mirrored"
-    """x and y of the positions are swapped, which mirrors the world; the vehicle heads along its path."""
+    """x and y of positions are swapped, which mirrors the world; the vehicle heads along its path."""
     BACKWARDS = "backwards"
-    """The camera looks the other way than its guess: front and rear are swapped."""
+    """The camera looks opposite to its guess: front and rear are swapped."""
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One quantity that the ground may contradict, freed beside the mounting.
 
-    ``name`` is one of: ``clock_s`` (an image was taken so much later on the poses' clock than its stamp
-    says), ``focal_scale`` (focal length / given one - 1), ``distortion_k1`` (k1 - given one), ``grade`` (rise
-    of the poses over the ground, m per m driven), ``up_m``, ``forward_m`` and ``left_m`` (camera centre -
-    stated one). Where this drive does not make it ``observable``, ``why_not`` says which drive would.
+    ``name`` is ``clock_s`` (exposure time on the poses' clock minus stamp), ``focal_scale`` (focal length
+    over the given one, minus 1), ``distortion_k1`` (minus the given one), ``grade`` (rise of the poses over
+    the ground, m per m driven), or ``up_m``, ``forward_m``, ``left_m`` (camera centre minus the stated one).
+    If not ``observable``, ``why_not`` names a drive that would show it.
     """
 
     name: str
@@ -81,10 +79,10 @@ class Parameter:
 class GroundEstimate:
     """The mounting of one camera and the errors of a drive's statements, from bare ground.
 
-    ``shares``: of the patches, how many find a partner under each reading of the poses; ``reading`` is the
-    best one. ``calibration`` has ``cam_from_vehicle`` with its covariance, None unless ``status`` is FOUND.
-    ``median_residual`` is in units of :data:`v2hdm.ground.adjust.PIXEL_SIGMA`: .3 to .5 on a clean drive.
-    ``innovations`` are the root mean squares of the poses' estimated errors in their stated sigmas.
+    ``shares`` are the matched fractions of patches under each reading of the poses, ``reading`` the best.
+    ``calibration`` has ``cam_from_vehicle`` with its covariance, None unless ``status`` is FOUND.
+    ``median_residual`` is in units of :data:`v2hdm.ground.adjust.PIXEL_SIGMA`, 0.3 to 0.5 on a clean drive.
+    ``innovations`` are the RMS of estimated pose errors in stated sigmas.
     """
 
     camera: str
@@ -99,7 +97,7 @@ class GroundEstimate:
 
 
 def better_start(drive: Drive, estimates: Mapping[str, GroundEstimate]) -> Drive:
-    """The drive with its cameras started from the ground's mounting, where that is found and sure."""
+    """The drive with its cameras started from the ground's mounting where that is found and certain."""
     cameras = {
         name: _started(camera, estimates[name]) if name in estimates else camera
         for name, camera in drive.cameras.items()

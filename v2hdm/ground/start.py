@@ -1,4 +1,4 @@
-"""A first mounting under which the ground matches, and the reading of the poses that fits the ground."""
+"""An initial mounting under which the ground matches, and the reading of the poses that fits it best."""
 
 from __future__ import annotations
 
@@ -18,33 +18,29 @@ from v2hdm.ground.results import Reading
 from v2hdm.records import Drive, FloatArray, IntArray
 
 _PAIRS, _GRID_M = 10, 0.06
-# Distance between the images of a pair that a start is found by: a wrong guess shifts the ground by a part
-# of it.
-_SHORT_M = (0.3, 1.6)
-_TOLERANCE = 8.0  # factor on the residual from which on a match loses its weight: the guess is degrees off
+_SHORT_M = (0.3, 1.6)  # baseline of a pair for the start: a wrong guess shifts the ground by a fraction of it
+_TOLERANCE = 8.0  # factor on the residual at which weights fall: the guess is degrees off
 _SEARCH_M = (0.9, 0.5)
 _LEAST_SHARE = 0.1
-"""Share of patches that must find a partner: of parts of a real drive, half in the shade of trees, .16 to .43
-do once the pitch is settled, and .09 at most where positions are in feet or images upside down."""
-_TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)  # pitches that are tried in turn
-_FARTHEST_DEG = 20.0  # a start further off its guess is none
+"""Least matched fraction of patches: .16 to .43 in parts of a real drive half in the shade of trees, once the
+pitch has settled; at most .09 with positions in feet or images upside down."""
+_TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)  # pitch offsets, tried in this order
+_FARTHEST_DEG = 20.0  # largest angle between a start and its guess
 _LEAST_MATCHES = 30  # ten for each angle of the mounting
-# Distance between the images of a pair that separates readings: poses read wrongly move the ground further
-# than the search.
+# Baseline of a pair that separates readings: wrongly read poses move the ground beyond the search.
 _APART_M = (1.2, 2.8)
-_TURN_RAD = np.deg2rad(2)  # a turn between the images of a pair that is no noise of the path
+_TURN_RAD = np.deg2rad(2)  # largest turn within a pair from the noise of a path
 _READING_SEARCH_M = 0.6
-_RIVAL = 0.5  # as given, the share of matching patches must not fall below this part of another reading's
-# Factor by which the ground may move otherwise than stated: under guesses 10 deg off in pitch it moves .75 to
-# 1.06 times as far, and positions in feet make it 3.3 times.
+_RIVAL = 0.5  # least matched fraction as given, relative to another reading's
+# Factor on the stated motion within which the ground agrees: guesses 10 deg off in pitch yield 0.75 to 1.06,
+# positions in feet 3.3.
 _STRETCHED = 2.0
-# Share from which on another reading is one: on even asphalt of real roads a fifth of the patches match.
-_CLEAR_SHARE = 0.2
+_CLEAR_SHARE = 0.2  # least matched fraction of another reading: a fifth, on even asphalt of real roads
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the adjustment starts, the share of patches that match there, and how many there were."""
+    """The initial mounting, the matched fraction of patches under it, and the number sought."""
 
     mount: Mount | None
     share: float
@@ -52,11 +48,11 @@ class Start:
 
 
 def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
-    """The first of the guess and copies that look further up or down from which the ground matches."""
+    """The first of the guess and its copies at other pitches under which the ground matches."""
     pairs = start_pairs(stated)
     best = Start(None, 0.0, 0)
     for turn_deg in _TURNS_DEG:
-        # Pitch is about the camera's own sideways axis: a camera may look anywhere.
+        # The turn is about the camera's own x axis: a camera may look anywhere.
         sideways = guess.vehicle_from_cam_rotation[:, 0]
         turned = guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3))
         tried = _settle(matcher, stated, pairs, turned, guess)
@@ -67,7 +63,7 @@ def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
 
 
 def start_pairs(stated: Stated) -> IntArray:
-    """The pairs (P, 2) of images that a start is found from."""
+    """Pairs (P, 2) of images for the start."""
     path_m = stated.path_m()
     pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
     if len(pairs) < _PAIRS // 2:  # images are rarer: those next to each other
@@ -76,11 +72,11 @@ def start_pairs(stated: Stated) -> IntArray:
 
 
 def contradicts(matcher: Matcher, stated: Stated) -> bool:
-    """Whether ground that does not match in the pairs of a start says that something stated is wrong.
+    """Whether ground that fails to match in the pairs of a start contradicts the drive's statements.
 
-    It does where patches are found again wherever they are, and show the vehicle to have moved between most
-    images by less than half or more than twice the stated way, or to have turned otherwise: no error of the
-    guess does that. Patches that are found nowhere lack texture, which says nothing.
+    It does if patches match elsewhere and show, in most pairs, less than half or more than twice the stated
+    motion, or another turn: no error of the guess explains that. Patches without a match lack texture, which
+    is no evidence.
     """
     pairs = start_pairs(stated)
     pairs = pairs[:: -(-len(pairs) // _PAIRS)]
@@ -100,7 +96,7 @@ def contradicts(matcher: Matcher, stated: Stated) -> bool:
 
 
 def _motion(matches: Matches, mount: Mount) -> FloatArray | None:
-    """Pose (2, 3) of the vehicle at the second image in that at the first, but for a common scale."""
+    """Pose (2, 3) of the vehicle at the second image relative to the first, up to scale."""
     here = np.broadcast_to(np.eye(4), (len(matches), 4, 4))
     first, second = (hit_ground(mount, px, here).points_map for px in (matches.first_px, matches.second_px))
     known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
@@ -126,7 +122,7 @@ def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, gue
 
 @dataclass(frozen=True)
 class Readings:
-    """The start as given, the shares of all readings and the best one."""
+    """The start as given, the matched fraction under every reading, and the best reading."""
 
     start: Start
     shares: Mapping[Reading, float]
@@ -134,7 +130,7 @@ class Readings:
 
 
 def try_readings(drive: Drive, camera: str, matcher: Matcher, stated: Stated, others: bool) -> Readings:
-    """Find a start and compare the readings of the poses; without ``others`` only the one as given."""
+    """Find a start and compare readings of the poses; without ``others`` the given one only."""
     start = find_start(matcher, stated, stated.guess)
     pairs = _distinctive_pairs(drive, camera)
     shares = {Reading.AS_GIVEN: 0.0}
@@ -164,7 +160,7 @@ def _share_under(
 
 
 def _distinctive_pairs(drive: Drive, camera: str) -> IntArray:
-    """Pairs between which the vehicle turns most along its path; evenly spread ones on a straight route."""
+    """Pairs with the largest turns along the path; evenly spread pairs on a straight route."""
     motion = motion_of(drive, camera, Reading.HEADING_FROM_PATH)
     yaw = np.unwrap(heading_rad(motion.poses()))
     pairs = changing_pairs(motion.path_at_images(), yaw[:, None], _PAIRS, *_APART_M)
