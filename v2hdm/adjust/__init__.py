@@ -1,8 +1,8 @@
 """Bundle adjustment of marking corners, camera extrinsics and vehicle poses on the ground plane.
 
-``solve(problem, options) -> solution``: numpy in, numpy out; torch's LBFGS on whitened variables
-inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hdm.adjust.model` every
-residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
+``solve(problem, options) -> solution``, numpy in and out, by torch's LBFGS on whitened variables.
+:mod:`v2hdm.adjust.problem` states unknowns and data, :mod:`v2hdm.adjust.model` every residual, which an
+engine of :mod:`v2hdm.adjust.engines` evaluates and linearises.
 """
 
 from v2hdm.adjust.problem import (

@@ -1,4 +1,4 @@
-"""Kernels compiled by another process meanwhile, where no earlier one has: it takes half a minute of CPU."""
+"""Kernels compiled meanwhile by another process, unless cached: it takes half a minute of CPU."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from v2hdm.adjust.problem import Observations, Problem, SolveOptions
 from v2hdm.adjust.solve import solve
 from v2hdm.compiled import folder_of
 
-_DONE = "all"  # file beside kept kernels that says that there are all of an adjustment
+_DONE = "all"  # file beside the cached kernels: all of an adjustment's are there
 _PROGRAM = "from v2hdm.adjust import ahead; ahead.compile_kernels()"
 
 
 @contextmanager
 def compiled_meanwhile(device: str) -> Iterator[None]:
-    """Have the kernels of an adjustment on the CPU compiled by the end of the block, if they can be kept."""
+    """Have the kernels of an adjustment on the CPU compiled by the end of the block, if cacheable."""
     folder, quiet = folder_of(engine), subprocess.DEVNULL
     if device != "cpu" or folder is None or (folder / _DONE).exists():
         yield
@@ -41,7 +41,7 @@ def compiled_meanwhile(device: str) -> Iterator[None]:
 
 
 def compile_kernels() -> None:
-    """Compile all kernels and say so beside them; ends with the process at the other end of stdin."""
+    """Compile all kernels and mark them complete; ends with the process at the other end of stdin."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
     use_kernels()
     if (folder := folder_of(engine)) is not None:
@@ -49,7 +49,7 @@ def compile_kernels() -> None:
 
 
 def use_kernels() -> None:
-    """Call every kernel, as the adjustment of a drive does, for a small problem."""
+    """Call every kernel as the adjustment of a drive does, for a small problem."""
     problem = _small_problem()
     for states in ((), SolveOptions().pose_states):
         solution = solve(problem, SolveOptions(pose_states=states, coarse=not states))
@@ -60,7 +60,7 @@ def use_kernels() -> None:
 
 
 def _small_problem() -> Problem:
-    """A camera two metres up that looks down on six points from four places."""
+    """A camera two metres up that looks down on six points, from four places."""
     points_map, driven_m = np.array([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-0.6, 0.5)]), np.arange(4) / 5
     seen_px = 250.0 * (points_map - np.stack([driven_m, 0 * driven_m], axis=1)[:, None]) * [1, -1]
     frame, corner = (place.ravel() for place in np.indices(seen_px.shape[:2]))

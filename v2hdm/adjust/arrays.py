@@ -10,15 +10,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-# Observations that are computed at once: their intermediate results stay in the processor's cache, and
-# beside the whole take no memory.
-_RUN = 1 << 14
+_RUN = 1 << 14  # observations per run: intermediate results stay in the processor's cache
 _RUN_ON_DEVICE = 1 << 20
 
 
 @dataclass(frozen=True)
 class Lengths:
-    """Known distances: between the corners ``first`` and ``second`` (M,), and 1 / sigma of each."""
+    """Known distances between the corners ``first`` and ``second`` (M,), and 1 / sigma of each."""
 
     first: Tensor
     second: Tensor
@@ -28,13 +26,10 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Run:
-    """Neighbouring corners and all that was seen of them: k observations of n corners.
+    """Consecutive corners with all their observations: k observations of n corners.
 
-    Attributes:
-        observations, corners: which of the problem's.
-        pair: (k,) as in :class:`Arrays`.
-        corner: (k,) counted from the run's first.
-        measured, root_information: (2, k) and (3, k), as in :class:`Arrays`.
+    ``observations`` and ``corners`` are ranges of the problem's, ``corner`` (k,) counts from the run's first;
+    ``pair`` (k,), ``measured`` (2, k) and ``root_information`` (3, k) are as in :class:`Arrays`.
     """
 
     observations: slice
@@ -46,7 +41,7 @@ class Run:
 
     @cached_property
     def corner_count(self) -> int:
-        """The n corners."""
+        """Number of corners, n."""
         return int(self.corners.stop - self.corners.start)
 
     def sum_by_corner(self, rows: Tensor) -> Tensor:
@@ -58,35 +53,34 @@ class Run:
 class Arrays:
     """The constants of a solve; K observations of N corners from P = C * J (camera, frame) pairs.
 
-    Everything that an extrinsic and a frame do to an observation, they do through its pair. So the
-    big arrays know only pairs and corners, and sums over pairs are carried on to extrinsics and
-    frames on small tables (pair = camera * J + frame). Where images are read out row by row, a frame has
-    several *moments*, one for each row that something was seen in: they take its place (M for J) in pairs,
-    and in ``clock_twist``.
+    Extrinsic and frame act on an observation through its pair alone. So the large arrays know only pairs and
+    corners, and sums over pairs are carried on to extrinsics and frames in small tables (pair = camera * J +
+    frame). With rolling shutters a frame has several *moments*, one per observed row, which replace frames
+    (M for J) in pairs and in ``clock_twist``.
 
     Attributes:
-        order: (K,) where each sorted observation stood in the problem.
-        corner_order: (N,) which corner of the problem each one here is.
-        joined: (N,) whether known lengths join a corner to the one before it: such corners lie side by side.
+        order: (K,) index of each sorted observation in the problem.
+        corner_order: (N,) index of each corner in the problem.
+        joined: (N,) whether known lengths join a corner to the one before; joined ones are contiguous.
         pair: (K,) index of the (camera, frame) pair.
         corner: (K,) index of the corner, ascending.
-        measured: (2, K) where it was seen, on the plane at depth 1.
-        root_information: (3, K) a, b, c with whitened residual (a dx, b dx + c dy), dx at depth 1.
+        measured: (2, K) the observation at depth 1.
+        root_information: (3, K) a, b, c of the whitened residual (a dx, b dx + c dy), dx at depth 1.
         vehicle_from_map: (J, 4, 4) as recorded.
-        visit: (J,) the session that each frame is of.
-        states: the column of the frame tangent that each state of a frame acts on. Where an error has a
-            drift beside its white part, two states act on one column.
+        visit: (J,) session of each frame.
+        states: column of the frame tangent of each state. An error with a drift beside its white part
+            has two states on one column.
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
-        state_transition: (J, S, S) what a frame's states are expected to be, given the frame's before.
-        state_information_root: (J, S) 1 / sigma of what is new in it.
-        clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offsets; Q is the number of visits,
-            or 0 where no offset is estimated, and one more where the read-out time is: the last.
+        state_transition: (J, S, S) prediction of a frame's states from the frame before.
+        state_information_root: (J, S) 1 / sigma of the innovations.
+        clock_twist: (J, 6, Q) the vehicle's motion per clock offset; Q is the number of sessions, or 0
+            without offsets, plus one, the last, for an estimated read-out time.
         clock_information_root: (Q,) 1 / sigma of each.
-        control, control_root: surveyed positions (N, 2) of the corners and a, b, c (N, 3) as those of
-            ``root_information``, 0 where there is no survey.
+        control, control_root: surveyed positions (N, 2) of the corners and a, b, c (N, 3) as in
+            ``root_information``, 0 without survey.
         lengths: known distances between corners.
-        frame_of_moment: (M,) the frame of each moment, None where frames are moments themselves.
-        read_out: (C, M, 6) how the vehicle has moved since the frame's stamp by the read-out times as stated.
+        frame_of_moment: (M,) frame of each moment, None if frames are moments.
+        read_out: (C, M, 6) the vehicle's motion since the frame's stamp for the stated read-out times.
     """
 
     order: Tensor
@@ -113,55 +107,55 @@ class Arrays:
 
     @cached_property
     def frame_count(self) -> int:
-        """The number of frames, J."""
+        """Number of frames, J."""
         return self.vehicle_from_map.shape[0]
 
     @cached_property
     def camera_count(self) -> int:
-        """The number of cameras, C."""
+        """Number of cameras, C."""
         return self.centre.shape[0]
 
     @cached_property
     def corner_count(self) -> int:
-        """The number of corners, N."""
+        """Number of corners, N."""
         return self.corner_order.shape[0]
 
     @cached_property
     def camera_unknowns(self) -> int:
-        """6 + Q: a camera's extrinsic and, where they are estimated, its clock offsets and read-out time."""
+        """Unknowns of a camera, 6 + Q: its extrinsic and, if estimated, clock offsets and read-out time."""
         return 6 + self.clock_twist.shape[-1]
 
     @property
     def moves(self) -> bool:
-        """Whether images may be of other times than their stamps."""
+        """Whether images may have been taken at other times than their stamps."""
         return self.clock_twist.shape[-1] > 0 or self.read_out is not None
 
     @cached_property
     def pair_count(self) -> int:
-        """The number of pairs, P."""
+        """Number of pairs, P."""
         return self.camera_count * self.moment_count
 
     @cached_property
     def moment_count(self) -> int:
-        """The number of moments, M, or J where frames are moments."""
+        """Number of moments, M; J if frames are moments."""
         return self.clock_twist.shape[0]
 
     def camera_of(self, pair: Tensor) -> Tensor:
-        """The cameras of pairs."""
+        """Cameras of pairs."""
         return pair // self.moment_count
 
     def frame_of(self, pair: Tensor) -> Tensor:
-        """The frames of pairs."""
+        """Frames of pairs."""
         moment = pair % self.moment_count
         return moment if self.frame_of_moment is None else self.frame_of_moment[moment.long()]
 
     def at_moments(self, by_frame: Tensor, axis: int = 0) -> Tensor:
-        """Values (..., J, ...) of frames as those (..., M, ...) of their moments."""
+        """Values (..., J, ...) of frames, repeated for their moments (..., M, ...)."""
         moments = self.frame_of_moment
         return by_frame if moments is None else by_frame.index_select(axis, moments)
 
     def over_moments(self, by_moment: Tensor) -> Tensor:
-        """Sums (J, ...) over the moments of each frame of values (M, ...)."""
+        """Sums (J, ...) over each frame's moments of values (M, ...)."""
         if self.frame_of_moment is None:
             return by_moment
         out = by_moment.new_zeros(self.frame_count, *by_moment.shape[1:])
@@ -173,12 +167,12 @@ class Arrays:
 
     @cached_property
     def units(self) -> Tensor:
-        """Corners that may begin a run, the end appended."""
+        """First corners of units, which may begin a run, and the end."""
         end = self.joined.new_full((1,), self.corner_count, dtype=torch.int64)
         return torch.cat([(~self.joined).nonzero()[:, 0], end])
 
     def bounds(self, size: int) -> list[tuple[int, int]]:
-        """(observation, corner) at which runs of about ``size`` observations begin, and the end."""
+        """(observation, corner) at the start of runs of about ``size`` observations, and the end."""
         count = self.corner.shape[0]
         if count <= size:
             return [(0, 0), (count, self.corner_count)]
@@ -189,16 +183,16 @@ class Arrays:
 
     @cached_property
     def run_bounds(self) -> list[tuple[int, int]]:
-        """(observation, corner) at which each run begins, and the end."""
+        """(observation, corner) at the start of each run, and the end."""
         return self.bounds(_RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE)
 
     def runs(self, size: int | None = None) -> Iterator[Run]:
-        """The whole problem, run by run; corners that are joined are never parted."""
+        """The whole problem in runs; joined corners are never separated."""
         for (begin, first), (end, last) in pairwise(self.run_bounds if size is None else self.bounds(size)):
             yield self.run(slice(begin, end), slice(first, last))
 
     def run(self, observations: slice, corners: slice) -> Run:
-        """The run of these observations, which are all those of these corners."""
+        """The run of these observations, which are all of these corners'."""
         return Run(
             observations,
             corners,
@@ -209,7 +203,7 @@ class Arrays:
         )
 
     def gather(self, corners: Tensor) -> Run:
-        """Some corners (n,), ascending, as a run of their own, in which they are counted from 0."""
+        """A run of corners (n,), ascending, counted from 0."""
         bounds = torch.searchsorted(self.corner, torch.stack([corners, corners + 1]).to(self.corner.dtype))
         count = bounds[1] - bounds[0]
         corner = torch.repeat_interleave(count)
@@ -218,14 +212,13 @@ class Arrays:
         return Run(slice(0, len(rows)), slice(0, len(corners)), *seen)
 
     def whole(self) -> Run:
-        """Everything as one run."""
+        """The whole problem as one run."""
         return self.run(slice(0, len(self.corner)), slice(0, self.corner_count))
 
     def take(self, keep: Tensor) -> tuple[Arrays, Tensor]:
-        """The problem restricted to some observations and to the corners they touch.
+        """The problem of observations ``keep``, a mask (K,) or ascending indices, and of their corners.
 
-        ``keep`` is a mask (K,) or ascending indices. Of the known lengths, those are left whose corners both
-        are. Returns it with the indices here of the corners that are left.
+        Known lengths need both corners. Returns the corners' indices here as well.
         """
         corners, corner = torch.unique(self.corner[keep], return_inverse=True)
         corners = corners.long()

@@ -1,4 +1,4 @@
-"""Refuses malformed problems, naming the offending item, before they can turn into NaN."""
+"""Rejects malformed problems, naming the offending item, before they can turn into NaN."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOpt
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_SYMMETRIC_TO = 1e-5  # how symmetric a covariance must be, as a share of its diagonal: float32 is
-# Tangent of the angle from a camera's axis beyond which nothing is seen on its plane: 89.9 degrees.
-_MAX_SLOPE = 573.0
+_SYMMETRIC_TO = 1e-5  # asymmetry of a covariance, relative to its diagonal: that of float32
+_MAX_SLOPE = 573.0  # tangent of the largest angle from a camera's axis to anything it sees: 89.9 degrees
 
 
 def check_problem(problem: Problem) -> None:
-    """Raise :class:`AdjustError` for what cannot be solved with, observations that are there twice apart."""
+    """Raise :class:`AdjustError` for an unsolvable problem, except for duplicate observations."""
     _check_arrays(problem)
     wrong = (problem.intrinsic[:, :2] <= 0).any(1)
     _refuse(wrong, "intrinsic of camera {} has a focal length that is not positive")
@@ -29,7 +28,7 @@ def check_problem(problem: Problem) -> None:
 
 
 def _refuse(wrong: BoolArray | np.bool_, said: str, *values: FloatArray | IntArray) -> None:
-    """Raise for the first item that is ``wrong``, if any is: its number and ``values`` are filled in."""
+    """Raise for the first ``wrong`` item, if any, with its number and ``values`` filled in."""
     if wrong.any():
         k = int(np.argmax(wrong))
         raise AdjustError(said.format(k, *(each[k] for each in values)))
@@ -70,7 +69,7 @@ def _check_lengths(problem: Problem) -> None:
 
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
-    """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
+    """Raise :class:`AdjustError` where ``options`` need data that ``problem`` lacks."""
     if options.clock_offset and problem.twist_vehicle is None:
         raise AdjustError("a clock offset needs twist_vehicle: give the vehicle's motion at each frame")
     if options.read_out or problem.read_out_s is not None:
@@ -111,11 +110,11 @@ _ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
         "camera": (), "frame": (), "corner": (), "pinhole_px": (2,), "covariance_px": (2, 2), "row_share": (),
     },
 }  # fmt: skip
-"""The shapes of a problem's arrays, of one for each thing."""
+"""Shapes of a problem's arrays, per item."""
 
 
 def _check_arrays(problem: Problem) -> None:
-    """Every array is one, has its shape and, but for sigmas of centres and what was seen, finite numbers."""
+    """Check types, shapes and finiteness, except that of centre sigmas and observations."""
     seen = problem.observations
     if len(seen.camera) == 0:
         raise AdjustError("there are no observations to adjust: detect and associate markings first")
@@ -146,7 +145,7 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
 
 
 def check_observations(problem: Problem) -> None:
-    """Raise :class:`AdjustError` for the first observation that cannot be solved with."""
+    """Raise :class:`AdjustError` for the first unusable observation."""
     from v2hdm.adjust.engines.numba.layout import Seen, first_unsound  # loads numba
 
     by_corner = np.zeros(problem.corner_count, dtype=np.int64)
@@ -162,7 +161,7 @@ def check_observations(problem: Problem) -> None:
 
 
 def _fault(problem: Problem, k: int) -> str:
-    """The message for observation k, which is unsound."""
+    """The message for the unsound observation k."""
     seen = problem.observations
     for name, size in _sizes(problem).items():
         index = getattr(seen, name)[k]
@@ -185,7 +184,7 @@ def _fault(problem: Problem, k: int) -> str:
 
 
 def _sizes(problem: Problem) -> dict[str, int]:
-    """How many there are of each thing that an observation names."""
+    """Number of each thing that an observation refers to."""
     frames = len(problem.map_from_vehicle)
     return {"camera": len(problem.intrinsic), "frame": frames, "corner": problem.corner_count}
 

@@ -1,4 +1,4 @@
-"""How sure the estimate is: blocks of the inverse Hessian, computed on demand."""
+"""Uncertainty of the estimate: blocks of the inverse Hessian, computed on demand."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from v2hdm.adjust.reduced import reduced_coupling, to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
-# Corners whose right-hand sides are solved for together: enough for fast products, and of how many numbers
-# these may consist.
+# Right-hand sides solved together: enough corners for fast products, and a limit on their numbers.
 _CORNERS_AT_ONCE = 256
 _NUMBERS_AT_ONCE = 1 << 25
-_FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved for together
+_FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved together
 
 
 @dataclass(frozen=True)
 class Moves:
-    """How the solution moves with B independent errors, of one sigma each, of what a solve takes as known."""
+    """Changes of the solution per standard deviation of B independent errors of quantities held fixed."""
 
     corners: FloatArray  # (N, 2, B) m
     extrinsic: FloatArray  # (C, 6, B) left tangents
@@ -33,18 +32,18 @@ class Moves:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Marginal covariances at the solution, of whatever was estimated beside marginalised out.
+    """Marginal covariances at the solution.
 
-    With the factors of :mod:`v2hdm.adjust.whitening`, the reduced unknowns have S^-1 and the corners
-    V^-1 + V^-1 W' S^-1 W V^-1.
+    With the factors of :mod:`v2hdm.adjust.whitening`, that of the reduced unknowns is S^-1, that of the
+    corners V^-1 + V^-1 W' S^-1 W V^-1.
     """
 
     descent: Descent
-    held: Moves | None = None  # with what was held, and is uncertain as well
+    held: Moves | None = None  # the part of quantities held fixed, but uncertain
 
     @property
     def whitening(self) -> Whitening:
-        """The factors, made when they are first asked for."""
+        """The factors, computed on first use."""
         return self.descent.whitening
 
     def extrinsic(self) -> FloatArray:
@@ -53,18 +52,18 @@ class Covariance:
         return own if self.held is None else own + self.held.extrinsic @ self.held.extrinsic.swapaxes(1, 2)
 
     def clock_s2(self) -> FloatArray:
-        """Variance (C, Q), s^2, of clock offsets by visit and, where estimated, last of the read-out time."""
+        """Variances (C, Q), s^2, of clock offsets by session and, if estimated, last the read-out time."""
         return np.stack([block.diagonal()[6:] for block in self._cameras()])
 
     def _cameras(self) -> list[FloatArray]:
         """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
-        # They come last, so the tip of L_S is the factor of their marginal information.
+        # Cameras come last: the tip of L_S is the factor of their marginal information matrix.
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip).cpu().numpy()
         each = self.whitening.engine.arrays.camera_unknowns
         return [joint[k : k + each, k : k + each] for k in range(0, len(joint), each)]
 
     def poses(self) -> FloatArray:
-        """Variances (J, 6) of each frame's tangent, how well its pose is known; 0 without states."""
+        """Variances (J, 6) of the frames' tangents; 0 without states."""
         arrays, whitening = self.whitening.engine.arrays, self.whitening
         frames, states = arrays.frame_count, len(arrays.states)
         out = np.zeros((frames, 6))
@@ -86,7 +85,7 @@ class Covariance:
         return np.asarray((tip @ tip.mT).cpu().numpy())
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
-        """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
+        """Joint covariances (M, 2 n, 2 n), m^2, of M groups (M, n) of corners."""
         parts = np.array_split(groups, min(max(-(-groups.size // _at_once(self.whitening)), 1), len(groups)))
         own = np.concatenate([self._corners(part) for part in parts])
         if self.held is None:
@@ -98,11 +97,11 @@ class Covariance:
         arrays = self.whitening.engine.arrays
         rank = torch.argsort(arrays.corner_order)
         chosen = rank[torch.as_tensor(groups, device=rank.device)]
-        # Known lengths tie corners to others outside their group, and V^-1 with them.
+        # Known lengths couple V^-1 of corners to others outside their group.
         near = _with_joined(arrays, chosen)
         corners = torch.unique(near)
         by_near = _reduced_root(self.whitening, corners).T[_columns(corners, near)]
-        # V^-1 of the corners and all that is joined to them; of kept ones 1.
+        # V^-1 of the corners and all joined ones; 1 for kept corners.
         unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
         factor = self.whitening.linearised.corner_factor.take(corners)
         inverse = factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
@@ -115,10 +114,10 @@ class Covariance:
 
 
 def corner_gain(whitening: Whitening) -> FloatArray:
-    """How corners follow the cameras (N, 2, C (6 + Q)): they move by minus this times their change.
+    """Regression (N, 2, C (6 + Q)) of corners on cameras: a change e of the cameras moves them by -gain e.
 
-    Frames follow as well. Column by column, x = L_S^-T (0, L_tip' e) is what a change e of the cameras
-    does to the reduced unknowns, so that W' x = (L_S^-1 W)' (0, L_tip' e).
+    Frames follow too: e changes the reduced unknowns by x = L_S^-T (0, L_tip' e), column by column, so that
+    W' x = (L_S^-1 W)' (0, L_tip' e).
     """
     arrays, tip = whitening.engine.arrays, whitening.reduced_factor.tip
     out = np.empty((arrays.corner_count, 2, len(tip)))
@@ -136,13 +135,13 @@ def corner_gain(whitening: Whitening) -> FloatArray:
 
 
 def _at_once(whitening: Whitening) -> int:
-    """Corners whose right-hand sides are solved for together."""
+    """Number of corners whose right-hand sides are solved together."""
     most = _NUMBERS_AT_ONCE // (2 * whitening.reduced_factor.size)
     return min(max(most, 1), _CORNERS_AT_ONCE)
 
 
 def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
-    """Groups (M, n) of corners, and all that lengths join to them (M, m); the last fills up shorter rows."""
+    """Groups (M, n) of corners with all that lengths join to them (M, m); shorter rows repeat the last."""
     if not bool(arrays.joined.any()):
         return chosen
     unit = (~arrays.joined).cumsum(0)
@@ -152,19 +151,19 @@ def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
 
 
 def _once(near: Tensor) -> Tensor:
-    """1 for the columns (M, 1, 2 m) of each row's corners, 0 for what repeats one."""
+    """Mask (M, 1, 2 m): 1 for the columns of a row's corners, 0 for repetitions."""
     again = (near[:, :, None] == near[:, None, :]).tril(-1).any(2)
     return (~again).repeat_interleave(2, dim=1)[:, None].to(torch.float64)
 
 
 def _columns(corners: Tensor, wanted: Tensor) -> Tensor:
-    """Where x and y (M, 2 m) of the corners ``wanted`` (M, m) stand among those of ``corners``, ascending."""
+    """Columns (M, 2 m) of x and y of the corners ``wanted`` (M, m) among ``corners``, ascending."""
     place = 2 * torch.searchsorted(corners, wanted.contiguous())
     return torch.stack([place, place + 1], dim=-1).flatten(1)
 
 
 def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
-    """L_S^-1 W (D, 2 n) for n corners, ascending; of kept ones -L_S^-1 E, where E picks them."""
+    """L_S^-1 W (D, 2 n) for n corners, ascending; -L_S^-1 E, with the selection E, for kept ones."""
     plan, estimate = whitening.plan, whitening.estimate
     arrays = whitening.engine.arrays
     run = arrays.whole() if len(corners) == arrays.corner_count else arrays.gather(corners)

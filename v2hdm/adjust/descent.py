@@ -1,4 +1,4 @@
-"""From a start to an optimum: whiten, minimise, renew the whitening, until a certificate holds."""
+"""From a start to an optimum: whiten, minimise and whiten again, until the predicted decrease vanishes."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient
 Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
 
 _LINE_SEARCH: dict[str, Any] = {"history_size": 20, "max_eval": 25}
-# One iteration a step: stopping is the affair of the loop around it.
+# One iteration per step: the surrounding loop decides when to stop.
 _STEPWISE: dict[str, Any] = {"max_iter": 1, "tolerance_grad": 0.0, "tolerance_change": 0.0}
-_STEPS_FROM_NEARBY = 2  # steps that a whitening near the optimum takes to the end
-_NO_PROGRESS = 1e-15  # a relative decrease below this is rounding
+_STEPS_FROM_NEARBY = 2  # steps to convergence under a whitening made near the optimum
+_NO_PROGRESS = 1e-15  # relative decrease below which it is rounding
 
 
 def predicted_gap(cost: float, gradient: Tensor) -> float:
-    """|g|^2, twice what a unit Newton step gains, as a share of the cost where that is above 1."""
+    """|g|^2, twice the predicted decrease of a unit Newton step, relative to a cost above 1."""
     return float(gradient @ gradient) / max(cost, 1.0)
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended: y, its cost and its gradient, and whether its whitening was too slow."""
+    """The end of a minimisation: y, cost, gradient, and whether its whitening converged too slowly."""
 
     whitened: Tensor
     cost: float
@@ -52,15 +52,13 @@ def minimise(
     max_iterations: int,
     renewal: float = math.inf,
 ) -> Minimum:
-    """Minimise from y = 0, whose cost and gradient (n,) are given; the Hessian there is about identity.
+    """Minimise from y = 0 of known cost and gradient (n,); the Hessian there is approximately the identity.
 
     torch's first step is ``-min(1, 1 / |g|_1) g``. On u = y / a with the objective scaled by 1 / a^2 and a =
-    |g_y(0)|_1 the gradient's 1-norm is 1 and that step is y = -g_y: the unit step that the whitening was made
-    for, with no internals touched.
-
-    It stops when :func:`predicted_gap` is below ``tolerance``. A new whitening, which costs ``renewal``
-    evaluations, is better after ``max_iterations``, or where the steps that are left, at the rate of the
-    last, cost more than that and the few steps from nearby.
+    |g_y(0)|_1 the gradient's 1-norm is 1 and that step is y = -g_y: the unit step that the whitening is made
+    for, without touching internals. It stops once :func:`predicted_gap` is below ``tolerance``, and is too
+    slow after ``max_iterations``, or if the remaining steps, at the rate of the last, cost more than a new
+    whitening of ``renewal`` evaluations and the few steps from nearby.
     """
     scale = float(gradient.abs().sum())
     u = torch.zeros_like(gradient)
@@ -68,16 +66,16 @@ def minimise(
 
     def closure() -> float:
         new_cost, new_gradient = seen.at(u)
-        # An infinite cost is but a step too far, whatever its gradient.
+        # An infinite cost means an overshooting step, whatever its gradient.
         if math.isnan(new_cost) or not (math.isinf(new_cost) or bool(new_gradient.isfinite().all())):
             raise _NoNumberError
         u.grad = new_gradient / scale
-        # Relative to the start, small improvements of a large cost keep their digits.
+        # Differences to the start keep the digits of small improvements of a large cost.
         return (new_cost - cost) / scale**2
 
     _leave_compiler_out()
     optimizer = torch.optim.LBFGS([u], line_search_fn="strong_wolfe", **_STEPWISE, **_LINE_SEARCH)
-    # Without the hooks of profilers around it, which take as long.
+    # Unwrapped: the profiler's hooks around it take as long as the step.
     step = inspect.unwrap(torch.optim.LBFGS.step)
     best, best_gradient = cost, gradient
     gap, slow = predicted_gap(best, best_gradient), False
@@ -90,7 +88,7 @@ def minimise(
         except _NoNumberError:
             reached = math.inf
         if not math.isfinite(reached):
-            # A line search over a singular direction has run off; the point before it still stands.
+            # A line search along a singular direction diverged; the point before it stands.
             u.copy_(seen.start)
             break
         seen.begin_step(u, reached, reached_gradient)
@@ -104,38 +102,38 @@ def minimise(
 
 
 def _steps_left(before: float, gap: float, tolerance: float) -> float:
-    """Steps to the tolerance, if each takes as much of the gap as the last."""
+    """Steps to the tolerance if each reduces the gap by the last one's factor."""
     if gap <= tolerance:
         return 0.0
     return math.log(tolerance / gap) / math.log(gap / before) if gap < before else math.inf
 
 
 class _NoNumberError(Exception):
-    """The objective is no number where a line search looked, whose comparisons then mean nothing."""
+    """The objective is NaN within a line search, whose comparisons are then meaningless."""
 
 
 class _Evaluations:
-    """An objective that knows the points of one step: each asks first where the last one ended."""
+    """An objective that caches the points of a step: each step first asks for the end of the last."""
 
     def __init__(self, objective: Evaluate, start: Tensor, cost: float, gradient: Tensor) -> None:
         self._objective = objective
         self.begin_step(start, cost, gradient)
 
     def begin_step(self, start: Tensor, cost: float, gradient: Tensor) -> None:
-        """Forget all points but the one that a step starts from, with its cost and gradient."""
+        """Forget all points except the start of a step, with its cost and gradient."""
         self._known = [(start.clone(), cost, gradient)]
 
     @property
     def start(self) -> Tensor:
-        """The point that the current step started from."""
+        """Start of the current step."""
         return self._known[0][0]
 
     def at(self, point: Tensor) -> tuple[float, Tensor]:
-        """Cost and gradient at a point, computed if it is none of the known ones."""
+        """Cost and gradient at a point, from the cache if possible."""
         for known, cost, gradient in self._known:
             if torch.equal(known, point):
                 return cost, gradient
-        with np.errstate(over="ignore", invalid="ignore"):  # a step too far may overflow
+        with np.errstate(over="ignore", invalid="ignore"):  # an overshooting step may overflow
             cost, gradient = self._objective(point)
         self._known.append((point.clone(), cost, gradient))
         return cost, gradient
@@ -143,7 +141,7 @@ class _Evaluations:
 
 @cache
 def _leave_compiler_out() -> None:
-    """Keep torch from importing its compiler, which takes 1 to 2.5 s, for the first optimiser's methods."""
+    """Keep torch from importing its compiler, 1 to 2.5 s, for the methods of the first optimiser."""
     if "torch._dynamo" in sys.modules:
         return
     for name in dir(torch.optim.Optimizer):
@@ -153,35 +151,31 @@ def _leave_compiler_out() -> None:
                 method.__dynamo_disable = method
 
 
-# While a robust loss is still being narrowed, there is no point in more digits than this.
-_ANNEALING_TOLERANCE = 1e-3
+_ANNEALING_TOLERANCE = 1e-3  # while a robust loss is being narrowed, more digits are wasted
 _ANNEALING_STEP = 3.0
 _ITERATIONS_PER_WHITENING = 12
-# Evaluations that a whitening takes as long as.
-RENEWAL = 2.0
+RENEWAL = 2.0  # cost of a whitening, in evaluations
 RENEWAL_WITH_STATES = 10.0
 
 
 @dataclass(frozen=True)
 class Descent:
-    """Where a descent ended."""
+    """The end of a descent."""
 
-    # of the problem
     engine: Engine
     plan: Plan
-    # where it ended, under which loss, and the cost there by name
-    estimate: Estimate
+    estimate: Estimate  # the optimum, under ``robust``, with the cost by name
     robust: Loss
     terms: dict[str, float]
     gap: float  # the predicted remaining decrease as a fraction of the cost
     evaluations: int  # of cost and gradient
-    progressing: bool  # it was still going down when it was stopped
-    is_singular: bool  # observations and priors leave a direction of the reduced unknowns free
-    made: Whitening | None  # the whitening at the estimate, where the descent had to make it
+    progressing: bool  # the cost was still falling at the end
+    is_singular: bool  # some direction of the reduced unknowns is undetermined
+    made: Whitening | None  # the whitening at the estimate, if the descent made it
 
     @cached_property
     def whitening(self) -> Whitening:
-        """The whitening at the estimate, made when it is asked for."""
+        """The whitening at the estimate, computed on first use."""
         if self.made is not None:
             return self.made
         arrays = self.engine.arrays
@@ -190,7 +184,7 @@ class Descent:
 
 
 class Point(NamedTuple):
-    """Whitened variables, what they stand for, and the cost there by name."""
+    """Whitened variables, the estimate they represent, and its cost by name."""
 
     whitened: Tensor
     estimate: Estimate
@@ -198,7 +192,7 @@ class Point(NamedTuple):
 
 
 class Objective:
-    """Cost and gradient by whitened variables around where the whitening was made; counts its evaluations."""
+    """Cost and gradient by whitened variables about the whitening's estimate; counts evaluations."""
 
     def __init__(self, whitening: Whitening) -> None:
         self.whitening = whitening
@@ -206,12 +200,12 @@ class Objective:
         self._last: Point | None = None
 
     def at_base(self) -> tuple[float, Tensor]:
-        """Cost and gradient at 0, which the whitening knows."""
+        """Cost and gradient at 0, from the whitening."""
         self.evaluations += 1
         return sum(self.whitening.terms.values()), self.whitening.gradient
 
     def point(self, whitened: Tensor) -> Point:
-        """The point that whitened variables stand for; known where they were evaluated last."""
+        """The point of some whitened variables, cached if they were evaluated last."""
         if not bool(whitened.any()):
             return Point(whitened, self.whitening.estimate, self.whitening.terms)
         if self._last is None or not torch.equal(self._last.whitened, whitened):
@@ -232,7 +226,7 @@ class Objective:
 
 
 def narrowed(engine: Engine, estimate: Estimate, robust: Loss, last: Loss | None = None) -> Loss:
-    """The loss with most residuals in its convex part, and a third as wide as the ``last`` at most."""
+    """The loss, with most residuals in its convex part, at most a third as wide as ``last``."""
     if robust.name == "none":
         return robust
     squared = engine.residuals(engine.poses(estimate), estimate.corners_map).square().sum(0)
@@ -251,7 +245,7 @@ def descend(
     max_evaluations: int,
     opening: Whitening | None = None,
 ) -> Descent:
-    """Minimise the cost, narrowing the loss; ``opening`` is what :func:`open_descent` made of the start."""
+    """Minimise the cost while narrowing the loss; ``opening`` is :func:`open_descent` of the start."""
     whitening = opening or open_descent(engine, estimate, robust)
     del opening
     plan, renewal = whitening.plan, RENEWAL_WITH_STATES if engine.arrays.states else RENEWAL
@@ -273,12 +267,12 @@ def descend(
             made = whitening
         else:
             inner = tolerance if final else _ANNEALING_TOLERANCE
-            # One that follows a slow one was made near enough: what slows it is the loss, not the distance.
+            # After a slow whitening the next is near enough: the loss slows it, not the distance.
             whitened, reached, gradient, slow = minimise(
                 objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, math.inf if slow else renewal
             )
             gap = predicted_gap(reached, gradient)
-            # A whitening under which the gap shrank this fast determines it well enough.
+            # A whitening under which the gap shrank this fast determines it well.
             ended = final and not slow and gap <= tolerance
         point, used = objective.point(whitened), whitening.robust
         evaluations += objective.evaluations
@@ -288,7 +282,7 @@ def descend(
             return Descent(*at, gap, evaluations, progressing, singular, made)
         estimate = point.estimate
         progressing = reached < cost or not final
-        # The old factor and what led away from it go before the new one comes.
+        # Frees the memory of the old factor, and of what refers to it, before the new one is made.
         del whitening, objective, whitened, gradient, point
         whitening = factorise(
             engine, plan, estimate, used if final else narrowed(engine, estimate, robust, used)
@@ -296,5 +290,5 @@ def descend(
 
 
 def open_descent(engine: Engine, estimate: Estimate, robust: Loss) -> Whitening:
-    """The first whitening of a descent, under a loss as wide as the residuals ask for."""
+    """First whitening of a descent, under a loss wide enough for the residuals."""
     return factorise(engine, engine.plan(), estimate, narrowed(engine, estimate, robust))

@@ -1,8 +1,7 @@
-"""The interface of engines: they evaluate and linearise a problem and eliminate its corners.
+"""The interface of engines, which evaluate and linearise a problem and eliminate its corners.
 
-The solver knows no observation. It asks an :class:`Engine` made for one problem
-(:func:`v2hdm.adjust.engines.make_engine`), either ``torch``, which differentiates :mod:`v2hdm.adjust.model`,
-or ``numba``, whose compiled kernels do the same in closed form.
+An :class:`Engine` is made for one problem (:func:`v2hdm.adjust.engines.make_engine`): ``torch``
+differentiates :mod:`v2hdm.adjust.model`, ``numba`` computes the same in compiled closed forms.
 """
 
 from __future__ import annotations
@@ -17,18 +16,17 @@ from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import CornerFactor, Coupled, Plan, PriorBlocks, ReducedSystem, Spread
 from v2hdm.records import BoolArray, FloatArray
 
-WEIGHT_FLOOR = 1e-6  # least weight of an observation in the Hessian: a corner of outliers stays factorable
+WEIGHT_FLOOR = 1e-6  # least weight of an observation in the Hessian: keeps a corner of outliers definite
 
 
 @dataclass(frozen=True)
 class Evaluated:
     """Cost and gradient after a step."""
 
-    estimate: Estimate  # where the step led
-    terms: dict[str, float]  # the cost there, by name
-    gradient: Gradient  # by the step
-    # what :meth:`Linearised.carry` makes of the corners' part
-    whitened: Tensor
+    estimate: Estimate  # after the step
+    terms: dict[str, float]  # its cost, by name
+    gradient: Gradient  # with respect to the step
+    whitened: Tensor  # L^-1 g of the corners, see :meth:`Linearised.carry`
     coupled: Coupled
 
 
@@ -36,20 +34,17 @@ class Evaluated:
 class Linearised(ABC):
     """A problem linearised at an estimate, its corners eliminated."""
 
-    # the cost at the estimate, by name, and its gradient
-    terms: dict[str, float]
+    terms: dict[str, float]  # the cost at the estimate, by name
     gradient: Gradient
     corner_factor: CornerFactor  # L, the factor of the corners' own block
-    # what :meth:`carry` makes of the gradient's corner part
-    whitened: Tensor
+    whitened: Tensor  # L^-1 g of the corners, see :meth:`carry`
     coupled: Coupled
 
     @abstractmethod
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
-        """Evaluate after a step of the reduced unknowns, with which the corners move.
+        """Evaluate after a step of the reduced unknowns, the corners following.
 
-        ``tangents`` (C, M, 6) are those of the pairs under the step, ``own`` (N, 2) whitened variables of
-        corners.
+        ``tangents`` (C, M, 6) are the pairs' under the step, ``own`` (N, 2) the corners' whitened variables.
         """
 
     @abstractmethod
@@ -73,11 +68,11 @@ class Engine(ABC):
 
     @abstractmethod
     def plan(self) -> Plan:
-        """How the reduced system is cut into tiles."""
+        """The division of the reduced system into tiles."""
 
     @abstractmethod
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) a ray fixes."""
+        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined."""
 
     @abstractmethod
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
@@ -89,27 +84,24 @@ class Engine(ABC):
 
     @abstractmethod
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
+        """In problem order: residuals (K, 2), px, squared Mahalanobis distances, points behind."""
 
     @abstractmethod
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
-        """The cost, by name."""
+        """The cost by name."""
 
     @abstractmethod
     def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
-        """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K).
-
-        ``spread`` is that of :meth:`spread` at the estimate.
-        """
+        """Gradient of a scalar from that by the whitened residuals (2, K); :meth:`spread` at the estimate."""
 
     @abstractmethod
     def spread(self, estimate: Estimate) -> Spread:
-        """How pairs move with frame states and clock offsets."""
+        """Jacobians of the pairs by frame states and clock offsets."""
 
     @abstractmethod
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
-        """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
+        """Gauss-Newton Hessian of the priors by the reduced unknowns."""
 
     @abstractmethod
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> Linearised:
-        """Linearise and eliminate the corners; raises AdjustError where joined ones cannot be solved for."""
+        """Linearise and eliminate the corners; raises AdjustError if a block of joined ones is singular."""

@@ -1,14 +1,14 @@
-r"""The map while the vehicle drives: one marking at a time, at a cost that does not grow with the map.
+r"""The map while the vehicle drives: one marking at a time, at a cost independent of the map's size.
 
-Given the cameras (extrinsics and clock offsets) the markings are independent, so all that those in the map
-say about the cameras is one quadratic in their tangents :math:`\xi`, ``cam_from_vehicle = exp(xi) @ base``. A
-further marking is solved for by :func:`v2hdm.adjust.solve`, with that quadratic as the prior on the cameras;
-what the solve's Hessian leaves of the cameras once frames and corners are eliminated, less the prior, is
+Given the cameras (extrinsics and clock offsets) the markings are independent, so that all information of the
+mapped ones on the cameras is one quadratic in their tangents :math:`\xi`,
+``cam_from_vehicle = exp(xi) @ base``. A new marking is solved for by :func:`v2hdm.adjust.solve` with that
+quadratic as the prior on the cameras; the solve's marginal information on the cameras, less the prior, is
 added to the quadratic. Every corner stays an affine function of :math:`\xi`, read on demand.
 
-Whenever the number of markings has doubled, all are solved anew together: a constant share of the cost of
-each, and the batch's own optimum. Until then the errors of a frame's pose are marginalised out marking by
-marking, so that markings that came since do not share them with the others.
+Whenever the number of markings has doubled, all are solved together: a constant factor in cost per marking,
+and the batch optimum. In between, a frame's pose error is marginalised out marking by marking, so that later
+markings do not share it with earlier ones.
 """
 
 from __future__ import annotations
@@ -38,19 +38,17 @@ from v2hdm.adjust.whitening import factorise, whitened_gradient
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
-# Of a marking's solve: from a cost of a few hundred it then ends within a thousandth of a sigma.
-_GAP_TOLERANCE = 1e-9
-# Share of an unknown's information, as correlated as it is, below which a difference is what rounding left.
-_LEAST_LEFT = 1e-12
+_GAP_TOLERANCE = 1e-9  # of a marking's solve: at a cost of a few hundred, within a thousandth of a sigma
+_LEAST_LEFT = 1e-12  # fraction of an unknown's information, correlations included, below which it is rounding
 
 
 class UndeterminedError(AdjustError):
-    """The markings so far leave a direction of the extrinsics free."""
+    """The markings so far leave a direction of the extrinsics undetermined."""
 
 
 @dataclass(frozen=True)
 class Sighted:
-    """All that is known of one marking, its corners numbered from 0; lengths and control None if unknown."""
+    """All data on one marking, its corners numbered from 0; lengths and control None if unknown."""
 
     observations: Observations
     lengths: KnownLengths | None = None
@@ -58,11 +56,11 @@ class Sighted:
 
     @property
     def corner_count(self) -> int:
-        """Corners up to the last that was seen."""
+        """Number of corners up to the last one observed."""
         return int(self.observations.corner.max()) + 1
 
     def joined(self, later: Sighted) -> Sighted:
-        """With what was seen of the same corners later; what is known of them is as said last."""
+        """With later observations of the same corners; later control and lengths replace earlier ones."""
         return Sighted(
             _stacked([self.observations, later.observations]),
             later.lengths or self.lengths,
@@ -72,7 +70,7 @@ class Sighted:
 
 @dataclass(frozen=True)
 class _Own:
-    """One marking's share of a :class:`_Quadratic`, in the unknowns ``rows`` of its cameras."""
+    """One marking's contribution to a :class:`_Quadratic`, in the unknowns ``rows`` of its cameras."""
 
     rows: IntArray
     information: FloatArray
@@ -81,9 +79,9 @@ class _Own:
 
 @dataclass(frozen=True)
 class _Settled:
-    """Corners (n, 2) at the unknowns ``at`` (D,) of all cameras; ``gain`` (n, 2, D) how they follow these.
+    """Corners (n, 2) at the unknowns ``at`` (D,) of all cameras; ``gain`` (n, 2, D) is their derivative.
 
-    ``own`` is its share of what is known of the cameras, None where others were solved for together with it.
+    ``own`` is their contribution to the quadratic, None if others were solved together with it.
     """
 
     at: FloatArray
@@ -94,7 +92,7 @@ class _Settled:
 
 @dataclass(frozen=True)
 class _Quadratic:
-    """Half xi' ``information`` xi less ``vector`` xi, around ``base``; least where xi is ``mean`` (D,)."""
+    """Half xi' ``information`` xi minus ``vector`` xi, around ``base``; minimal at ``mean`` (D,)."""
 
     cameras: IntArray
     base: FloatArray
@@ -106,13 +104,13 @@ class _Quadratic:
         return np.asarray(np.linalg.solve(self.information, self.vector))
 
     def rows(self, cameras: IntArray) -> IntArray:
-        """Where the unknowns of some of the cameras stand."""
+        """Indices of the unknowns of some cameras."""
         each = len(self.vector) // len(self.cameras)
         place = np.searchsorted(self.cameras, cameras)
         return np.asarray((place[:, None] * each + np.arange(each)).ravel())
 
     def plus(self, own: _Own, sign: float) -> _Quadratic:
-        """With a marking's share added, or with ``sign`` -1 subtracted."""
+        """With a marking's contribution added, or subtracted with ``sign`` -1."""
         added, moved = self.information.copy(), self.vector.copy()
         added[own.rows[:, None], own.rows] += sign * own.information
         moved[own.rows] += sign * own.vector
@@ -123,7 +121,7 @@ class IncrementalMap:
     """Extrinsics and corners, up to date after every marking."""
 
     def __init__(self, drive: Problem, options: SolveOptions | None = None) -> None:
-        """Begin with an empty map of a ``drive``, of whose problem cameras, frames and priors are taken."""
+        """An empty map for the cameras, frames and priors of the problem ``drive``."""
         self._drive = drive
         self._options = options or SolveOptions()
         self._sighted: dict[int, Sighted] = {}
@@ -133,23 +131,23 @@ class IncrementalMap:
 
     @property
     def markings(self) -> Mapping[int, Sighted]:
-        """The markings by their number, in the order in which they came."""
+        """The markings by number, in order of arrival."""
         return self._sighted
 
     @property
     def cam_from_vehicle(self) -> FloatArray:
-        """The extrinsics (C, 4, 4) that all markings together say; where to start from, of unseen cameras."""
+        """Extrinsics (C, 4, 4) from all markings; the start for cameras without any."""
         out = self._drive.cam_from_vehicle.copy()
         if self._earlier is not None:
             out[self._earlier.cameras] = _moved(self._earlier.base, self._earlier.mean, "cpu")[0].numpy()
         return out
 
     def is_solved(self, marking: int) -> bool:
-        """Whether a marking is part of the map, and not but noted (:meth:`add`) or waiting."""
+        """Whether a marking is part of the map, rather than noted (:meth:`add`) or waiting."""
         return marking in self._settled and self._earlier is not None
 
     def preview(self, sighted: Sighted) -> FloatArray:
-        """Back-projected corners (n, 2), nan if nowhere; AdjustError for two sightings of one in an image."""
+        """Back-projected corners (n, 2), nan above the horizon; AdjustError for a duplicate in an image."""
         problem, _ = self._problem([sighted])
         arrays = make_arrays(problem, (), "cpu")
         engine = make_engine(self._options.engine, arrays)
@@ -160,22 +158,22 @@ class IncrementalMap:
         return out
 
     def corners_map(self, marking: int) -> FloatArray:
-        """Corners (n, 2) of a marking by the present extrinsics; AdjustError where they are not known yet."""
+        """Corners (n, 2) of a marking under the present extrinsics; AdjustError if not solved yet."""
         if not self.is_solved(marking) or self._earlier is None:
             raise AdjustError(f"marking {marking} is not in the map")
         settled = self._settled[marking]
         return np.asarray(settled.corners_map - settled.gain @ (self._earlier.mean - settled.at))
 
     def add(self, marking: int, sighted: Sighted) -> None:
-        """Take note of a marking, or more of it, without solving; :meth:`adjust` does."""
+        """Note a marking, or further observations of it, for the next :meth:`adjust`."""
         before = self._sighted.get(marking)
         self._sighted[marking] = sighted if before is None else before.joined(sighted)
 
     def observe(self, marking: int, sighted: Sighted) -> None:
-        """Take a marking into the map; one that is in it already is re-estimated from all its sightings.
+        """Add a marking to the map, or re-estimate a mapped one from all its observations.
 
-        The first ones of a camera wait until there are enough to fix its extrinsic. Raises AdjustError where
-        it cannot be solved for; the map is as it was.
+        A camera's first markings wait until its extrinsic is determined. If unsolvable, raises AdjustError
+        and leaves the map unchanged.
         """
         before = self._sighted.get(marking)
         earlier = self._earlier if before is None else self._without(marking, before)
@@ -189,7 +187,7 @@ class IncrementalMap:
             else:
                 self._earlier, _, self._settled[marking] = self._linearised(earlier, marking, joined)
         except UndeterminedError:
-            # The first few of a camera leave its extrinsic free; they wait for those that come.
+            # The first few of a camera leave its extrinsic undetermined; they wait for more.
             self._adjusted_count = 0
         except AdjustError:
             del self._sighted[marking]
@@ -198,7 +196,7 @@ class IncrementalMap:
             raise
 
     def _without(self, marking: int, sighted: Sighted) -> _Quadratic | None:
-        """The quadratic without a marking; None where so little is left that all others are solved anew."""
+        """The quadratic without a marking; None if so little remains that all others must be solved again."""
         if self._earlier is None or marking not in self._settled:
             return self._earlier
         own = self._settled[marking].own or self._linearised(self._earlier, marking, sighted)[1]
@@ -207,10 +205,10 @@ class IncrementalMap:
         return less if least > _LEAST_LEFT else None
 
     def adjust(self) -> Solution:
-        """Solve for all markings together; happens by itself whenever the map has doubled.
+        """Solve for all markings together; called whenever the map has doubled.
 
-        The solution's corners are those of :attr:`markings`, one after the other. Raises AdjustError where
-        there is none, or they cannot be solved for.
+        The solution's corners are those of :attr:`markings`, concatenated. Raises AdjustError if there is
+        none, or they are unsolvable.
         """
         if not self._sighted:
             raise AdjustError("there is no marking to adjust")
@@ -232,8 +230,8 @@ class IncrementalMap:
     def _linearised(
         self, earlier: _Quadratic, marking: int, sighted: Sighted
     ) -> tuple[_Quadratic, _Own, _Settled]:
-        """The information of ``earlier`` and a marking, its share, and itself where both agree."""
-        # All that priors say of the cameras is part of the quadratic.
+        """The quadratic ``earlier`` plus a marking, the marking's contribution, and its corners."""
+        # The quadratic contains the cameras' priors.
         without = {"centre_vehicle": None, "clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
         problem, cameras = self._problem([sighted], **without)
         check_observations(problem)
@@ -254,7 +252,7 @@ class IncrementalMap:
             share = partial(_joined, earlier, rows, held.reduced_factor, chart)
             _, joint, whitened, _ = share(at, held.gradient)
             step = held.step(whitened)
-            if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # beyond what the chart is of
+            if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # outside the chart
                 raise _unsolved(f"marking {marking}", Status.STALLED)
             done, at = held.linearised.evaluate(*step), joint.mean
             left = done.gradient, done.coupled, done.whitened
@@ -276,7 +274,7 @@ class IncrementalMap:
         return joint, own, _Settled(at, out, gain, own)
 
     def _problem(self, sighted: Sequence[Sighted], **changes: Any) -> tuple[Problem, IntArray]:
-        """Some markings as a problem of the cameras and frames that saw them, and which these cameras are."""
+        """Some markings as a problem of their cameras and frames, and the indices of these cameras."""
         starts = np.cumsum([0, *(one.corner_count for one in sighted)])
         seen = _stacked([one.observations for one in sighted])
         corner = seen.corner + np.repeat(starts[:-1], [len(one.observations.corner) for one in sighted])
@@ -289,10 +287,10 @@ class IncrementalMap:
 def _joined(
     earlier: _Quadratic, rows: IntArray, factor: TiledCholesky, chart: FloatArray, at: FloatArray, by: Tensor
 ) -> tuple[_Own, _Quadratic, Tensor, float]:
-    """A marking's share, its whitened gradient ``by`` at the unknowns ``at`` of all cameras, and the sum.
+    """A marking's contribution from its whitened gradient ``by`` at the unknowns ``at``, and the sum.
 
-    Lastly the step in whitened variables to where the sum is least, and twice what it gains; ``factor`` is of
-    a whitening that holds the cameras, ``chart`` that of :func:`_moved`.
+    Then the whitened step to the sum's minimum, and twice its decrease; ``factor`` is of a whitening with
+    held cameras, ``chart`` that of :func:`_moved`.
     """
     assert factor.held is not None
     cameras = (step := -by)[factor.size - len(rows) : factor.size]
@@ -307,9 +305,9 @@ def _joined(
 
 
 def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor, Tensor, FloatArray]:
-    """Extrinsics (C, 4, 4) and clock offsets (C, Q) at the unknowns (C (6 + Q),) of cameras around ``base``.
+    """Extrinsics (C, 4, 4) and clock offsets (C, Q) at the unknowns (C (6 + Q),) around ``base``.
 
-    Lastly the left tangents and clock offsets that a change of the unknowns is, (C (6 + Q), C (6 + Q)).
+    Then the chart: left tangents and clock offsets by the unknowns, (C (6 + Q), C (6 + Q)).
     """
     by_camera = unknowns.reshape(len(base), -1)
     moved, turns = move(np.ascontiguousarray(by_camera[:, :6]), base)
@@ -320,13 +318,13 @@ def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor,
 
 
 def _scale(information: FloatArray) -> FloatArray:
-    """Products (D, D) of the roots of an information's diagonal: entries by it have no unit."""
+    """Products (D, D) of the roots of an information matrix' diagonal, which make entries dimensionless."""
     root = np.sqrt(np.diagonal(information))
     return np.asarray(root[:, None] * root)
 
 
 def _sound(solution: Solution) -> Solution:
-    """A solution that determines the map."""
+    """The solution, if it determines the map."""
     bad = solution.status in (Status.BEHIND_CAMERA, Status.UNDETERMINED)
     if bad or not np.isfinite(solution.corners_map).all():
         raise _unsolved("the map", solution.status)
@@ -348,7 +346,7 @@ def _stacked(parts: Sequence[_Known]) -> _Known:
 
 
 def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:
-    """Prior knowledge of several markings' corners, which begin at ``starts`` among those of all."""
+    """Control and lengths of several markings, whose corners begin at ``starts`` in the concatenation."""
     shifted = []
     for one, start in zip(parts, starts, strict=False):
         if one is not None:

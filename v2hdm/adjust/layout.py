@@ -1,7 +1,7 @@
 """From a checked problem to its :class:`~v2hdm.adjust.arrays.Arrays`.
 
-The origin is near the drive: in UTM coordinates a solver would lose seven digits to the distance of theirs.
-The errors of the recorded poses become states of the frames, each expected from those of the frame before.
+The origin is moved near the drive: UTM coordinates would cost seven digits. Errors of recorded poses become
+states of the frames, each predicted from the frame before.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_NEAR_M = 10_000.0  # coordinates of this size are known to a picometre; moving them would only cost memory
+_NEAR_M = 10_000.0  # coordinates up to this are exact to a picometre; moving them would only cost memory
 
 
 def nearby_origin(problem: Problem) -> FloatArray:
-    """A point (2,) in whole metres near the recorded poses: the origin, or their middle if that is far."""
+    """A point (2,) in whole metres near the recorded poses: the origin, or their centre if that is far."""
     position = problem.map_from_vehicle[:, :2, 3]
     middle = np.round((position.min(0) + position.max(0)) / 2)
     return np.asarray(middle if np.abs(middle).max() > _NEAR_M else np.zeros(2))
 
 
 def shifted(problem: Problem, by_m: FloatArray) -> Problem:
-    """``problem`` on a map whose points all are moved by ``by_m`` (2,)."""
+    """``problem`` on a map with all points moved by ``by_m`` (2,)."""
     if not by_m.any():
         return problem
     poses = problem.map_from_vehicle.copy()
@@ -47,18 +47,18 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     )
 
 
-MIN_STEP = 1e-4  # least step between frames, as a fraction of the distance over which a drift fades
+MIN_STEP = 1e-4  # least step between frames, as a fraction of a drift's correlation length
 
-_MIN_WHITE_SHARE = 1e-3  # below this share of an error its white part is rounding left over from the drift
+_MIN_WHITE_SHARE = 1e-3  # a smaller white fraction of an error is rounding of the drift
 
 
 def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
-    """The states of a frame: for each error its white part, then its drift, where there are any.
+    """States of a frame: of each error the white part, then the drift, where present.
 
-    All visits have the same; none outlasts its visit. A drift is a first-order Gauss-Markov process along the
-    driven distance d: memory m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied
-    Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition (J, S, S) and
-    the inverse sigma (J, S) of what is new in a frame's.
+    They are common to all sessions, and independent between them. A drift is a first-order Gauss-Markov
+    process along the driven distance d: memory m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2)
+    (Gelb, Applied Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition
+    (J, S, S) and the inverse sigma (J, S) of its innovation.
     """
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
@@ -77,7 +77,7 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     memory = np.zeros((len(poses), len(columns)))
     fades = np.arange(len(columns)) >= len(scattering)
-    # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
+    # A standing vehicle repeats its error; a floor on the step keeps the innovation's sigma above 0.
     faded = np.exp(-np.maximum(step_m[:, None] / over_m[visit][1:, fading], MIN_STEP))
     memory[1:, fades] = (np.diff(visit) == 0)[:, None] * faded
     turn = np.tile(np.eye(6), (max(len(poses) - 1, 0), 1, 1))
@@ -87,7 +87,7 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     return columns, transition, 1 / (sigma[visit] * np.sqrt(1 - memory**2))
 
 
-_MOST_JOINED = 256  # corners that known lengths may join; time and memory grow with the square and the cube
+_MOST_JOINED = 256  # most corners joined by known lengths: time grows with the cube, memory the square
 
 
 def make_arrays(
@@ -97,7 +97,7 @@ def make_arrays(
     clock_offset: bool = False,
     read_out: bool = False,
 ) -> Arrays:
-    """Lay a checked problem out; AdjustError where an image has a corner twice or lengths join too many."""
+    """Lay out a checked problem; AdjustError for a corner twice in an image, or too many joined corners."""
 
     def real(values: FloatArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
@@ -150,7 +150,7 @@ def make_arrays(
 
 
 def _surveys(problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Surveyed centres (C, 3) and corners (N, 2), each with its root information, 0 without a survey."""
+    """Surveyed centres (C, 3) and corners (N, 2), each with its root information, 0 without survey."""
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
     if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
         centre, centre_root = problem.centre_vehicle, 1 / problem.centre_sigma_m
@@ -169,7 +169,7 @@ def _lengths(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
 
 
 def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
-    """Corners (N,) by the frame that first saw them, joined ones side by side, and which follow such (N,)."""
+    """Corners (N,) by first frame, joined ones contiguous, and whether (N,) each is joined to the last."""
     count, lengths = problem.corner_count, problem.lengths
     seen, frames = problem.observations, len(problem.map_from_vehicle)
     first_frame = np.full(count, frames)
@@ -191,7 +191,7 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
-    """Observations (K,) by corner, then camera, then frame; corner, pair and what was measured of each."""
+    """Observations (K,) by corner, camera, frame; then corner, pair and measurement of each."""
     from v2hdm.adjust.engines.numba.layout import Seen, lay_out  # loads numba
 
     seen, count = Seen.of(problem.observations.columns, problem.intrinsic), len(problem.observations.corner)
@@ -211,7 +211,7 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any]
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:
-    """(J, 6, Q), Q visits if clock offsets are estimated: a frame moves with that of its visit; sigmas."""
+    """Twists (J, 6, Q), one column per session if clock offsets are estimated; prior sigmas."""
     if not clock_offset or problem.twist_vehicle is None:
         return np.zeros((len(problem.map_from_vehicle), 6, 0)), []
     own = problem.visit_of_frame[:, None] == np.arange(problem.visit_count)
@@ -220,9 +220,9 @@ def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list
 
 
 def _moments(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
-    """The frames (M,) of the moments at which rows were read, ascending, and each observation's moment (K,).
+    """Frames (M,) of the moments of row read-out, ascending, and each observation's moment (K,).
 
-    Lastly how the vehicle has moved at them since its frame's stamp, by the read-out time (M, 6).
+    Then the vehicle's motion (M, 6) since its frame's stamp, per unit of read-out time.
     """
     seen = problem.observations
     rows = np.column_stack([seen.frame, np.asarray(seen.row_share)])

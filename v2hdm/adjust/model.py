@@ -1,24 +1,23 @@
-r"""The whole model, as one writes it on a blackboard: every residual, in torch and kornia, float64.
+r"""The complete model: every residual, in torch and kornia, float64.
 
 The paper (*Monocular Camera Mapping with Pose-Guided Optimization*, IROS 2023) projects the ground corners l
 of markings through the extrinsic T = ``cam_from_vehicle`` and the recorded pose P = ``map_from_vehicle``, and
-minimises the reprojection error over extrinsics and corners together. Each observation k of corner n by
-camera c in frame j has the whitened residual
+minimises the reprojection error over extrinsics and corners. The whitened residual of observation k, of
+corner n by camera c in frame j, is
 
 .. math:: r_k = \Sigma_k^{-1/2} (\pi(T_c\,e^{-q_c v_j}\,e^{-s_j}\,P_j^{-1}\,l_n) - u_k)
 
-which is the paper's for s = 0 and q = 0. Beyond it, frames have states s (what the recorded pose is off,
-some of it drifting) and cameras clock offsets q (images are late, and the vehicle moves with the twist v).
-A rolling shutter reads the first row r / 2 before the image's stamp and the last r / 2 after it: for q_c
-there stands q_c + r_c rho_k, with rho_k from -1/2 to 1/2 by the row of the observation.
-A lane is a spline through knots, which are points l as corners are, seen as a line that passes them: of
-:math:`\Sigma_k^{-1/2}` but the row across the line is left. A knot moves across its lane alone, since
-t'(l - l0) along it is held at zero.
-The cost is half the sum of all squares, where a robust loss takes the squares of the observations.
+which is the paper's for s = 0 and q = 0. In addition, frames have states s (errors of the recorded pose, some
+drifting) and cameras clock offsets q (late images, vehicle moving with the twist v). A rolling shutter
+reads the first row r / 2 before the image's stamp and the last r / 2 after it: q_c becomes q_c + r_c rho_k,
+with rho_k from -1/2 to 1/2 by the observation's row. Lanes are splines whose knots are points l like corners,
+observed as lines: of :math:`\Sigma_k^{-1/2}` the row across the line remains. A knot moves across its lane
+alone, since t'(l - l0) along it is held at zero. The cost is half the sum of squares, those of observations
+under a robust loss.
 
-Tangents are (translation, rotation), as kornia's ``Se3`` has them, and act from the left: exp(x) T.
-No derivative is written here: :mod:`v2hdm.adjust.engines.autograd` takes them by autograd, and what
-:mod:`v2hdm.adjust.engines.numba` computes in closed form is tested against that.
+Tangents are (translation, rotation), as in kornia's ``Se3``, and act from the left: exp(x) T.
+Derivatives are left to autograd (:mod:`v2hdm.adjust.engines.autograd`), against which the closed forms of
+:mod:`v2hdm.adjust.engines.numba` are tested.
 """
 
 from __future__ import annotations
@@ -36,15 +35,15 @@ from v2hdm.adjust.arrays import Arrays
 from v2hdm.geometry.tensors import NEAR_M, inverse
 
 MIN_DEPRESSION_SINE = 0.01
-"""Below this sine of the depression a ray meets the ground too far away to say where."""
+"""Least sine of a ray's depression: below, its ground point is too far away to be determined."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A point in the space of unknowns.
+    """A value of all unknowns.
 
-    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s, where the read-out
-    time is estimated what it is longer than stated in the last column.
+    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), and clock offsets (C, Q), s, with the error of
+    the stated read-out time in the last column, if estimated.
     """
 
     cam_from_vehicle: Tensor
@@ -55,7 +54,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Gradient:
-    """A gradient by extrinsic (left tangent, (C, 6)), frame state (J, S), corner (N, 2), clock (C, Q)."""
+    """A gradient: by extrinsic (left tangent, (C, 6)), frame state (J, S), corner (N, 2) and clock (C, Q)."""
 
     extrinsic: Tensor
     frame_state: Tensor
@@ -65,14 +64,14 @@ class Gradient:
 
 @dataclass(frozen=True)
 class Loss:
-    """A robust loss by name and scale."""
+    """A robust loss, by name and scale."""
 
     name: str
     scale: float
 
 
 def rigid(tangent: Tensor) -> Tensor:
-    """The motions exp(x) (*batch, 4, 4) of tangents x (*batch, 6)."""
+    """Rigid motions exp(x) (*batch, 4, 4) of tangents x (*batch, 6)."""
     motion: Tensor = Se3.exp(tangent.reshape(-1, 6)).matrix()
     return motion.view(*tangent.shape[:-1], 4, 4)
 
@@ -84,19 +83,16 @@ def left_tangent(moved: Tensor, base: Tensor) -> Tensor:
 
 
 def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
-    """Tangents s (..., J, 6) of the frames by their states (..., J, S); two may act on one axis."""
+    """Tangents s (..., J, 6) of the frames from their states (..., J, S); two states may share an axis."""
     axis = torch.tensor(arrays.states, dtype=torch.int64, device=frame_state.device)
     return frame_state @ one_hot(axis, 6).to(frame_state.dtype)
 
 
 def cam_from_map(arrays: Arrays, cam_from_vehicle: Tensor, frame_state: Tensor, clock_s: Tensor) -> Tensor:
-    """T exp(-(q + r rho) v) exp(-s) P^-1 of every pair of a camera and a moment, (C, M, 4, 4).
+    """Poses T exp(-(q + r rho) v) exp(-s) P^-1 (C, M, 4, 4) of every pair of a camera and a moment.
 
-    Args:
-        arrays: the problem.
-        cam_from_vehicle: (C, 4, 4).
-        frame_state: (J, S), or (C, M, S) for states of each pair.
-        clock_s: (C, Q), or (C, M, Q) for offsets of each pair.
+    ``cam_from_vehicle`` is (C, 4, 4), ``frame_state`` (J, S) or by pair (C, M, S), ``clock_s`` (C, Q) or by
+    pair (C, M, Q).
     """
     camera, vehicle_from_map = cam_from_vehicle[:, None], arrays.vehicle_from_map
     by_pair = frame_state.ndim == 3
@@ -112,21 +108,21 @@ def cam_from_map(arrays: Arrays, cam_from_vehicle: Tensor, frame_state: Tensor, 
 
 
 def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
-    """Tangents (C, M, 6) by which the vehicle has moved since the stamps, by offsets (C, Q) or (C, M, Q)."""
+    """Motion of the vehicle since the stamps, tangents (C, M, 6), for offsets (C, Q) or (C, M, Q)."""
     late = clock_s if clock_s.ndim == 3 else clock_s[:, None]
     by_clock: Tensor = (arrays.clock_twist @ late[..., None])[..., 0]
     return by_clock if arrays.read_out is None else by_clock + arrays.read_out
 
 
 def before_camera(points_cam: Tensor) -> Tensor:
-    """Points (k, 3) for projection: behind the depth ``NEAR_M`` 1 / z goes on as in ``inverse_depth``."""
+    """Points (k, 3) for projection: below the depth ``NEAR_M``, 1 / z continues as in ``inverse_depth``."""
     depth = points_cam[:, 2:]
     beyond = 1 + (NEAR_M - depth).clamp(min=0) / NEAR_M
     return torch.cat([points_cam[:, :2] * beyond, depth.clamp(min=NEAR_M)], dim=1)
 
 
 def points_in_camera(cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
-    """Points (k, 3) in the camera of corners (k, 2) on the ground z = 0, each by a transform of its own."""
+    """Points (k, 3) in the camera of corners (k, 2) on the ground z = 0, one transform per corner."""
     points_cam: Tensor = transform_points(cam_from_map, pad(corners_map, (0, 1))[:, None])[:, 0]
     return points_cam
 
@@ -140,9 +136,9 @@ def corner_residual(points_cam: Tensor, measured: Tensor, root_information: Tens
 
 
 def ground_points(cam_from_map: Tensor, measured: Tensor) -> Tensor:
-    """Where rays (2, k), at depth 1, meet the ground (k, 2): the inverse homography of the ground, the IPM.
+    """Ground points (k, 2) of rays (2, k) at depth 1, by the inverse homography, the IPM.
 
-    Above the horizon the points mean nothing (:func:`depression_sine`).
+    They are meaningless above the horizon (:func:`depression_sine`).
     """
     ipm, _ = torch.linalg.inv_ex(cam_from_map[:, :3, [0, 1, 3]])
     points_map: Tensor = transform_points(ipm, measured.T[:, None])[:, 0]
@@ -150,14 +146,14 @@ def ground_points(cam_from_map: Tensor, measured: Tensor) -> Tensor:
 
 
 def depression_sine(cam_from_map: Tensor, measured: Tensor) -> Tensor:
-    """How steeply rays (2, k), at depth 1, descend to the ground: sines (k,), negative above the horizon."""
+    """Sines (k,) of the depression of rays (2, k) at depth 1: negative above the horizon."""
     ray = pad(measured.T, (0, 1), value=1.0)
     sine: Tensor = -(ray * cam_from_map[:, :3, 2]).sum(1) / ray.norm(dim=1)
     return sine
 
 
 def centre_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
-    """Camera centres o = -R' t against their survey, (C, 3)."""
+    """Camera centres o = -R' t minus the surveyed ones, (C, 3)."""
     rotation, translation = cam_from_vehicle[:, :3, :3], cam_from_vehicle[:, :3, 3:]
     return (-(rotation.mT @ translation)[..., 0] - arrays.centre) * arrays.centre_information_root
 
@@ -165,8 +161,8 @@ def centre_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
 def state_residual(arrays: Arrays, frame_state: Tensor, before: Tensor | None = None) -> Tensor:
     """Innovations (J, S) of the frame states: s_j - A_j s_(j-1).
 
-    A state that scatters has A = 0; one that drifts is a Gauss-Markov process, A = exp(-d / D) over the
-    driven distance d. ``before`` (J, S) are the states of the frames before, if not those of ``frame_state``.
+    A white state has A = 0; a drift is a Gauss-Markov process with A = exp(-d / D) over the driven distance
+    d. ``before`` (J, S) overrides the states of the previous frames.
     """
     if before is None:
         before = torch.cat([torch.zeros_like(frame_state[:1]), frame_state[:-1]])
@@ -175,26 +171,26 @@ def state_residual(arrays: Arrays, frame_state: Tensor, before: Tensor | None = 
 
 
 def clock_residual(arrays: Arrays, clock_s: Tensor) -> Tensor:
-    """Clock offsets (C, Q) against zero, and read-out times against the stated ones."""
+    """Clock offsets (C, Q), and read-out times minus the stated ones."""
     return clock_s * arrays.clock_information_root
 
 
 def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
-    """Corners (N, 2) against what a survey measured; knots of lanes do not wander along their line."""
+    """Corners (N, 2) minus their surveyed positions; knots of lanes are held along their line."""
     x, y = (corners_map - arrays.control).unbind(1)
     a, b, c = arrays.control_root.unbind(1)
     return torch.stack([a * x, b * x + c * y], dim=1)
 
 
 def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:
-    """Distances (M,) of corners (M, 2) against the known lengths."""
+    """Distances (M,) of corners (M, 2) minus the known lengths."""
     known = arrays.lengths
     distance_m: Tensor = torch.linalg.vector_norm(first_map - second_map, dim=1)
     return (distance_m - known.length_m) * known.information_root
 
 
 def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
-    """The residuals of everything but the observations, by name."""
+    """All residuals except those of observations, by name."""
     corners, known = estimate.corners_map, arrays.lengths
     return {
         "camera_centre": centre_residual(arrays, estimate.cam_from_vehicle),
@@ -206,16 +202,16 @@ def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
 
 
 def prior_terms(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
-    """The cost of everything but the observations, by name."""
+    """The cost except that of observations, by name."""
     residuals = prior_residuals(arrays, estimate)
     return {name: residual.square().sum() / 2 for name, residual in residuals.items()}
 
 
 def robustified(robust: Loss, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """The loss rho(s) of squared residuals and its derivative, the weight of reweighted least squares.
+    """The loss rho(s) of squared residuals s, and its derivative, the IRLS weight.
 
-    All losses agree with rho(s) = s near 0 (Barron, A General and Adaptive Robust Loss Function, CVPR 2019,
-    alpha = 2, 1, 0, -2, up to the scale's convention); the scale is the residual from which they bend.
+    All losses equal s near 0 and depart from it at the scale (Barron, A General and Adaptive Robust Loss
+    Function, CVPR 2019, alpha = 2, 1, 0, -2, up to the convention of the scale).
     """
     if robust.name == "none":
         return squared, torch.ones_like(squared)

@@ -1,27 +1,27 @@
 r"""The problem as plain numpy records: observations, unknowns and priors.
 
-Unknown are, in the frames of :mod:`v2hdm.geometry`,
+The unknowns, in the frames of :mod:`v2hdm.geometry`, are
 
 - the extrinsic ``cam_from_vehicle`` of every camera,
 - the corners of the markings ``corners_map`` (x, y); the ground is z = 0,
-- optionally, for every frame, how far the vehicle was from its recorded pose: any of x, y, height,
-  roll, pitch, heading, as a tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``,
-- optionally, for every camera, a clock offset: its images were taken that much later than they say,
-- optionally, for every camera, its read-out time: from the first row of an image to the last, the middle row
-  being taken at the image's stamp (plus the clock offset).
+- optionally the error of every frame's recorded pose, any of x, y, height, roll, pitch and heading, as a
+  tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``,
+- optionally a clock offset of every camera, exposure minus stamp,
+- optionally the read-out time of every camera, from the first row of an image to the last; the middle row is
+  taken at the stamp (plus the clock offset).
 
-Frames may be of several visits to the site. Each visit has its own noise of poses, whose drift begins anew,
-and its own clock offsets; cameras and corners are common to all.
+Frames may belong to several sessions. Each session has its own pose noise, with drifts that start anew, and
+its own clock offsets; cameras and corners are common.
 
 The cost, in units of half a squared standard deviation, is
 
 .. math:: f = \tfrac12 \sum_k \rho(\|\Sigma_k^{-1/2} (\pi(T_c\,e^{-s_j} P_j^{-1}\, l) - u_k)\|^2)
     + \tfrac12 \sum_c \|(o_c - \bar o_c) / \sigma_c\|^2 + \tfrac12 \sum_j \|s_j / \sigma_s\|^2
 
-over observations k (one corner in one image), camera centres o and frame states s; to which come, where they
-are known, the surveyed positions of corners, the distances between them, and clock offsets. The prior acts on
-the camera's *centre in the vehicle frame*, which a survey measures, and not on the translation of
-``cam_from_vehicle``, which a rotation error would drag along.
+over observations k (one corner in one image), camera centres o and frame states s, plus terms of surveyed
+corners, known lengths and clock offsets where given. The prior acts on the camera's *centre in the vehicle
+frame*, which a survey measures, rather than on the translation of ``cam_from_vehicle``, which depends on
+the rotation.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ import numpy as np
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
-"""The axes in which a frame can deviate, in the order of its tangent."""
+"""Axes of a frame's error, in the order of its tangent."""
 
 _LINE_RATIO = 1e3
-"""Ratio of an observation's two variances from which it is one of a line: a point's is below 200."""
+"""Ratio of an observation's variances from which it is of a line; a point's is below 200."""
 
 # With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
 LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
-"""Squared trace over determinant of a covariance from which an observation is one of a line."""
+"""Squared trace over determinant of a covariance from which the observation is of a line."""
 
 _ROUNDED = 1e-12
-"""Share of an information below which what another axis has left of it is rounding."""
+"""Fraction of an axis' information below which its remainder beside the other axis is rounding."""
 
 READ_OUT_SIGMA_S = 0.03
-"""How far a read-out time may be from the stated one, s: a global shutter's is 0, that of CMOS cameras in
-phones mostly 28 to 32 ms (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
+"""Prior sigma of a read-out time, s: 0 of a global shutter, mostly 28 to 32 ms of CMOS cameras in phones
+(Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
@@ -56,11 +56,11 @@ ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
 
 @dataclass(frozen=True)
 class Observations:
-    """K sightings: camera ``camera`` (K,) saw at frame ``frame`` (K,) the corner ``corner`` (K,).
+    """K sightings: ``camera`` (K,) saw ``corner`` (K,) at ``frame`` (K,).
 
-    ``pinhole_px`` (K, 2) is where, with the lens distortion removed; ``covariance_px`` (K, 2, 2) how
-    well, px^2. ``row_share`` (K,) is when in the read-out its row of the recorded image was taken, from -1/2
-    for the first row to 1/2 for the last; only a rolling shutter asks for it.
+    ``pinhole_px`` (K, 2) is undistorted, with ``covariance_px`` (K, 2, 2), px^2. ``row_share`` (K,) is the
+    read-out time of its row in the recorded image, -1/2 for the first row to 1/2 for the last; only rolling
+    shutters need it.
     """
 
     camera: IntArray
@@ -72,7 +72,7 @@ class Observations:
 
     @property
     def columns(self) -> tuple[IntArray | FloatArray, ...]:
-        """All columns but the row shares, in the order of the fields."""
+        """All columns except the row shares, in the order of the fields."""
         return self.camera, self.frame, self.corner, self.pinhole_px, self.covariance_px
 
     def take(self, rows: IntArray | BoolArray) -> Observations:
@@ -82,7 +82,7 @@ class Observations:
 
     @property
     def on_line(self) -> BoolArray:
-        """Which observations (K,) say on which line of the image their corner lies, and not where on it."""
+        """Observations (K,) of lines: the position along the line is unknown."""
         xx, yx, yy = (self.covariance_px[:, row, column] for row, column in ((0, 0), (1, 0), (1, 1)))
         return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * LINE_EXCESS)
 
@@ -91,8 +91,8 @@ class Observations:
 class Drift:
     """The slow part of a pose error: a first-order Gauss-Markov process along the route.
 
-    ``sigma`` is its standard deviation, in the unit of the error; ``over_m`` the driven distance over which
-    it fades to 1 / e. A sigma of 0 means that there is none.
+    ``sigma`` is its standard deviation in the error's unit, ``over_m`` the driven distance over which it
+    decorrelates to 1 / e. A sigma of 0 means none.
     """
 
     sigma: float = 0.0
@@ -101,10 +101,9 @@ class Drift:
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2).
+    """M surveyed corners: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2).
 
-    Sigmas are those of x and y or, where directions ``along`` (M, 2) are given, along and across these;
-    an infinite one says nothing.
+    Sigmas are of x and y, or along and across the directions ``along`` (M, 2); inf means unknown.
     """
 
     corner: IntArray
@@ -113,13 +112,13 @@ class ControlPoints:
     along: FloatArray | None = None
 
     def take(self, rows: IntArray | BoolArray, corner: IntArray) -> ControlPoints:
-        """The points at ``rows``, of corners that are now called ``corner``."""
+        """The points at ``rows``, for corners renumbered to ``corner``."""
         along = None if self.along is None else self.along[rows]
         return ControlPoints(corner, self.points_map[rows], self.sigma_m[rows], along)
 
     @property
     def root_information(self) -> FloatArray:
-        """a, b, c (M, 3) of the whitened residuals (a dx, b dx + c dy)."""
+        """Root information a, b, c (M, 3) of whitened residuals (a dx, b dx + c dy)."""
         t = np.array([[1.0, 0.0]]) if self.along is None else self.along
         one, other = (1 / self.sigma_m**2).T
         xx, yy = one * t[:, 0] ** 2 + other * t[:, 1] ** 2, one * t[:, 1] ** 2 + other * t[:, 0] ** 2
@@ -131,11 +130,10 @@ class ControlPoints:
 
 @dataclass(frozen=True)
 class KnownLengths:
-    """M distances that are known beforehand, such as the sides of a painted sign.
+    """M distances known beforehand, such as the sides of a painted sign.
 
-    Between the corners ``first`` (M,) and ``second`` (M,) there are ``length_m`` (M,), give or take
-    ``sigma_m`` (M,). Corners that lengths join, directly or through others, are eliminated together: meant
-    for those of one marking, not for a net over the whole map.
+    Corners ``first`` and ``second`` (M,) are ``length_m`` (M,) apart, with ``sigma_m`` (M,). Joined corners
+    are eliminated together: meant for one marking, not for a net over the whole map.
     """
 
     first: IntArray
@@ -146,11 +144,10 @@ class KnownLengths:
 
 @dataclass(frozen=True)
 class PoseSigma:
-    """How far the recorded poses are off, one standard deviation of each state of a frame.
+    """Standard deviations of the recorded poses, per state of a frame.
 
-    Of each, the ``..._drift`` is the part that fades along the route; frames must then be in driving
-    order. The rest, in quadrature, is independent from frame to frame. A drift of the position keeps its
-    direction in the map, and so turns in the vehicle as it turns.
+    A ``..._drift`` is the correlated part, for frames in driving order; the rest, in quadrature, is white. A
+    position drift keeps its direction in the map, and so rotates in the vehicle frame.
     """
 
     position_m: float = 0.02
@@ -174,19 +171,17 @@ class PoseSigma:
 
 @dataclass(frozen=True)
 class Problem:
-    """C cameras, J frames, N corners and what ties them together.
+    """C cameras, J frames, N corners and the data that connect them.
 
-    ``intrinsic`` (C, 4) is fx, fy, cx, cy in px. ``cam_from_vehicle`` (C, 4, 4) is where to start
-    from; ``map_from_vehicle`` (J, 4, 4) are the recorded poses. ``centre_vehicle`` and
-    ``centre_sigma_m`` (C, 3) are the surveyed camera centres, or None. ``corners_start`` (N, 2), if
-    given, replaces the start by weighted back-projection. ``twist_vehicle`` (J, 6) is how the vehicle
-    moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
-    is held near zero by ``clock_sigma_s``. ``read_out_s`` (C,) are the cameras' read-out times as stated,
-    None for global shutters; estimated ones are held near them by ``read_out_sigma_s``. ``control``, if
-    given, ties corners to a survey: the only thing that can tell a shift of the whole map from the drift of
-    the receiver. ``lengths``, if given, are known distances between corners. ``visit`` (J,), if
-    given, numbers the visit that each frame is of, from 0 and rising; there is then one ``pose_sigma`` for
-    all visits or one for each.
+    ``intrinsic`` (C, 4) is fx, fy, cx, cy, px. ``cam_from_vehicle`` (C, 4, 4) is the start,
+    ``map_from_vehicle`` (J, 4, 4) the recorded poses. ``centre_vehicle`` and ``centre_sigma_m`` (C, 3) are
+    the surveyed camera centres, or None. ``corners_start`` (N, 2) replaces the start by weighted
+    back-projection. ``twist_vehicle`` (J, 6), the vehicle's velocity in its own frame (m/s, rad/s), is needed
+    for clock offsets, whose prior sigma is ``clock_sigma_s``. ``read_out_s`` (C,) are the stated read-out
+    times, None for global shutters; their prior sigma is ``read_out_sigma_s``. ``control`` are surveyed
+    corners: they alone separate a shift of the whole map from the drift of GNSS. ``lengths`` are known
+    distances. ``visit`` (J,) numbers the session of each frame, from 0 and rising; ``pose_sigma`` is one for
+    all sessions or one per session.
 
     >>> problem = build_problem(port, result.detections)
     >>> problem.intrinsic.shape, problem.observations.pinhole_px.shape[1:]
@@ -211,9 +206,9 @@ class Problem:
     visit: IntArray | None = None
 
     def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
-        """The problem of the cameras and frames of ``observations`` alone, and their indices (C,), (J,) here.
+        """The problem of the cameras and frames of ``observations``, and their indices (C,), (J,) here.
 
-        Corners are those of the observations; what this problem knows of its own is left out.
+        Corners are those of the observations, without this problem's knowledge of its own.
         """
         cameras, camera = np.unique(observations.camera, return_inverse=True)
         frames, frame = np.unique(observations.frame, return_inverse=True)
@@ -228,42 +223,42 @@ class Problem:
 
     @property
     def visit_of_frame(self) -> IntArray:
-        """The visit (J,) that each frame is of."""
+        """Session (J,) of each frame."""
         return np.zeros(len(self.map_from_vehicle), dtype=np.int64) if self.visit is None else self.visit
 
     @property
     def visit_count(self) -> int:
-        """How many visits there are."""
+        """Number of sessions."""
         if not isinstance(self.pose_sigma, PoseSigma):
             return len(self.pose_sigma)
         return int(self.visit_of_frame.max(initial=0)) + 1
 
     @property
     def pose_sigmas(self) -> tuple[PoseSigma, ...]:
-        """How far the recorded poses of each visit are off."""
+        """Standard deviations of each session's recorded poses."""
         one = self.pose_sigma
         return self.visit_count * (one,) if isinstance(one, PoseSigma) else one
 
 
 @dataclass(kw_only=True)
 class SolveOptions:
-    """How to solve.
+    """Options of a solve.
 
     Attributes:
-        pose_states: the states each frame is given, of :data:`POSE_STATES`; () is the paper's model.
-        clock_offset: whether each camera's clock offset, one a visit, is estimated.
-        read_out: whether each camera's read-out time is estimated.
-        loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
-        loss_scale: residual, in standard deviations, from which the loss departs from least squares.
-        gate_probability: share of sound observations that the verdict on outliers may cost.
-        coarse: where the start is far off, or the problem large, first solve a subset of steep rays, which
+        pose_states: states of each frame, of :data:`POSE_STATES`; () is the paper's model.
+        clock_offset: estimate one clock offset per camera and session.
+        read_out: estimate each camera's read-out time.
+        loss: robust loss of an observation's whitened residual, of :data:`LOSSES`.
+        loss_scale: residual, in standard deviations, at which the loss departs from least squares.
+        gate_probability: fraction of sound observations that the outlier test may reject.
+        coarse: from a distant start, or in a large problem, first solve a subset of steep rays, which
             converges from ten degrees away.
-        gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
-        max_refreshes: how often the problem is whitened anew at most.
-        max_evaluations: of cost and gradient, over all refreshes.
-        engine: who evaluates and linearises, of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU,
-            ``torch`` by autograd anywhere; ``auto`` is numba on the CPU, torch elsewhere.
-        device: torch device to compute on.
+        gap_tolerance: predicted remaining decrease, as a fraction of the cost, at which to stop.
+        max_refreshes: largest number of whitenings.
+        max_evaluations: largest number of evaluations of cost and gradient, in total.
+        engine: of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU, ``torch`` by autograd anywhere;
+            ``auto`` is numba on the CPU, torch elsewhere.
+        device: torch device.
     """
 
     pose_states: tuple[str, ...] = POSE_STATES

@@ -1,10 +1,10 @@
-"""The reduced system of frame states, kept corners and cameras, all other corners eliminated, in tiles.
+"""The reduced system of frame states, kept corners and cameras, other corners eliminated, in tiles.
 
-S = U - B' B (:mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the tiles in
-elimination order, padded to whole tiles, then the cameras' unknowns. Tiles are of frames along the route or
-of *kept* corners: where several drives pass the same corners, eliminating these first would couple the frames
-of all drives with one another, and it takes less to eliminate each drive's frames before them. The corners'
-own block V is factorised by blocks of 2 x 2, or as many as known lengths join.
+S = U - B' B (:mod:`v2hdm.adjust.whitening`). Vectors of reduced unknowns hold the tiles in elimination order,
+padded to whole tiles, then the cameras' unknowns. A tile holds frames along the route, or *kept* corners:
+eliminating corners shared by several drives would couple the frames of all drives, so it is cheaper to
+eliminate each drive's frames first. The corners' block V is factorised in blocks of 2 x 2, or larger where
+known lengths join corners.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, TiledMatrix, factorise_tiles
 from v2hdm.errors import AdjustError
 
-CORNER_FLOOR = 1e-10  # information, 1 / m^2, that keeps a corner factorable which runs off to the horizon
+CORNER_FLOOR = 1e-10  # information, 1 / m^2, that keeps V definite for a corner running to the horizon
 
-PIVOT_FLOOR = 1e-12  # least pivot of a corner's second coordinate, as a share of its own information
+PIVOT_FLOOR = 1e-12  # least pivot of a corner's second coordinate, as a fraction of its information
 
 INSEPARABLE = "corners joined by known lengths cannot be solved for together: increase their sigma_m"
-"""The error of a block that has no factor."""
+"""Error message for a block that is not positive definite."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Groups of ``corners`` corners each, side by side from ``begin`` (m,); lower factors (m, 2g, 2g)."""
+    """Groups of ``corners`` corners each, contiguous from ``begin`` (m,); lower factors (m, 2g, 2g)."""
 
     begin: Tensor
     corners: int
@@ -37,19 +37,19 @@ class Joint:
 
     @property
     def index(self) -> Tensor:
-        """The groups' corners (m, g)."""
+        """Corners (m, g) of the groups."""
         return self.begin[:, None] + torch.arange(self.corners, device=self.begin.device)
 
 
 @dataclass(frozen=True)
 class CornerFactor:
-    """L of the block-diagonal V = L L': ``lower`` (3, n), xx, yx, yy, where a corner stands alone."""
+    """L of the block-diagonal V = L L': ``lower`` (3, n), xx, yx, yy, of corners without joined ones."""
 
     lower: Tensor
     joint: tuple[Joint, ...]
 
     def part(self, corners: slice) -> CornerFactor:
-        """The factor of some corners, which are joined to no others."""
+        """The factor of a range of corners that are joined to no others."""
         inside = []
         for group in self.joint:
             chosen = (group.begin >= corners.start) & (group.begin < corners.stop)
@@ -58,7 +58,7 @@ class CornerFactor:
         return CornerFactor(self.lower[:, corners], tuple(inside))
 
     def take(self, corners: Tensor) -> CornerFactor:
-        """The factor of corners (n,), ascending, with all that they are joined to."""
+        """The factor of corners (n,), ascending, including all joined ones."""
         inside = []
         for group in self.joint:
             place = torch.searchsorted(corners, group.begin).clamp(max=len(corners) - 1)
@@ -91,9 +91,9 @@ class CornerFactor:
 
 
 def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, Tensor]) -> CornerFactor:
-    """Factorise V of (N, 2, 2) J'J by corner, and derivatives (M, 2) of the lengths by both their corners.
+    """Factorise V from J'J (N, 2, 2) by corner and derivatives (M, 2) of the lengths by both corners.
 
-    Raises AdjustError where corners that lengths join cannot be solved for together.
+    Raises AdjustError if a block of joined corners is singular.
     """
     xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
     lower = cholesky_2x2(xx + CORNER_FLOOR, yx, yy + CORNER_FLOOR)
@@ -131,46 +131,45 @@ def _add_lengths(arrays: Arrays, group: Joint, by_length: tuple[Tensor, Tensor],
 
 
 def cholesky_2x2(xx: Tensor, yx: Tensor, yy: Tensor) -> Tensor:
-    """Lower factors (3, n) of symmetric 2 x 2 blocks, by hand: one call per block would be slow."""
+    """Lower factors (3, n) of symmetric 2 x 2 blocks, in closed form: one call per block would be slow."""
     first = xx.sqrt()
     below = yx / first
     last = (yy - below.square()).clamp(min=PIVOT_FLOOR * yy).sqrt()
     return torch.stack([first, below, last])
 
 
-# Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
-_TILE_ROWS = 96
+_TILE_ROWS = 96  # approximate rows of a tile: fast products, yet small against a corner's span of frames
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a problem's reduced system is cut into tiles; depends on who observed what, not on numbers."""
+    """The division of a reduced system into tiles; depends on the structure alone, not on numbers."""
 
-    frames_per_tile: int  # frames of a tile
-    size: int  # rows of a tile
-    frame_tiles: int  # how many tiles are of frames; those of kept corners follow
-    pattern: Pattern  # which tiles are not zero, and their order of elimination
-    kept: Tensor  # (n,) the corners that are not eliminated before the frames, ascending
-    most_tiles: int = 0  # tiles that the observations of a unit of corners touch at most
+    frames_per_tile: int  # frames per tile
+    size: int  # rows per tile
+    frame_tiles: int  # number of frame tiles; those of kept corners follow
+    pattern: Pattern  # nonzero tiles and their elimination order
+    kept: Tensor  # (n,) corners not eliminated before the frames, ascending
+    most_tiles: int = 0  # largest number of tiles that the observations of a unit of corners touch
 
     @property
     def tile_count(self) -> int:
-        """G."""
+        """Number of tiles, G."""
         return len(self.pattern.below)
 
     @property
     def kept_tiles(self) -> int:
-        """How many tiles are of kept corners."""
+        """Number of tiles of kept corners."""
         return self.tile_count - self.frame_tiles
 
     @cached_property
     def position(self) -> Tensor:
-        """Where each tile stands in the order of elimination."""
+        """Position of each tile in the elimination order."""
         return torch.tensor(self.pattern.position, dtype=torch.int64, device=self.kept.device)
 
 
 def frames_per_tile(arrays: Arrays) -> int:
-    """How many frames make a tile."""
+    """Number of frames per tile."""
     return max(_TILE_ROWS // max(len(arrays.states), 1), 1)
 
 
@@ -205,7 +204,7 @@ def from_tiles(plan: Plan, rows: Tensor, frame_count: int, states: int) -> tuple
 
 @dataclass(frozen=True)
 class Coupled:
-    """A gradient by the reduced unknowns: by frame state (J, S) and by the cameras' unknowns (C, 6 + Q)."""
+    """A gradient by the reduced unknowns: frame states (J, S), and cameras (C, 6 + Q)."""
 
     frame_state: Tensor
     camera: Tensor
@@ -213,20 +212,20 @@ class Coupled:
 
 @dataclass(frozen=True)
 class Spread:
-    """How pairs move: derivatives of their left tangents; by the camera's extrinsic it is the identity."""
+    """Jacobians of the pairs' left tangents; that by the camera's extrinsic is the identity."""
 
     arrays: Arrays
-    state: Tensor  # (C, M, 6, S) by the states of the frame
-    clock: Tensor  # (C, M, 6, Q) by the camera's clock offset
+    state: Tensor  # (C, M, 6, S) by the frame's states
+    clock: Tensor  # (C, M, 6, Q) by the camera's clock offsets
 
     @property
     def camera(self) -> Tensor:
-        """(C, M, 6, 6 + Q): by all unknowns of the camera."""
+        """Jacobian (C, M, 6, 6 + Q) by all unknowns of the camera."""
         identity = torch.eye(6, dtype=self.clock.dtype, device=self.clock.device)
         return torch.cat([identity.expand(*self.clock.shape[:2], 6, 6), self.clock], dim=-1)
 
     def gather(self, by_pair: Tensor) -> Coupled:
-        """A gradient (C, M, 6) by the pairs' tangents as one by the unknowns that they move with."""
+        """A gradient (C, M, 6) by the pairs' tangents, carried back to the reduced unknowns."""
         by_state, by_camera = by_pair.new_zeros(self.arrays.frame_count, 0), by_pair.sum(1)
         if self.state.shape[-1]:
             by_state = self.arrays.over_moments((self.state.mT @ by_pair[..., None])[..., 0].sum(0))
@@ -236,7 +235,7 @@ class Spread:
         return Coupled(by_state, by_camera)
 
     def by_state(self, run: Run, coupling: Tensor) -> Tensor:
-        """W' (k, 2, S) by the states of each observation's frame, from that by its pair (k, 2, 6)."""
+        """W' (k, 2, S) by the states of each observation's frame, from that by pair (k, 2, 6)."""
         return coupling @ self.state.flatten(0, 1)[run.pair]
 
     def by_camera(self, run: Run, coupling: Tensor) -> Tensor:
@@ -251,9 +250,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class PriorBlocks:
-    """The priors' part of the Hessian, of cameras (C (6 + Q), C (6 + Q)) and of frames' states (J, S, S).
+    """Hessian of the priors: of cameras (C (6 + Q), C (6 + Q)) and of frame states (J, S, S).
 
-    ``across`` (J, S, S) stands between each frame's states and those of the frame before.
+    ``across`` (J, S, S) couples each frame's states to the previous frame's.
     """
 
     camera: Tensor
@@ -262,16 +261,16 @@ class PriorBlocks:
 
 
 class ReducedSystem:
-    """S while it is put together: U is summed up, and the corners' part is subtracted."""
+    """S under assembly: U is accumulated, the corners' part subtracted."""
 
     def __init__(self, arrays: Arrays, plan: Plan, spread: Spread) -> None:
         self.arrays, self.plan, self.spread = arrays, plan, spread
-        # U by pair; where no pair moves but with its camera, by camera.
+        # U by pair, or by camera where pairs move with their camera alone.
         self.by_pair = bool(arrays.states) or arrays.camera_unknowns > 6
         self.tip = arrays.camera_count * arrays.camera_unknowns
         self.matrix = TiledMatrix.zeros(plan.pattern, plan.size, self.tip, arrays.centre)
         self._own = arrays.centre.new_zeros(0)
-        # U's diagonal: 0 in rows that only fill up a tile, until they are fixed at 0.
+        # U's diagonal; rows that pad a tile are 0 until they are fixed.
         self._diagonal = arrays.centre.new_zeros(plan.tile_count * plan.size)
 
     def add(self, own: Tensor, cameras: Tensor) -> None:
@@ -280,10 +279,10 @@ class ReducedSystem:
         self.matrix.tiles[TIP, TIP].sub_(cameras)
 
     def add_kept(self, run: Run, coupling: Tensor, index: Tensor, blocks: Tensor) -> None:
-        """Add what is known of the kept corners, whose observations are ``run``.
+        """Add the information on kept corners, whose observations are ``run``.
 
-        ``coupling`` (k, 2, 6) is W' of these, ``blocks`` (m, 2, 2) the part of V at ``index`` (2, m), the
-        first not the lower.
+        ``coupling`` (k, 2, 6) is their W', ``blocks`` (m, 2, 2) the part of V at ``index`` (2, m), lower
+        triangle.
         """
         plan, axes = self.plan, torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
@@ -300,7 +299,7 @@ class ReducedSystem:
             self.matrix.tiles[TIP, place][:, : len(part)] += part.mT
 
     def _kept_rows(self, number: Tensor) -> Tensor:
-        """Rows at which kept corners begin, by their numbers."""
+        """First rows of kept corners, by their numbers."""
         plan, each = self.plan, self.plan.size // 2
         return plan.position[plan.frame_tiles + number // each] * plan.size + number % each * 2
 
@@ -312,7 +311,7 @@ class ReducedSystem:
         return (begin + within)[:, None] + torch.arange(states, device=frame.device)
 
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
-        """Add values at rows and columns of the tiles; of two that mirror each other the lower one counts."""
+        """Add values at rows and columns of the tiles, at the lower triangle's of two mirrored ones."""
         rows, columns = torch.broadcast_tensors(rows, columns)  # type: ignore[no-untyped-call]
         low, high = torch.minimum(rows, columns), torch.maximum(rows, columns)
         size, device = self.plan.size, values.device
@@ -324,10 +323,7 @@ class ReducedSystem:
     def factorise(
         self, priors: PriorBlocks, jitter: float, hold_cameras: bool
     ) -> tuple[TiledCholesky, float] | None:
-        """Factorise in place; the factor and its least pivot as a share of U's diagonal, None where it fails.
-
-        ``jitter`` is added to U's diagonal, relative to it.
-        """
+        """Factor in place, and least relative pivot; None if indefinite. ``jitter`` inflates U's diagonal."""
         self._add_frames(priors)
         diagonal = [*self._diagonal.view(self.plan.tile_count, self.plan.size), self._add_cameras(priors)]
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]

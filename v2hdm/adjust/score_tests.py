@@ -1,20 +1,20 @@
-r"""Which single wrong input would explain the residuals best: score tests at a solution.
+r"""The single wrong input that would best explain the residuals: score tests at a solution.
 
-A fault is one number p more in the model, zero in what was solved: a clock offset, a focal length, a shift
-of a survey. With whitened residuals r, their derivatives J_p by the fault and J_y by all that was estimated,
-one step gives its value (Rao's score test; Rao, Linear Statistical Inference and Its Applications, 2nd ed.,
-section 6e):
+A fault is one more parameter p of the model, zero in the solve: a clock offset, a focal length, a shift of a
+survey. With whitened residuals r and Jacobians J_p by the fault and J_y by the estimated unknowns, one step
+gives its value (Rao's score test; Rao, Linear Statistical Inference and Its Applications, 2nd ed., section
+6e):
 
 .. math:: z = J_p - J_y H^{-1} J_y' J_p, \quad p = -\frac{z' r}{z' z},
 
-everything else being estimated anew along with p. Residuals of a real road are no white noise: poses, and the
-ground under the wheels, err smoothly along the route. So each stretch g of the route is asked by itself. It
-has the score s_g = z_g' r_g and the information w_g = z_g' z_g, and what the stretches disagree by, e_g = s_g
-+ p w_g, is the noise that the fault is held against: a cluster-robust variance (Liang and Zeger, Biometrika
-73, 1986; the correction of Bell and McCaffrey, Survey Methodology 28, 2002; neighbours by Bartlett's weights,
-Newey and West, Econometrica 55, 1987). Few stretches say little of their own noise, and what the others of
-the same drive say moderates it (Smyth, Statistical Applications in Genetics and Molecular Biology 3, 2004).
-A fault costs about as much as four evaluations of the gradient, and no solve.
+everything else being re-estimated along with p. Residuals of a real road are no white noise: errors of poses
+and of the ground under the wheels are smooth along the route. So each segment g of the route yields a score
+s_g = z_g' r_g and an information w_g = z_g' z_g of its own, and the segments' disagreement e_g = s_g + p w_g
+is the noise that the fault is tested against: a cluster-robust variance (Liang and Zeger, Biometrika 73,
+1986; corrected by Bell and McCaffrey, Survey Methodology 28, 2002; neighbours by Bartlett's weights, Newey
+and West, Econometrica 55, 1987). With few segments it is noisy, hence shrunk towards that of the drive's
+other faults (Smyth, Statistical Applications in Genetics and Molecular Biology 3, 2004). A fault costs about
+four evaluations of the gradient, and no solve.
 """
 
 from __future__ import annotations
@@ -36,49 +36,49 @@ from v2hdm.adjust.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray
 
-_LEAST_OBSERVABLE = 1e-9  # share of a fault's own information, left by all else, below which it is rounding
+_LEAST_OBSERVABLE = 1e-9  # fraction of a fault's own information, net of all else, below which it is rounding
 
-_LEAST_P = 1e-300  # below it a p-value is zero for floating-point numbers
+_LEAST_P = 1e-300  # a smaller p-value is zero in floating point
 
-_STRETCHES_PER_CHANGE = 2  # stretches from one frame at which inputs may change to the next
+_STRETCHES_PER_CHANGE = 2  # segments between candidate frames of a change of inputs
 
 _MOST_CHANGES = 12
-"""Frames at which inputs may change, of all sessions together: each costs a test of every camera and axis."""
+"""Candidate frames of a change, over all sessions: each costs a test of every camera and axis."""
 
-_DRIFTS = 3  # shapes of a clock that drifts: evenly, in two half waves and in three
+_DRIFTS = 3  # shapes of a clock drift: linear, and cosines of two and three half waves
 
 _STEPS = ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5), (-(0.5**0.5), 0.5**0.5))
-"""Directions in the map in which positions may step: none is farther than 22.5 deg from one of them."""
+"""Directions of position steps in the map: no direction is more than 22.5 deg from one of them."""
 
-_LEAST_SPEED_MPS = 0.5  # below it a vehicle has no course
+_LEAST_SPEED_MPS = 0.5  # a slower vehicle has no course
 
-_LAGS = 1  # neighbours of a stretch that err along with it
+_LAGS = 1  # neighbouring segments with correlated errors
 
-_PRIOR_FREEDOM = 15.0  # degrees of freedom that the usual disagreement of stretches counts for in each test
+_PRIOR_FREEDOM = 15.0  # degrees of freedom of the prior on each test's disagreement
 
 
 class Fault(Enum):
-    """An input that may be wrong, and the unit of its value."""
+    """An input that may be wrong; its value has :attr:`unit`."""
 
-    CLOCK = "clock"  # images were taken later than they say
-    CLOCK_DRIFT = "clock drift"  # and ever later: by so much from the first to the last
-    FOCAL = "focal"  # share by which the focal length is longer than stated
+    CLOCK = "clock"  # images were taken later than stamped
+    CLOCK_DRIFT = "clock drift"  # increasingly so: total from first to last image
+    FOCAL = "focal"  # relative error of the focal length
     DISTORTION = "distortion"  # first radial coefficient
-    PRINCIPAL = "principal"  # point of the image on the optical axis
-    SLOPE = "slope"  # of the ground, which the poses do not know of
+    PRINCIPAL = "principal"  # position in the image
+    SLOPE = "slope"  # of the ground, unknown to the poses
     CROWN = "crown"  # fall of the ground to both sides of the route
-    COURSE = "course"  # heading is the direction of motion of a point so far ahead of the rear axle
-    STEP = "step"  # recorded positions are off by so much from a time on
-    KNOCK = "knock"  # a camera is turned by so much from a time on; all of them by load
+    COURSE = "course"  # the heading is that of the motion of a point ahead of the rear axle
+    STEP = "step"  # offset of recorded positions from some time on
+    KNOCK = "knock"  # rotation of a camera from some time on; of all cameras by load
     SURVEY = "survey"  # of one camera's centre
-    LEVER = "lever"  # all centres alike: from the point that the poses are of
-    SIZE = "size"  # known lengths of one value
-    CONTROL = "control"  # one surveyed point
-    DATUM = "datum"  # all surveyed points alike
+    LEVER = "lever"  # of all centres, or of the point that poses refer to
+    SIZE = "size"  # of known lengths of one value
+    CONTROL = "control"  # of one surveyed point
+    DATUM = "datum"  # of all surveyed points
 
     @property
     def unit(self) -> str:
-        """The unit of the value and its sigma; empty where it is a pure number."""
+        """Unit of the value and its sigma; empty if dimensionless."""
         return _UNITS.get(self, "m")
 
 
@@ -95,45 +95,40 @@ _UNITS = {
 
 
 def sigmas_of(p_value: float) -> float:
-    """The standard deviations at which a normal distribution has a two-sided p-value."""
+    """Two-sided p-value as a number of standard deviations of a normal distribution."""
     return float(stats.norm.isf(max(p_value, _LEAST_P) / 2))
 
 
-CHANGES = (Fault.STEP, Fault.KNOCK)  # faults that begin at some time, which is unknown
+CHANGES = (Fault.STEP, Fault.KNOCK)  # faults that begin at an unknown time
 
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """One fault, as the residuals see it."""
+    """The test of one fault."""
 
-    fault: Fault  # what would be wrong
-    camera: int  # of which camera of the problem; -1 for all together
-    # along or about which axis, 0 to 2: of the vehicle (survey, lever, knock), of the map (slope, datum;
-    # step: east, north, north-east, north-west), of the image (principal); the side (crown: both, left,
-    # right), the shape of a drift
+    fault: Fault  # the hypothesis
+    camera: int  # index in the problem; -1 for all together
+    # axis, 0 to 2, of the vehicle (survey, lever, knock), map (slope, datum; step: east, north, north-east,
+    # north-west) or image (principal); side (crown: both, left, right); or shape of a drift
     axis: int
-    # which of the problem's control points, known lengths or (clock) visits, or the frame from which on
-    # inputs are wrong (step, knock); -1 for none or all
+    # control point, known length, (clock) session, or first frame of a change (step, knock); -1: none, all
     item: int
-    value: float = 0.0  # by how much, true minus stated
-    # how well the drive observes it, by what its stretches disagree; inf where it cannot
-    sigma: float = float("inf")
-    model_sigma: float = float("inf")  # how well it would, were all noise as the model has it
-    # how often a drive without the fault would show as large a value, 1 where it is unobservable
-    p_value: float = 1.0
-    # by how much the fault raises the log likelihood of each stretch as the others predict it, summed over
-    # all; negative where the stretches do not agree on it
+    value: float = 0.0  # true minus stated
+    sigma: float = float("inf")  # from the segments' disagreement; inf if unobservable
+    model_sigma: float = float("inf")  # standard deviation under the model's own noise
+    p_value: float = 1.0  # probability of such a value without the fault; 1 if unobservable
+    # log-likelihood ratio of the fault, each segment predicted from the others; negative if they disagree
     gain: float = 0.0
 
     @property
     def sigmas(self) -> float:
-        """The standard deviations at which a normal distribution has this p-value."""
+        """The p-value as a number of standard deviations of a normal distribution."""
         return sigmas_of(self.p_value)
 
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One fault, and how to get its column."""
+    """One fault, and its column of the Jacobian."""
 
     fault: Fault
     column: Callable[[Sensitivity], Rows]
@@ -144,18 +139,17 @@ class _Hypothesis:
 
 @dataclass(frozen=True)
 class _Answer:
-    """The scores and the information that the stretches of the route hold on one fault."""
+    """Scores and information of the route's segments on one fault."""
 
     hypothesis: _Hypothesis  # the fault
-    # (G + 1,) s_g and w_g; the last are those of priors that belong to no stretch
-    score: FloatArray
+    score: FloatArray  # (G + 1,) s_g, and below w_g; the last is of priors of no segment
     information: FloatArray
-    drawn: FloatArray  # (D, G + 1) scores of noise as the model has it
-    own: float  # the fault's information if all else were known
+    drawn: FloatArray  # (D, G + 1) scores of noise drawn from the model
+    own: float  # the fault's information with all else known
 
     @classmethod
     def to(cls, hypothesis: _Hypothesis, solved: Sensitivity) -> _Answer:
-        """The answer at a solution."""
+        """The segments' scores at a solution."""
         column = hypothesis.column(solved)
         efficient = solved.flat(solved.efficient(column))
         information = solved.by_stretch(efficient, efficient)
@@ -165,22 +159,22 @@ class _Answer:
 
     @property
     def is_observable(self) -> bool:
-        """Whether more than rounding is left of the fault's information."""
+        """Whether the fault's net information exceeds rounding."""
         return float(self.information.sum()) > _LEAST_OBSERVABLE * self.own > 0
 
     @property
     def value(self) -> float:
-        """The fault."""
+        """Estimated value of the fault."""
         return float(self.score.sum() / self.information.sum())
 
     @property
     def disagreement(self) -> float:
-        """How many times as much the stretches' scores disagree as they would by the model's own noise."""
+        """Variance of the segments' scores relative to that under the model's noise."""
         by_model = float(np.mean([self._apart(score) for score in self.drawn]))
         return self._apart(self.score) / max(by_model, 1e-300)
 
     def _apart(self, score: FloatArray) -> float:
-        """Square sum of what is left of scores (G + 1,); neighbours err alike (Bartlett's weights)."""
+        """Sum of squared residual scores (G + 1,), with Bartlett's weights of neighbours."""
         off = (score - score.sum() / self.information.sum() * self.information)[:-1]
         lags = range(1, _LAGS + 1)
         together = sum(2 * (1 - lag / (_LAGS + 1)) * float(off[lag:] @ off[:-lag]) for lag in lags)
@@ -188,13 +182,13 @@ class _Answer:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the disagreement: how many stretches speak, less one."""
+        """Degrees of freedom of the disagreement: effective number of segments minus one."""
         w = self.information[:-1]
         speaking = float(w.sum()) ** 2 / max(float(w @ w), 1e-300) - float(w.sum() / self.information.sum())
         return max(speaking, 0.0) / (1 + 2 * sum((1 - lag / (_LAGS + 1)) ** 2 for lag in range(1, _LAGS + 1)))
 
     def test(self, usual: float) -> ScoreTest:
-        """The test, given how many times as large as stated the variances of this drive ``usually`` are."""
+        """The test, shrinking the variance factor towards the drive's ``usual`` one."""
         at = self.hypothesis
         blank = ScoreTest(at.fault, at.camera, at.axis, at.item)
         if not self.is_observable:
@@ -202,12 +196,12 @@ class _Answer:
         freedom = self.freedom
         multiple = (_PRIOR_FREEDOM * usual + freedom * self.disagreement) / (_PRIOR_FREEDOM + freedom)
         if at.fault not in CHANGES:
-            # An error that lasts the whole drive is held against noise that may last as long, which stretches
-            # have in common and do not disagree by: they widen the model's sigma, and cannot narrow it.
+            # Noise as lasting as the fault is common to all segments, and no disagreement of theirs: they may
+            # widen the model's sigma, but not narrow it.
             multiple = max(multiple, 1.0)
         w, s, total = self.information, self.score, float(self.information.sum())
         sigma = float(np.sqrt(multiple * w[:-1].sum() + w[-1])) / total
-        # Each stretch as the others predict it; the priors that belong to no stretch are with the others.
+        # Each segment is predicted from the others, which include priors of no segment.
         others = (s.sum() - s[:-1]) / np.maximum(total - w[:-1], _LEAST_OBSERVABLE * total)
         gain = float(np.sum(others * s[:-1] - others**2 * w[:-1] / 2)) / multiple
         p_value = 2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + freedom))
@@ -216,7 +210,7 @@ class _Answer:
 
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
-    """Every fault that ``problem`` can have, each tested at its ``solution``; largest gain first."""
+    """Tests at ``solution`` of every fault that ``problem`` can have, largest gain first."""
     solved = Sensitivity.at(solution.covariance.whitening)
     answers = [_Answer.to(hypothesis, solved) for hypothesis in _hypotheses(problem, solved.arrays)]
     said = [one.disagreement for one in answers if one.is_observable]
@@ -268,7 +262,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
 
 
 def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest]:
-    """Keep the likeliest frame of each input that may change; Sidak corrects for the others."""
+    """Keep the likeliest frame of each input's change, with Sidak's correction for the other frames."""
     kept = [one for _, one in found if one.fault not in CHANGES]
     changes: dict[tuple[Fault, int, int], list[tuple[_Answer, ScoreTest]]] = {}
     for answer, one in found:
@@ -282,9 +276,9 @@ def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest
 
 
 def _chances(changes: list[tuple[_Answer, ScoreTest]]) -> float:
-    """How many independent changes are as many chances as these, whose noise hangs together.
+    """Effective number of independent tests among these, whose noise is correlated.
 
-    The squared trace of the correlation over that of its square (Galwey, Genetic Epidemiology 33, 2009).
+    It is tr(R)^2 / tr(R^2) of their correlation R (Galwey, Genetic Epidemiology 33, 2009).
     """
     drawn = np.array([answer.drawn.ravel() for answer, one in changes if np.isfinite(one.sigma)])
     if not len(drawn):
@@ -294,10 +288,10 @@ def _chances(changes: list[tuple[_Answer, ScoreTest]]) -> float:
 
 
 def _control_points(problem: Problem, solution: Solution, usual: float) -> Iterator[ScoreTest]:
-    """Each surveyed point against what everything else says of its corner.
+    """Test each surveyed point against everything else on its corner.
 
-    What the adjustment leaves between a point and its corner has the covariance of the point less that of
-    the corner; the two axes are tested together, so the gain has two degrees of freedom.
+    The residual between a point and its corner has the point's covariance minus the corner's; both axes are
+    tested together, with two degrees of freedom.
     """
     control = problem.control
     if control is None or not len(control.corner):
@@ -309,21 +303,21 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         if np.linalg.eigvalsh(expected).min() <= _LEAST_OBSERVABLE * np.max(sigma_m) ** 2:
             continue
         squared = float(off @ np.linalg.solve(expected, off)) / max(usual, 1.0)
-        # Without the point its corner would lie farther from it, by the share that it had of the information.
+        # Without the point, its corner would lie farther away, by the point's share of the information.
         apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
         sigma, p_value = apart / max(squared, 1e-12) ** 0.5, float(stats.chi2.sf(squared, 2))
         yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, sigma, p_value, squared / 2)
 
 
 def _lens(camera: int, power: int, solved: Sensitivity) -> Rows:
-    """A focal length longer by the share p or, with ``power`` 1, a first radial coefficient larger by p."""
-    # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
+    """Relative error p of a focal length or, with ``power`` 1, error p of the first radial coefficient."""
+    # Projected points rather than measured ones: pixels, whose noise is stated, do not scale.
     projected, mine = solved.projected, (solved.camera == camera) | (camera < 0)
     return {"observations": solved.whiten(projected * projected.square().sum(0) ** power * mine)}
 
 
 def _principal(problem: Problem, camera: int, axis: int, solved: Sensitivity) -> Rows:
-    """A principal point that lies farther right, or down, by one pixel."""
+    """A principal point one pixel farther right, or down."""
     seen_by, focal_px = solved.camera, torch.as_tensor(problem.intrinsic[:, axis])
     off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
     none = torch.zeros_like(off)
@@ -347,20 +341,20 @@ def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Sensitiv
 
 
 def _late(problem: Problem, camera: int, share: FloatArray, _: Arrays, out: Tensor) -> Tensor:
-    """Images that are late by a ``share`` (J,) of the value."""
+    """Images late by a ``share`` (J,) of the value."""
     twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * share[:, None])
     out[slice(None) if camera < 0 else camera] = twist.to(out.device)
     return out
 
 
 def _drift(axis: int, frames: int) -> FloatArray:
-    """A clock (J,) that is off by between half the value and minus that, evenly or in more waves than one."""
+    """Clock error (J,) from half the value to minus half, in one half wave or more."""
     share = np.linspace(0.0, 1.0, frames)
     return share - 0.5 if axis == 0 else 0.5 * np.cos((axis + 1) * np.pi * share)
 
 
 def _changes(arrays: Arrays) -> list[int]:
-    """Frames at which inputs may change: some dozen, evenly among the stretches of all sessions."""
+    """Candidate frames of a change: about a dozen, evenly spread over the segments of all sessions."""
     stretch = stretches(arrays)
     begins = (stretch.diff() > 0).nonzero()[:, 0] + 1
     within = [int(j) for j in begins if arrays.visit[j] == arrays.visit[j - 1]]
@@ -368,7 +362,7 @@ def _changes(arrays: Arrays) -> list[int]:
 
 
 def _course(problem: Problem, _: Arrays, out: Tensor) -> Tensor:
-    """A heading that is the course of a point ahead of the rear axle: it slips as the path bends."""
+    """Heading taken from the course of a point ahead of the rear axle, which sideslips in bends."""
     twist = np.asarray(problem.twist_vehicle)
     speed = np.hypot(twist[:, 0], twist[:, 1])
     curvature = np.where(speed > _LEAST_SPEED_MPS, twist[:, 5] / np.maximum(speed, _LEAST_SPEED_MPS), 0.0)
@@ -377,13 +371,13 @@ def _course(problem: Problem, _: Arrays, out: Tensor) -> Tensor:
 
 
 def _step(axis: int, frame: int, arrays: Arrays, out: Tensor) -> Tensor:
-    """Positions that are recorded short along a direction, from a frame to the end of its session."""
+    """Positions recorded short along a direction, from a frame to the end of its session."""
     out[..., :3] = arrays.vehicle_from_map[:, :3, :2] @ arrays.centre.new_tensor(_STEPS[axis])
     return out * _since(arrays, frame)
 
 
 def _knock(camera: int, axis: int, frame: int, arrays: Arrays, out: Tensor) -> Tensor:
-    """A camera that turns about its own centre; load turns all of them, about the rear axle."""
+    """Rotation of a camera about its own centre; load rotates all of them about the rear axle."""
     turn = torch.eye(3, dtype=out.dtype, device=out.device)[axis]
     chosen = slice(None) if camera < 0 else slice(camera, camera + 1)
     out[chosen, :, 3:] = turn
@@ -399,7 +393,7 @@ def _since(arrays: Arrays, frame: int) -> Tensor:
 
 
 def _crown(axis: int, solved: Sensitivity) -> Rows:
-    """Corners that lie lower by the value times their distance from the route, all or on one side alone."""
+    """Corners lower by the value times their distance from the route, on both sides or one."""
     arrays, estimate = solved.arrays, solved.whitening.estimate
     frames = arrays.vehicle_from_map.inverse()
     route = KDTree(frames[:, :2, 3].cpu().numpy())
@@ -410,7 +404,7 @@ def _crown(axis: int, solved: Sensitivity) -> Rows:
 
 
 def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:
-    """Ground that rises along an axis of the map, under poses that do not know of it."""
+    """Ground that rises along an axis of the map, unknown to the poses."""
     turn = arrays.centre.new_tensor([0.0, -1.0, 0.0] if axis == 0 else [1.0, 0.0, 0.0])
     out[..., 3:] = arrays.vehicle_from_map[:, :3, :3] @ turn
     return out

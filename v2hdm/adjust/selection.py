@@ -1,17 +1,15 @@
-"""The model of the poses' errors that a drive calls for, and how far they err, as the drive itself shows.
+"""The pose error model that a drive calls for, and its noise, estimated from the drive itself.
 
-Every model is fitted to most of the observations of a stretch of the drive and predicts the others. What
-it predicts best is right, in the one sense that a drive without ground truth can tell: a model that
-leaves an error out mispredicts, and one that fits noise does, too.
+Every model is fitted to most observations of a part of the drive and predicts the rest: a model that omits an
+error mispredicts, and so does one that fits noise. This needs no ground truth.
 
-Receivers state their errors badly. Yet markings that were seen again and again have to lie still. The errors
-of the poses are drawn from their posterior at the solution, where it is Gaussian, by the factors of
-:mod:`v2hdm.adjust.whitening`; their mean square gives a sigma, and the distance after which their
-autocorrelation has fallen to 1 / e that over which they fade. Under these the posterior is another one, so
-the two take turns, as in expectation and maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977). The
-likelihood of the Gauss-Markov process would make far too long distances of roads smoother than it from image
-to image. What was stated is the prior: a long route overrules it; what images cannot see, such as an offset
-of the whole map, stays as stated.
+Receivers misstate their errors, but markings that are observed repeatedly lie still. Errors of the poses are
+drawn from their Gaussian posterior at the solution, by the factors of :mod:`v2hdm.adjust.whitening`: their
+mean square yields a sigma, and the distance at which their autocorrelation falls to 1 / e the correlation
+length. The posterior depends on both, so the steps alternate, as in expectation and maximisation (Dempster,
+Laird and Rubin, JRSS B 39, 1977). The likelihood of the Gauss-Markov process would overestimate the length
+on roads smoother than it from image to image. The stated noise is the prior: a long route overrules it;
+unobservable parts, such as an offset of the whole map, stay as stated.
 """
 
 from __future__ import annotations
@@ -43,10 +41,10 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
-    """``problem`` with the observations ``keep`` (K,) only, and which corners of it the part still has.
+    """``problem`` with the observations ``keep`` (K,) alone, and the corners of it that remain.
 
-    Every camera must keep an observation. Frames are cut off before the first and after the last that is
-    used, so that a drift still runs through the others.
+    Every camera must keep an observation. Frames are dropped before the first and after the last in use:
+    drift continues through the others.
     """
     seen = problem.observations
     corners, corner = np.unique(seen.corner[keep], return_inverse=True)
@@ -78,7 +76,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
 
 @dataclass(frozen=True)
 class Model:
-    """The pose errors that are estimated beside map and extrinsics."""
+    """The pose errors estimated beside map and extrinsics."""
 
     pose_states: tuple[str, ...] = ()
     clock_offset: bool = False
@@ -93,23 +91,22 @@ MODELS: Mapping[str, Model] = {
 }
 """Models by name, the simplest first. ``paper`` trusts the recorded poses."""
 
-# Frames of the stretch that models are compared on, and the share of its observations held out.
+# Frames of the part of the drive that models are compared on, and the fraction of observations held out.
 _STRETCH_FRAMES = 120
 _HELD_OUT_SHARE = 0.2
-_MIN_HELD_OUT = 40  # with fewer than these the residuals cannot tell one model from another
-# By how much what can take up errors of other inputs, such as a clock offset, must predict better than what
-# does without.
+_MIN_HELD_OUT = 40  # with fewer, the residuals cannot separate models
+# Standard errors by which a model that can absorb errors of other inputs, such as a clock offset, must
+# predict better than one without.
 _SURE_STANDARD_ERRORS = 3.0
-# Where the loss of a held-out residual bends, squared sigmas: wrong associations must not decide.
-_LOSS_SCALE2 = 9.0
+_LOSS_SCALE2 = 9.0  # squared sigmas at which the loss bends, lest wrong associations decide
 
 
 @dataclass(frozen=True)
 class Selection:
-    """The model chosen, and each model's score: the mean robust loss of the held-out observations.
+    """The chosen model, and every model's score: the mean robust loss of held-out observations.
 
-    There are no scores where too little was seen often enough to hold any of it out.
-    Without a model error and for Gaussian noise the score is a little below 2.
+    Scores are absent if too few observations repeat to be held out. With a correct model and Gaussian noise a
+    score is a little below 2.
     """
 
     name: str
@@ -125,19 +122,18 @@ class Selection:
 
 
 def with_model(options: SolveOptions, model: Model) -> SolveOptions:
-    """``options`` that estimate what ``model`` says."""
+    """``options`` with the states and clock offsets of ``model``."""
     return replace(options, pose_states=model.pose_states, clock_offset=model.clock_offset)
 
 
 def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] = tuple(MODELS)) -> Selection:
-    """Choose the richest of the models ``names`` that predicts as well as the best.
+    """Choose the richest of the models ``names`` that predicts as well as the best, from simplest to richest.
 
-    As well means: within one standard error of the paired difference, by frames, since errors within a frame
-    go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). A clock
-    offset trades against the camera's forward offset, so it is taken only where it predicts better than all
-    others by more than three standard errors. The extrinsics of ``problem`` had better be near already;
-    ``names`` begin with the simplest, and ``clock`` is left out where twists are not known. Raises
-    AdjustError where a model's problem cannot be solved.
+    As well means within one standard error of the paired difference, clustered by frame, within which errors
+    correlate (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). A clock
+    offset trades against the camera's forward offset, so it must beat all others by three standard errors;
+    without twists it is left out. The extrinsics of ``problem`` should be near. Raises AdjustError for an
+    unsolvable model.
     """
     unknown = [name for name in names if name not in MODELS]
     if unknown:
@@ -162,7 +158,7 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
 
 
 def predicts_better(problem: Problem, rival: Problem, options: SolveOptions) -> bool:
-    """Whether ``problem`` predicts held-out observations better than ``rival``, by three standard errors."""
+    """Whether ``problem`` predicts held-out observations better than ``rival`` by three standard errors."""
     chosen = _stretch(problem)
     held_out = _held_out(restrict(problem, chosen)[0].observations)
     if np.count_nonzero(held_out) < _MIN_HELD_OUT:
@@ -173,7 +169,7 @@ def predicts_better(problem: Problem, rival: Problem, options: SolveOptions) -> 
 
 
 def _losses(whole: Problem, held_out: BoolArray, options: SolveOptions) -> FloatArray:
-    """The robust losses of the ``held_out`` observations of ``whole``, as the others predict them."""
+    """Robust losses of the ``held_out`` observations of ``whole``, predicted from the others."""
     fitted, corners = restrict(whole, ~held_out)
     solution = solve(fitted, replace(options, coarse=False))
     squared = predicted_squared(whole, held_out, fitted, solution, corners)
@@ -183,7 +179,7 @@ def _losses(whole: Problem, held_out: BoolArray, options: SolveOptions) -> Float
 def predicted_squared(
     whole: Problem, held_out: BoolArray, fitted: Problem, solution: Solution, corners: np.ndarray
 ) -> FloatArray:
-    """Squared residuals, in sigmas, of the ``held_out`` observations by the solution of the others."""
+    """Squared Mahalanobis distances of ``held_out`` observations from the solution of the others."""
     seen = whole.observations
     camera, frame = seen.camera[held_out], seen.frame[held_out]
     first = int(whole.observations.frame[~held_out].min())
@@ -206,7 +202,7 @@ def predicted_squared(
 
 
 def _stretch(problem: Problem) -> BoolArray:
-    """Observations (K,) of the run of frames that holds most of them, every camera's included."""
+    """Observations (K,) of the run of frames with most of them, including every camera's."""
     seen, frames = problem.observations, len(problem.map_from_vehicle)
     if frames <= _STRETCH_FRAMES:
         return np.ones(len(seen.frame), dtype=bool)
@@ -220,7 +216,7 @@ def _stretch(problem: Problem) -> BoolArray:
 
 
 def _held_out(seen: Observations) -> BoolArray:
-    """A share of the observations (K,); two of each corner stay, and the first and last frames."""
+    """Held-out observations (K,); two of each corner stay, and the first and last frames."""
     rng = np.random.default_rng(0)
     order = rng.permutation(len(seen.corner))
     place = np.empty(len(order), dtype=np.int64)
@@ -233,28 +229,28 @@ def _held_out(seen: Observations) -> BoolArray:
 
 
 def _as_good(excess: FloatArray, frame: np.ndarray, standard_errors: float = 1.0) -> bool:
-    """Whether losses exceed others by no more than so many standard errors, clustered by ``frame``."""
+    """Whether losses exceed others by at most ``standard_errors``, clustered by ``frame``."""
     mean = float(excess.mean())
     by_frame = np.bincount(frame, weights=excess - mean)
     return mean <= standard_errors * float(np.sqrt(np.sum(by_frame**2))) / len(excess)
 
 
 _SPREAD = math.log(2.0)
-"""Standard deviation of the logarithm of a true sigma, or distance, about the stated one: a factor of two."""
+"""Prior sigma of the logarithm of a scale on a stated sigma or length: a factor of two."""
 
-_MOST = math.log(30.0)  # most that a sigma or distance is scaled by, as a logarithm
-_DRAWS = 8  # errors drawn from the posterior, each with its mirror image about the mean
-_ROUNDS = 4  # rounds of drawing and estimating: sigmas move by a tenth in the third
-_LEAST_STEP_M = 0.02  # step between frames below which a vehicle stands
-_LEAST_LAGS = 8  # steps of a route below which no distance can be estimated
+_MOST = math.log(30.0)  # largest logarithm of such a scale
+_DRAWS = 8  # draws from the posterior, each with its mirror image about the mean
+_ROUNDS = 4  # of drawing and estimating: sigmas change by a tenth in the third
+_LEAST_STEP_M = 0.02  # smaller steps between frames are a standing vehicle
+_LEAST_LAGS = 8  # least steps of a route for a correlation length
 
 _GROUPS = {"position": (0, 1), "height": (2,), "roll_pitch": (3, 4), "heading": (5,)}
-"""Axes of a frame's tangent whose errors are alike."""
+"""Axes of a frame's tangent with a common scale."""
 
 
 @dataclass(frozen=True)
 class _Scales:
-    """Logarithms of what a group's stated white sigma, drift and distance are multiplied by."""
+    """Logarithms of the scales on a group's stated white sigma, drift and correlation length."""
 
     white: float = 0.0
     drift: float = 0.0
@@ -262,9 +258,9 @@ class _Scales:
 
 
 def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...]:
-    """The sigmas of each visit's poses that the drive shows; as stated where nothing is estimated.
+    """Standard deviations of each session's poses, estimated from the drive; as stated where not observable.
 
-    The solution is under sigmas that are not far off. All visits' sigmas of a kind are scaled alike.
+    ``solution`` must be under roughly correct sigmas. All sessions share the scales.
     """
     descent = solution.covariance.descent
     arrays, stated = descent.engine.arrays, problem.pose_sigmas
@@ -297,7 +293,7 @@ def _of_group(sigma: PoseSigma, name: str) -> tuple[float, Drift]:
 
 
 def _scaled(stated: PoseSigma, scales: Mapping[str, _Scales]) -> PoseSigma:
-    """A visit's sigmas, each multiplied by its scale."""
+    """A session's sigmas times their scales."""
     out = {}
     for name, scale in scales.items():
         sigma, drift = _of_group(stated, name)
@@ -310,7 +306,7 @@ def _scaled(stated: PoseSigma, scales: Mapping[str, _Scales]) -> PoseSigma:
 
 
 def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
-    """The scales of a group that errors (D, J, 6), drawn, call for."""
+    """Scales of a group from drawn errors (D, J, 6)."""
     errors = drawn[:, :, _GROUPS[name]]
     if name == "position":  # its drift keeps its direction in the map
         errors = np.einsum("jab,djb->dja", problem.map_from_vehicle[:, :2, :2], errors)
@@ -318,7 +314,7 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
     drift_m2, total_m2 = np.mean([[drift.sigma**2, sigma**2] for sigma, drift in stated], axis=0)
     over_m = float(np.mean([drift.over_m for _, drift in stated]))
     correlation, step_m, path_m = _autocorrelation(problem, errors)
-    if not total_m2 > 0 or not correlation[0] > 0:  # not among the states of the frames
+    if not total_m2 > 0 or not correlation[0] > 0:  # not among the frames' states
         return _Scales()
     if not drift_m2 or len(correlation) < _LEAST_LAGS:
         count = errors.shape[1] * errors.shape[2]
@@ -338,7 +334,7 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
 
 
 def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, float, float]:
-    """Mean products of errors (D, J, a) that lie 0, 1, 2 ... steps apart, the step, and the path, m."""
+    """Autocorrelation of errors (D, J, a) at lags of 0, 1, 2 ... steps, the step, m, and the path, m."""
     poses, visit = problem.map_from_vehicle, problem.visit_of_frame
     products, counts, path_m = np.zeros(0), np.zeros(0), 0.0
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(visit) == 0]
@@ -362,5 +358,5 @@ def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, 
 
 
 def _shrunk(logarithm: float, variance: float) -> float:
-    """An estimated logarithm of a scale, drawn towards 0, what was stated, as its variance asks for."""
+    """Estimated logarithm of a scale, shrunk towards the stated 0 according to its variance."""
     return float(np.clip(logarithm * _SPREAD**2 / (_SPREAD**2 + variance), -_MOST, _MOST))

@@ -1,4 +1,4 @@
-"""How the residuals of a solution answer to what it has not estimated, all that it has moving along."""
+"""Sensitivity of a solution's residuals to parameters it holds fixed, with all estimated ones adapting."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
-_STEP = 1e-3  # step of the priors' central differences, in the fault's unit (s or rad): millimetres of motion
+_STEP = 1e-3  # of the priors' central differences, in the fault's unit (s or rad): millimetres of motion
 
-STRETCHES = 24  # stretches that the route is divided into: metres each, longer than most errors go together
+STRETCHES = 24  # segments of the route: metres each, longer than the correlation of most errors
 
-_DRAWS = 16  # draws of the model's own noise: what the stretches would disagree by is known to a tenth
+_DRAWS = 16  # draws of the model's noise: they give the expected disagreement to a tenth
 
-_AT_ONCE = 64  # columns whose gradients are in memory together
+_AT_ONCE = 64  # columns whose gradients are in memory at a time
 
 Rows = dict[str, Tensor]
-"""Whitened residuals, or their derivatives by one number, by kind: ``observations`` (2, K), and the priors'
-of :func:`v2hdm.adjust.model.prior_residuals`; kinds that a fault does not touch may be absent."""
+"""Whitened residuals, or their derivatives by one parameter, by kind: ``observations`` (2, K), and the
+priors' of :func:`v2hdm.adjust.model.prior_residuals`; untouched kinds may be absent."""
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """A solution as weighted least squares, whose residuals can be derived by further parameters."""
+    """A solution as weighted least squares, differentiable by further parameters."""
 
     whitening: Whitening  # the solution's Hessian
-    root: Tensor  # (K,) of the weights
+    root: Tensor  # (K,) square roots of the weights
     residuals: Rows  # of everything
-    whitened_px: Tensor  # (2, K) residuals of the observations without weights
-    stretch: Tensor  # (J,) of the route that each frame is in, from 0
+    whitened_px: Tensor  # (2, K) unweighted residuals of the observations
+    stretch: Tensor  # (J,) segment of the route of each frame, from 0
 
     @classmethod
     def at(cls, whitening: Whitening) -> Sensitivity:
-        """The sensitivity at a solution, by its Hessian."""
+        """The sensitivity at a solution, from its Hessian."""
         engine, estimate = whitening.engine, whitening.estimate
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
-        root = weight.sqrt()  # no floor: it keeps corners factorable, and is no evidence
+        root = weight.sqrt()  # without the floor, which keeps corners definite but is no evidence
         rows = _rows(engine.arrays, estimate, whitened_px * root)
         return cls(whitening, root, rows, whitened_px, stretches(engine.arrays))
 
@@ -59,7 +59,7 @@ class Sensitivity:
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Residuals (R, D) that noise as the model has it would leave, drawn."""
+        """Residuals (R, D) drawn from the model's noise."""
         generator = torch.Generator().manual_seed(0)
 
         def like(row: Tensor) -> Tensor:
@@ -71,17 +71,17 @@ class Sensitivity:
 
     @property
     def camera(self) -> Tensor:
-        """The camera (K,) of each observation."""
+        """Camera (K,) of each observation."""
         return self.arrays.camera_of(self.arrays.pair).long()
 
     def whiten(self, off: Tensor) -> Tensor:
-        """Weighted residuals (2, K) of points that are off (2, K) at depth 1."""
+        """Weighted residuals (2, K) of offsets (2, K) at depth 1."""
         a, b, c = self.arrays.root_information
         return torch.stack([a * off[0], b * off[0] + c * off[1]]) * self.root
 
     @property
     def projected(self) -> Tensor:
-        """Where the corners are projected (2, K), at depth 1."""
+        """Projected corners (2, K), at depth 1."""
         a, b, c = self.arrays.root_information
         first = self.whitened_px[0] / a
         return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
@@ -94,35 +94,35 @@ class Sensitivity:
 
     @cached_property
     def points(self) -> Tensor:
-        """The observed corners (K, 3) in the cameras."""
+        """Observed corners (K, 3) in camera coordinates."""
         corners = self.whitening.estimate.corners_map[self.arrays.corner.long()]
         return points_in_camera(self.poses, corners)
 
     def seen(self, moved_cam: Tensor) -> Tensor:
-        """Derivatives (2, K) of the weighted residuals by motions (K, 3) of the points in the cameras."""
+        """Derivatives (2, K) of the weighted residuals for motions (K, 3) of the points in the cameras."""
         depth = self.points[:, 2:].clamp(min=NEAR_M)
         off = (moved_cam[:, :2] - self.points[:, :2] / depth * moved_cam[:, 2:]) / depth
         return self.whiten(off.T)
 
     def turned(self, tangents: Tensor) -> Tensor:
-        """Motions (K, 3) of the points in the cameras under left tangents (C, M, 6) of the pairs."""
+        """Motions (K, 3) of the points in the cameras for left tangents (C, M, 6) of the pairs."""
         tangent = tangents.flatten(0, 1)[self.arrays.pair.long()]
         motion: Tensor = tangent[:, :3] + torch.linalg.cross(tangent[:, 3:], self.points)
         return motion
 
     def efficient(self, column: Rows) -> Rows:
-        """A fault's column less what is estimated in its place: z = J_p - J_y H^-1 J_y' J_p."""
+        """A fault's column net of the estimated unknowns: z = J_p - J_y H^-1 J_y' J_p."""
         estimated = self._along(self._coupling(column))
         return {name: column.get(name, torch.zeros_like(row)) - row for name, row in estimated.items()}
 
     def _along(self, whitened: Tensor) -> Rows:
-        """Derivatives of all residuals along a step of all that is estimated, whitened."""
+        """Derivatives of all residuals along a whitened step of the unknowns."""
         base, arrays = self.whitening.estimate, self.arrays
         _, tangents, _ = self.whitening.step(whitened)
-        # Derivatives are linear, poses are not: along a step that moves no pair by more than 1 m or rad.
+        # Derivatives are linear, poses are not: take a step that moves no pair by more than 1 m or rad.
         size = max(float(tangents.abs().max()), 1.0)
         step, tangents, own = self.whitening.step(whitened / size)
-        # Corners move with a step in proportion to it, so that of a whole step is their derivative.
+        # Corners move in proportion to the step: a whole step gives their derivative.
         at = self.whitening.linearised.evaluate(step, tangents, own).estimate
         corners = at.corners_map - base.corners_map
         along = (self.poses[:, :3, :2] @ corners[arrays.corner.long(), :, None])[..., 0]
@@ -143,7 +143,7 @@ class Sensitivity:
         return moved
 
     def _coupling(self, column: Rows) -> Tensor:
-        """N_yp: what the column has in common with all that is estimated, whitened."""
+        """N_yp: inner products of the column with the whitened unknowns."""
         engine, estimate = self.whitening.engine, self.whitening.estimate
         tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
         at = (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)
@@ -162,12 +162,12 @@ class Sensitivity:
         return self.whitening.whiten([gradient])[0]
 
     def flat(self, rows: Rows) -> FloatArray:
-        """All residuals, or derivatives, one after another, (R,)."""
+        """All residuals, or derivatives, concatenated, (R,)."""
         return np.concatenate([rows[name].detach().flatten().cpu().numpy() for name in self.residuals])
 
     @cached_property
     def _stretch_of(self) -> tuple[IntArray, IntArray]:
-        """The numbers of all residuals, stretch by stretch, and where each stretch begins among them."""
+        """Indices of all residuals by segment, and the first position of each segment among them."""
         count = int(self.stretch.max()) + 1
         by_kind = {name: torch.full_like(row, count) for name, row in self.residuals.items()}
         by_kind["observations"][:] = self.stretch[self.arrays.frame_of(self.arrays.pair).long()]
@@ -177,20 +177,20 @@ class Sensitivity:
         return order, np.searchsorted(stretch[order], np.arange(count + 2))
 
     def by_stretch(self, one: FloatArray, others: FloatArray) -> FloatArray:
-        """Products (G + 1, ...) of a column (R,) and others (R, ...) by stretch, last of priors of none."""
+        """Products (G + 1, ...) of a column (R,) and others (R, ...) by segment; last, priors of none."""
         order, begin = self._stretch_of
         shape = len(begin) - 1, len(one)
         return np.asarray(csr_array((one[order], order, begin), shape=shape) @ others)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
-    """All residuals at an estimate; those of the ``observations`` are given."""
+    """All residuals at an estimate, those of the ``observations`` given."""
     rows = {} if observations is None else {"observations": observations}
     return rows | prior_residuals(arrays, estimate)
 
 
 def stretches(arrays: Arrays) -> Tensor:
-    """The stretch (J,) of the route that each frame is in: equally long ones of every session."""
+    """Segment (J,) of the route of each frame; the segments of a session have equal lengths."""
     ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
     path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
     out, count = torch.zeros_like(arrays.visit), 0
@@ -206,15 +206,14 @@ def stretches(arrays: Arrays) -> Tensor:
 
 
 def raised(solved: Sensitivity, height: Tensor) -> Rows:
-    """Corners that each observation (K,) sees so much higher, m, a unit of the value."""
+    """Column of corners that each observation (K,) sees raised by ``height``, m, per unit of the value."""
     return {"observations": solved.seen(height[:, None] * solved.poses[:, :3, 2])}
 
 
 def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, FloatArray]:
-    """The information (B, B) on parameters that raise the ground, and the gradient (B,) of the cost by them.
+    """Information (B, B) on the ground's height parameters, and the cost's gradient (B,) by them.
 
-    ``heights`` (K, B), sparse, are m by which a unit of each raises what each observation of the problem
-    shows.
+    ``heights`` (K, B), sparse, is the Jacobian, m, of the height that each observation of the problem shows.
     """
     solved = Sensitivity.at(solution.covariance.whitening)
     unit = raised(solved, torch.ones_like(solved.root))["observations"]
@@ -235,7 +234,7 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
 
 
 def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
-    """How a solution moves with B errors of the heights (K, B), m, of what its observations show."""
+    """Motion of a solution under B errors of the observed ground's heights (K, B), m."""
     solved = Sensitivity.at(solution.covariance.whitening)
     whitening, arrays = solved.whitening, solved.arrays
     weighted = raised(solved, torch.ones_like(solved.root))["observations"] * solved.root

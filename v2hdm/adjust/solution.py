@@ -1,4 +1,4 @@
-"""The result of a solve: the estimate, how it went, how sure it is, verdicts, what the drive determines."""
+"""The result of a solve: estimate, status, covariance, verdicts on observations, and observability."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 VerdictArray = NDArray[np.int8]
 
-# The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
-_MEDIAN_SQUARED = 2 * float(np.log(2))
-_ROWS = 1 << 18  # observations that are judged at once
+_MEDIAN_SQUARED = 2 * float(np.log(2))  # median of a chi-square distribution with two degrees of freedom
+_ROWS = 1 << 18  # observations classified at once
 
 
 class Verdict(IntEnum):
-    """The verdict on an observation; unconfirmed: all others of its corner contradict it and one another."""
+    """Verdict on an observation; unconfirmed: all others of its corner contradict it and each other."""
 
     ACCEPTED = 0
     CONTRADICTS = 1
@@ -33,18 +32,18 @@ class Verdict(IntEnum):
 
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
-    """How many times as large as stated the noise's variance is, by the median; at least 1."""
+    """Robust variance factor of the observations, from the median; at least 1."""
     median = float(np.median(mahalanobis2.astype(np.float32), overwrite_input=True))
     return max(1.0, median / _MEDIAN_SQUARED)
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
-    """Squared residuals of lines, chi-square of one degree of freedom, as equally likely ones of points."""
+    """Squared residuals of lines, chi-square with one degree of freedom, as equally likely ones of points."""
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
 def line_variance_factor(squared: FloatArray, taken: float) -> float:
-    """How much larger than stated lines' variance is, by the median; unknowns take the share ``taken``."""
+    """Robust variance factor of lines, from the median; unknowns absorb the fraction ``taken``."""
     if not len(squared):
         return 1.0
     of_line = float(chi2.isf(np.exp(-np.median(squared) / 2), 1))
@@ -54,12 +53,11 @@ def line_variance_factor(squared: FloatArray, taken: float) -> float:
 def classify(
     observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float, scale: float
 ) -> VerdictArray:
-    """A :class:`Verdict` (K,) for every observation, by its squared residual in sigmas ``mahalanobis2`` (K,).
+    """:class:`Verdict` (K,) on observations with squared Mahalanobis distances ``mahalanobis2`` (K,).
 
-    The gate is the squared distance that a sound observation exceeds with ``probability`` (chi-square, two
-    degrees of freedom: -2 ln p), widened by the noise's ``scale`` so that covariances that are too small do
-    not empty the map. An observation is unconfirmed when the gate leaves it alone with a corner that had
-    others.
+    The gate is the chi-square quantile that a sound observation exceeds with ``probability`` (two degrees of
+    freedom: -2 ln p), times the variance ``scale``, so that understated covariances do not empty the map. An
+    observation is unconfirmed if the gate leaves it as the last of several of its corner.
     """
     gate = -2 * np.log(probability) * scale
     verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
@@ -77,15 +75,14 @@ def classify(
     return verdict
 
 
-# Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
-_OUTLIER_SQUARED = 13.8
-# Mean of half such a variable below that limit: leaving the tail out takes a little off the chi-square.
+_OUTLIER_SQUARED = 13.8  # exceeded by one good observation in a thousand: chi-square, 2 degrees of freedom
+# Mean of half such a variable below that limit: truncating the tail reduces the chi-square a little.
 _TRIMMED_MEAN = 1 - _OUTLIER_SQUARED / 2 / math.expm1(_OUTLIER_SQUARED / 2)
 
 
 @dataclass(frozen=True)
 class VarianceFactors:
-    """Variances as multiples of the stated ones: of everything, and of the observations alone."""
+    """Variance factors, relative to the stated variances: of all data, and of the observations alone."""
 
     all: float
     observations: float
@@ -94,12 +91,11 @@ class VarianceFactors:
 def variance_factors(
     squared: FloatArray, of_priors: float, free: int, scale: float | None = None
 ) -> VarianceFactors:
-    """Chi-square per degree of freedom, of good observations and priors together and of the former.
+    """Chi-square per degree of freedom of inliers and priors together, and of inliers alone.
 
-    What the priors have left of their own degrees of freedom is what the observations have taken of them: the
-    expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric Computer
-    Vision, section 4.2.4, on variance components). ``free`` are the unknowns less those that priors other
-    than the poses' hold.
+    The observations use up the degrees of freedom that priors lose: the expected chi-square of a prior is its
+    redundancy (Foerstner and Wrobel, Photogrammetric Computer Vision, section 4.2.4, on variance components).
+    ``free`` is the number of unknowns less those that priors other than the poses' determine.
     """
     good = squared <= _OUTLIER_SQUARED * (noise_scale(squared) if scale is None else scale)
     of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN
@@ -111,7 +107,7 @@ def variance_factors(
 
 
 class Status(Enum):
-    """How a solve ended; :attr:`advice` says what to do about it."""
+    """Outcome of a solve; :attr:`advice` says what to do about it."""
 
     CONVERGED = "converged"
     STALLED = "stalled"
@@ -121,7 +117,7 @@ class Status(Enum):
 
     @property
     def advice(self) -> str:
-        """One sentence: what the status means and what to try."""
+        """One sentence: meaning of the status, and what to try."""
         return _ADVICE[self]
 
 
@@ -140,40 +136,32 @@ _ADVICE = {
 
 @dataclass(frozen=True)
 class Solution:
-    """The adjusted extrinsics, poses and corners, and the evidence that they are the optimum."""
+    """Adjusted extrinsics, poses and corners, and the evidence that they are optimal."""
 
-    status: Status  # how it ended
+    status: Status  # outcome
     cam_from_vehicle: FloatArray  # adjusted extrinsics (C, 4, 4)
-    map_from_vehicle: FloatArray  # adjusted poses (J, 4, 4); the recorded ones where no state is estimated
+    map_from_vehicle: FloatArray  # adjusted poses (J, 4, 4); the recorded ones without frame states
     corners_map: FloatArray  # (N, 2) m
     residual_px: FloatArray  # projected minus observed, (K, 2)
-    # squared residual in standard deviations (K,), chi-square with 2 degrees of freedom where model and
-    # covariances are right (what was seen of a line is scaled to that)
-    mahalanobis2: FloatArray
+    mahalanobis2: FloatArray  # (K,) squared Mahalanobis distances, chi-square of 2 degrees of freedom
     verdict: VerdictArray  # a :class:`v2hdm.adjust.Verdict` on each observation (K,)
-    # (C, V) how much later than stated each camera's images of each visit were taken; 0 where that is not
-    # estimated
-    clock_offset_s: FloatArray
-    # (C,) the time from the first row of each camera's images to the last; as stated where that is not
-    # estimated
-    read_out_s: FloatArray
-    cost_terms: Mapping[str, float]  # the parts of the cost by name; they add up to :attr:`cost`
+    clock_offset_s: FloatArray  # (C, V) exposure minus stamp by camera and session; 0 if not estimated
+    read_out_s: FloatArray  # (C,) time from an image's first row to its last; as stated if not estimated
+    cost_terms: Mapping[str, float]  # parts of the cost by name, which sum to :attr:`cost`
     evaluations: int  # of cost and gradient, all stages together
     gap: float  # predicted decrease still possible, as a fraction of the cost (the certificate)
-    chi2_per_dof: float  # about 1 where the noise model is right; outliers are left out
-    # how many times as large as stated the observations' variances are, if the priors' are right; outliers
-    # are left out
-    observation_factor: float
+    chi2_per_dof: float  # about 1 if the noise model is right; without outliers
+    observation_factor: float  # variance factor of the observations if priors are right; without outliers
     covariance: Covariance = field(repr=False)  # of everything estimated, on demand
 
     @property
     def cost(self) -> float:
-        """Half the squared, robustified residuals plus priors."""
+        """Half the sum of squared residuals, those of observations under the loss, and priors."""
         return sum(self.cost_terms.values())
 
     @property
     def accepted(self) -> BoolArray:
-        """Which observations (K,) the verdict is for."""
+        """Accepted observations (K,)."""
         return np.asarray(self.verdict == Verdict.ACCEPTED)
 
     @property
@@ -182,7 +170,7 @@ class Solution:
         return self.covariance.extrinsic()
 
     def corner_covariance(self, indices: IntArray) -> FloatArray:
-        """Joint covariance (2n, 2n), m^2, x0, y0, x1, ..., of corners (n,); of groups (M, n), one each."""
+        """Joint covariance (2n, 2n), m^2, x0, y0, x1, ..., of corners (n,); of groups (M, n) stacked."""
         groups = np.atleast_2d(indices)
         covariance = self.covariance.corners(groups)
         return covariance if np.ndim(indices) == 2 else covariance[0]
@@ -190,28 +178,27 @@ class Solution:
 
 AXES: tuple[str, ...] = ("forward", "left", "up", "roll", "pitch", "heading")
 
-# Share of the information from which a direction is said to rest on the survey. Two cameras that
-# share an unobservable direction halve it between them, hence below one half.
+# Fraction of the information from which a direction rests on the survey: below one half, as two cameras
+# that share an unobservable direction share its prior.
 _RESTS_ON_PRIOR = 0.25
 
 
 @dataclass(frozen=True)
 class Observability:
-    """How well a drive knows one camera's extrinsic, along and about the vehicle's axes :data:`AXES`."""
+    """Observability of one camera's extrinsic, along and about the vehicle's axes :data:`AXES`."""
 
     sigma: FloatArray  # (6,) m and rad, after the adjustment
-    # (3,) of the variance of the centre after and before: 0, the drive alone determines it; 1, only the prior
-    prior_share: FloatArray
+    prior_share: FloatArray  # (3,) posterior over prior variance of the centre; 1: the prior decides
 
     @property
     def unobserved(self) -> tuple[str, ...]:
-        """Directions of the camera's centre that rest on its prior."""
+        """Directions of the camera centre that rest on its prior."""
         return tuple(
             axis for axis, share in zip(AXES, self.prior_share, strict=False) if share > _RESTS_ON_PRIOR
         )
 
     def sentence(self, camera: str) -> str:
-        """For the person who drove: what is known how well, and what would help."""
+        """Summary for the driver: what is determined how well, and what would help."""
         turns = np.rad2deg(self.sigma[3:])
         rotation = f"rotation known to {turns.max():.3f} deg"
         if not self.unobserved:
@@ -225,10 +212,10 @@ class Observability:
 
 
 def observability(problem: Problem, solution: Solution) -> Sequence[Observability]:
-    """How well each camera of ``problem`` is determined by the drive, one record a camera."""
+    """Observability of each camera's extrinsic in ``problem``, one record per camera."""
     rotation, covariance = solution.cam_from_vehicle[:, :3, :3], solution.extrinsic_covariance
     centre_sigma_m = np.inf if problem.centre_sigma_m is None else problem.centre_sigma_m
-    # The tangent's axes are the camera's, and its translation is minus the motion of the centre.
+    # The tangent is in camera axes; its translation is minus the motion of the centre.
     centre = rotation.transpose(0, 2, 1) @ covariance[:, :3, :3] @ rotation
     turn = rotation.transpose(0, 2, 1) @ covariance[:, 3:, 3:] @ rotation
     variance = np.concatenate([np.diagonal(block, axis1=1, axis2=2) for block in (centre, turn)], axis=1)
@@ -238,15 +225,14 @@ def observability(problem: Problem, solution: Solution) -> Sequence[Observabilit
 
 @dataclass(frozen=True)
 class PoseInnovations:
-    """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift."""
+    """Normalised innovations of the frames' states: white errors, and the drifts' process noise."""
 
-    # (S,) which of :data:`v2hdm.adjust.problem.POSE_STATES` each is; a state with a drift has two
-    state: IntArray
-    normalised: FloatArray  # (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
+    state: IntArray  # (S,) index into :data:`v2hdm.adjust.problem.POSE_STATES`; twice for a drift
+    normalised: FloatArray  # (J, S) in sigmas; mean square at most 1 if the sigmas are right
 
     @property
     def along_over_across(self) -> float:
-        """How many times as much positions err anew along the way as across it; 1 where none is known."""
+        """Ratio of white position errors along and across the path; 1 if unknown."""
         ahead, left = (np.flatnonzero(self.state == axis)[:1] for axis in (0, 1))
         if not len(ahead) or not len(left):
             return 1.0
@@ -255,7 +241,7 @@ class PoseInnovations:
 
 
 def pose_innovations(solution: Solution) -> PoseInnovations:
-    """Normalised innovations of a solution's poses; none where it estimates no state of a frame."""
+    """Normalised innovations of a solution's poses; empty without frame states."""
     descent = solution.covariance.descent
     normalised = state_residual(descent.engine.arrays, descent.estimate.frame_state)
     return PoseInnovations(np.array(descent.engine.arrays.states, dtype=np.int64), normalised.cpu().numpy())

@@ -1,6 +1,6 @@
 """``solve(problem, options) -> Solution``: check, lay out, start, descend, report.
 
-A start from far away first looks at steep rays of part of the route, which leads home from ten degrees.
+A distant start first uses steep rays of part of the route, which converges from ten degrees away.
 """
 
 from __future__ import annotations
@@ -27,19 +27,16 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp
 from v2hdm.records import FloatArray
 
-# Sines of the depression below which rays are left out: from nearby the first will do, else the rest in turn.
-_MIN_DEPRESSION_SINES = (0.1, 0.2, 0.1)
-# Rotation of a camera, rad, up to which every start led to the optimum without steep rays: 3 degrees, of the
-# 5 that were tried. What a first Newton step predicts errs by a twentieth at ten degrees.
+_MIN_DEPRESSION_SINES = (0.1, 0.2, 0.1)  # least of rays: the first from nearby, the others in turn from afar
+# Rotation of a camera, rad, up to which every start converged without steep rays: 3 degrees, of the 5 tried.
+# At ten degrees a first Newton step errs by a twentieth.
 _NEAR_RAD = 0.052
-# With more corners than this a look at some of them saves more evaluations of all than it costs.
-_WORTH_CORNERS = 1000
-# Corners of the first look, and of those from far away.
+_WORTH_CORNERS = 1000  # with more, a coarse stage saves more evaluations of all corners than it costs
+# Corners of the coarse stage from nearby, and from afar.
 _NEARBY_CORNERS = 100
 _CORNERS = 400
 _BLOCKS = 10
-# Below this many observations a camera's six unknowns are not worth estimating from the subset.
-_MIN_OBSERVATIONS = 24
+_MIN_OBSERVATIONS = 24  # of a camera: with fewer, its six unknowns are not estimated from the subset
 _LOSS = Loss("huber", 1.0)
 _GAP_TOLERANCE = 1e-3
 _MAX_REFRESHES = 10
@@ -47,25 +44,25 @@ _MAX_EVALUATIONS = 200
 
 
 def is_worth_a_look(arrays: Arrays) -> bool:
-    """Whether a coarse stage pays whatever the start: it leaves most of the descent to a few corners."""
+    """Whether a coarse stage pays for any start, as in large problems."""
     return arrays.corner_count > _WORTH_CORNERS
 
 
 def is_near(whitening: Whitening) -> bool:
-    """Whether the Newton step from a start turns no camera by more than the descent can do by itself."""
+    """Whether the Newton step turns every camera by less than the descent's range of convergence."""
     step, _, _ = whitening.step(-whitening.gradient)
     return float(step.extrinsic[:, 3:].norm(dim=1).max()) <= _NEAR_RAD
 
 
 def coarse_extrinsics(engine: Engine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
-    """Improved extrinsics (C, 4, 4), and the evaluations spent.
+    """Coarsely estimated extrinsics (C, 4, 4), and the number of evaluations.
 
-    Rays near the horizon turn a small error of pitch into tens of metres; steep ones do not, and a few
-    hundred corners fix an extrinsic. The poses are taken as recorded: what they are off is small
-    here. The loss is convex, and wide enough for the residuals that are found.
+    Near the horizon a small pitch error moves ground points by tens of metres; steep rays avoid that, and a
+    few hundred corners fix an extrinsic. Poses stay as recorded: their errors are small here. The loss is
+    convex, and wide enough for the residuals.
     """
     evaluations = 0
-    # Whether the start of a small problem is far off has been seen before.
+    # :func:`solve` has already found the start of a small problem to be distant.
     for stage in range(0 if is_worth_a_look(engine.arrays) else 1, len(_MIN_DEPRESSION_SINES)):
         arrays = _papers_model(engine.arrays, _CORNERS if stage else _NEARBY_CORNERS)
         whole = arrays.whole()
@@ -90,10 +87,10 @@ def coarse_extrinsics(engine: Engine, cam_from_vehicle: Tensor) -> tuple[Tensor,
 
 
 def _papers_model(arrays: Arrays, corners: int) -> Arrays:
-    """The problem of so many corners and the frames that saw them, no states and no clocks."""
+    """The problem of ``corners`` corners and their frames, without states and clocks."""
     if arrays.corner_count > corners:
         arrays, _ = arrays.take(_route_blocks(arrays, corners))
-    # Without states a moment is a frame of its own.
+    # Without states each moment is a frame.
     moments, moment = torch.unique(arrays.pair % arrays.moment_count, return_inverse=True)
     camera, moments = arrays.camera_of(arrays.pair), moments.long()
     frames = arrays.frame_of(moments)
@@ -112,7 +109,7 @@ def _papers_model(arrays: Arrays, corners: int) -> Arrays:
 
 
 def _route_blocks(arrays: Arrays, corners: int) -> Tensor:
-    """The observations (k,) of corners in contiguous blocks spread over the route."""
+    """Observations (k,) of corners in contiguous blocks spread over the route."""
     first = torch.arange(_BLOCKS, device=arrays.corner.device) * arrays.corner_count // _BLOCKS
     bounds = torch.stack([first, first + corners // _BLOCKS]).to(arrays.corner.dtype)
     begin, end = torch.searchsorted(arrays.corner, bounds).tolist()
@@ -121,7 +118,7 @@ def _route_blocks(arrays: Arrays, corners: int) -> Tensor:
 
 
 def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
-    """The problem of the corners that ``keep`` leaves at least two observations, if these are enough."""
+    """The problem of corners with at least two observations in ``keep``, if there are enough."""
     sightings = torch.bincount(arrays.corner[keep], minlength=arrays.corner_count)
     keep = keep & (sightings >= 2)[arrays.corner]
     camera = arrays.camera_of(arrays.pair[keep])
@@ -132,14 +129,9 @@ def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
 
 
 def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
-    """Adjust extrinsics, poses and corners together.
+    """Adjust extrinsics, poses and corners together; the default options suit a port vehicle.
 
-    Args:
-        problem: what was seen, and from where.
-        options: how to solve; the defaults suit a port vehicle.
-
-    Raises:
-        AdjustError: the problem is malformed; the message names the offending item.
+    Raises AdjustError, which names the malformed item of ``problem``.
 
     >>> solution = solve(build_problem(port, result.detections))
     >>> solution.cam_from_vehicle.shape, solution.corners_map.shape[1:]
@@ -155,7 +147,7 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
 
 
 def _solve(problem: Problem, options: SolveOptions) -> Solution:
-    """Solve what has been checked."""
+    """Solve a checked problem."""
     origin_map = nearby_origin(problem)
     near = shifted(problem, -origin_map)
     states, estimated = tuple(options.pose_states), (options.clock_offset, options.read_out)
@@ -173,7 +165,7 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
 def _start(
     problem: Problem, engine: Engine, robust: Loss, options: SolveOptions
 ) -> tuple[Estimate, Whitening | None, int]:
-    """Where the descent starts, its first whitening if known, evaluations spent. Raises AdjustError."""
+    """Start of the descent, its first whitening if known, and evaluations spent. Raises AdjustError."""
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
     if options.coarse and not is_worth_a_look(engine.arrays):
         estimate, corner = _estimate(problem, engine, cam_from_vehicle)
@@ -194,7 +186,7 @@ def _start(
 
 
 def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
-    """The start under some extrinsics, and a corner that none of its rays fixes, if there is any."""
+    """The start under some extrinsics, and a corner that no ray determines, if any."""
     arrays = engine.arrays
     state = torch.zeros_like(arrays.state_information_root)
     if problem.corners_start is not None:
@@ -208,7 +200,7 @@ def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tup
 def _report(
     problem: Problem, origin_map: FloatArray, options: SolveOptions, descent: Descent, spent: int
 ) -> Solution:
-    """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
+    """The solution in the frame of ``problem``; ``origin_map`` is the arrays' origin in it."""
     robust = Loss(options.loss, options.loss_scale)
     engine, estimate, terms = descent.engine, descent.estimate, descent.terms
     arrays = engine.arrays

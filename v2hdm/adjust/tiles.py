@@ -1,10 +1,9 @@
-"""Sparse Cholesky factorisation in dense tiles, for a matrix with an arrow's shape.
+"""Sparse Cholesky factorisation in dense tiles of a matrix with arrow structure.
 
-Frames, cut into tiles along the route, couple to their neighbours and to tiles of earlier laps; the
-extrinsics couple to everything and come last, as the *tip*. Tiles are ordered by reverse Cuthill-McKee or,
-where many couple, by least degree, and their fill is found beforehand (the elimination tree: George and Liu,
-Computer Solution of Large Sparse Positive Definite Systems, 1981), so time and memory grow with the route's
-length.
+Frames, in tiles along the route, couple to neighbours and to tiles of earlier laps; extrinsics couple to
+everything and come last, as the *tip*. Tiles are ordered by reverse Cuthill-McKee or, where many couple, by
+least degree, and their fill is found beforehand (the elimination tree: George and Liu, Computer Solution of
+Large Sparse Positive Definite Systems, 1981): time and memory grow linearly with the route.
 """
 
 from __future__ import annotations
@@ -31,11 +30,10 @@ TIP = -1  # the row of the tiles that border the others, and row and column of t
 
 @dataclass(frozen=True)
 class Pattern:
-    """Which tiles are not zero."""
+    """The nonzero tiles."""
 
-    position: tuple[int, ...]  # where each tile along the route stands in the elimination order
-    # for each column in that order, the rows below its diagonal, fill included, ascending
-    below: tuple[tuple[int, ...], ...]
+    position: tuple[int, ...]  # elimination order of each tile along the route
+    below: tuple[tuple[int, ...], ...]  # rows below each column's diagonal, fill included, ascending
 
     def multiplications(self, size: int, tip: int) -> float:
         """Multiplications of a factorisation, in tiles of ``size`` rows and a tip of ``tip``."""
@@ -44,7 +42,7 @@ class Pattern:
 
 
 def find_pattern(tile_count: int, cliques: Iterable[Sequence[int]], least_degree: bool = False) -> Pattern:
-    """The pattern of a factor whose matrix couples all tiles of each clique with one another."""
+    """Pattern of the factor of a matrix that couples all tiles of each clique."""
     edges = {pair for clique in cliques for pair in combinations(sorted(clique), 2)}
     position = np.arange(tile_count)
     if edges:
@@ -69,7 +67,7 @@ def _cuthill_mckee(tile_count: int, edges: set[tuple[int, int]]) -> NDArray[Any]
 
 
 def _least_degree(tile_count: int, edges: set[tuple[int, int]]) -> list[int]:
-    """Eliminate the tile of least degree next, whose neighbours then all couple."""
+    """Elimination order by least degree; eliminating a tile couples all its neighbours."""
     near: list[set[int]] = [set() for _ in range(tile_count)]
     for first, second in edges:
         near[first].add(second)
@@ -93,23 +91,20 @@ def _least_degree(tile_count: int, edges: set[tuple[int, int]]) -> list[int]:
 
 @dataclass(frozen=True)
 class TiledMatrix:
-    """The lower tiles of a symmetric matrix, laid out as those of its factor, which takes their place."""
+    """Lower tiles of a symmetric matrix, in the layout of the factor that overwrites them."""
 
-    pattern: Pattern  # which there are
-    values: Tensor  # all numbers. What follows are views of them.
-    # the tiles of each column but the tip's, stacked, in elimination order, the tip's rows last
-    columns: tuple[Tensor, ...]
-    tip: Tensor  # the last tile on the diagonal
-    # all of them by (row, column) in elimination order, or :data:`TIP`
-    tiles: Mapping[tuple[int, int], Tensor]
-    # of those in columns, ascending, the column times G + 1 plus the row, the tip's being G; and where each
-    # begins among the values
+    pattern: Pattern  # of nonzero tiles
+    values: Tensor  # all numbers; the following are views of them
+    columns: tuple[Tensor, ...]  # by column, the tip's excepted, stacked in elimination order, its rows last
+    tip: Tensor  # last diagonal tile
+    tiles: Mapping[tuple[int, int], Tensor]  # by (row, column) in elimination order, or :data:`TIP`
+    # of the columns' tiles, ascending: column * (G + 1) + row, with G for the tip; ``at`` is their offset
     keys: NDArray[np.int64]
     at: NDArray[np.int64]
 
     @classmethod
     def zeros(cls, pattern: Pattern, size: int, tip: int, like: Tensor) -> TiledMatrix:
-        """Tiles of ``size`` rows and columns and a tip of ``tip``; numbers are of the kind of ``like``."""
+        """Tiles of ``size`` rows and columns and a tip of ``tip``, of the type of ``like``."""
         count = len(pattern.below)
         areas = [size * (size + size * len(below) + tip) for below in pattern.below]
         values = like.new_zeros(sum(areas) + tip * tip)
@@ -130,9 +125,9 @@ class _Flat(NamedTuple):
     """A factor as kernels read it."""
 
     values: FloatArray  # all tiles but the tip
-    at: IntArray  # (G,) where each column begins among the values
-    rows: IntArray  # of the vector that all panels act on
-    begin: IntArray  # (G + 1,) where each panel's begin among the rows
+    at: IntArray  # (G,) offset of each column among the values
+    rows: IntArray  # rows of the vector that the panels act on
+    begin: IntArray  # (G + 1,) first of each panel among ``rows``
     size: int  # rows and columns of a tile
     tip: FloatArray
 
@@ -142,11 +137,11 @@ class TiledCholesky:
     """L of a positive definite matrix in tiles of ``size``, the tip last."""
 
     diagonal: tuple[Tensor, ...]  # lower factors of the diagonal tiles (G, size, size)
-    panels: tuple[Tensor, ...]  # what stands below each, stacked, the tip's rows last
-    rows: tuple[Tensor, ...]  # which rows of the vector each panel acts on
-    tip: Tensor  # lower factor of the tip, the identity where that is held
-    values: Tensor  # what all of these but the tip are views of
-    held: Tensor | None = None  # what is left of a tip that is held, the others eliminated
+    panels: tuple[Tensor, ...]  # tiles below each, stacked, the tip's rows last
+    rows: tuple[Tensor, ...]  # rows of the vector that each panel acts on
+    tip: Tensor  # lower factor of the tip; the identity if held
+    values: Tensor  # memory of all of these but the tip
+    held: Tensor | None = None  # Schur complement of a held tip
 
     @property
     def size(self) -> int:
@@ -165,7 +160,7 @@ class TiledCholesky:
         return _Flat(self.values.numpy(), at, rows, begin, len(self.diagonal[0]), tip)
 
     def _substitute(self, substitute: Callable[..., None], right: Tensor) -> Tensor:
-        """Solve for one column by a kernel: a loop over tiles takes Python ten times as long."""
+        """Solve for one column by a kernel: Python's loop over tiles takes ten times as long."""
         out = right[:, 0].clone(memory_format=torch.contiguous_format)
         substitute(self._flat, out.numpy())
         return out[:, None]
@@ -178,7 +173,7 @@ class TiledCholesky:
         if self._is_one_column(right):
             return self._substitute(_substitute_forward, right)
         out, begin = right.clone(), 0
-        # Above the first row that is not zero there is nothing to solve for.
+        # Rows above the first nonzero one stay zero.
         first = int(right.any(dim=1).to(torch.uint8).argmax()) if self.diagonal else 0
         for tile, panel, rows in zip(self.diagonal, self.panels, self.rows, strict=True):
             if begin + len(tile) > first:
@@ -204,7 +199,7 @@ class TiledCholesky:
 
 
 def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesky | None:
-    """Factorise in place, right-looking, the tip too unless it is held; None where it is not definite."""
+    """Factorise in place, right-looking, the tip too unless held; None if not positive definite."""
     diagonal, panels, rows = [], [], []
     tip = matrix.tip
     size = matrix.columns[0].shape[1] if matrix.columns else 0
@@ -279,7 +274,7 @@ def _substitute_backward(factor: _Flat, out: FloatArray) -> None:
 
 
 def _factorise_tile(tile: Tensor) -> bool:
-    """Put a tile's lower factor in its place; whether there is one."""
+    """Replace a tile by its lower factor; False if it has none."""
     factor, info = torch.linalg.cholesky_ex(tile)
     tile.copy_(factor)
     return int(info) == 0

@@ -1,4 +1,4 @@
-"""Variables in which the problem looks round: the Gauss-Newton Hessian becomes the identity.
+"""Whitening: variables in which the Gauss-Newton Hessian is the identity.
 
 With V the Hessian's block of the corners (2 x 2 each, or more where known lengths join some), W the coupling
 of the reduced unknowns r (frame states, then extrinsics) to them and U their own block,
@@ -6,13 +6,13 @@ of the reduced unknowns r (frame states, then extrinsics) to them and U their ow
     L L' = V,   B = L^-1 W',   S = U - B' B = L_S L_S',
 
 the change of variables x_r = L_S^-T y_r, x_c = L^-T (y_c - B x_r) turns the Hessian into the identity: a
-block Cholesky factorisation of the whole, corners eliminated first. A gradient follows as
-g_yc = L^-1 g_c, g_yr = L_S^-1 (g_r - B' g_yc). One gradient step of length 1 in y is then
-the Gauss-Newton step in x, and |g_y|^2 / 2 the decrease that it predicts.
+block Cholesky factorisation with the corners eliminated first. The gradient is g_yc = L^-1 g_c,
+g_yr = L_S^-1 (g_r - B' g_yc): a gradient step of length 1 in y is the Gauss-Newton step in x, and |g_y|^2 / 2
+its predicted decrease.
 
-Engines know W by *pair* of a camera and a frame (:class:`v2hdm.adjust.engine.Linearised`); it is spread to
-extrinsics and frames on the small table of pairs. Corners that several drives observed may be *kept*: they
-are then unknowns of r, and variables that are always zero stand where they would.
+Engines know W by *pair* of a camera and a frame (:class:`v2hdm.adjust.engine.Linearised`), which small tables
+carry to extrinsics and frames. Corners that several drives observed may be *kept*: they are then unknowns of
+r, and their places among the corners hold variables that are always zero.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from v2hdm.adjust.reduced import Coupled, Plan, ReducedSystem, Spread, from_tile
 from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.errors import AdjustError
 
-SINGULAR_PIVOT = 1e-13  # below this a pivot is what rounding left of zero
-# What is added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any.
-# A pivot is what elimination has left of it, and where that is rounding it says nothing of the size needed.
+SINGULAR_PIVOT = 1e-13  # a smaller pivot is the rounding of zero
+# Added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any. The
+# pivots left by elimination are rounding there, and do not show the size needed.
 JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 
 
@@ -39,17 +39,16 @@ JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 class Whitening:
     """The factorised Hessian at one estimate."""
 
-    engine: Engine  # of the problem that it belongs to
-    plan: Plan  # the tiles of its reduced system
-    # where, and under which loss, it was linearised
-    estimate: Estimate
+    engine: Engine  # of the problem
+    plan: Plan  # tiles of the reduced system
+    estimate: Estimate  # the point of linearisation, under ``robust``
     robust: Loss
-    linearised: Linearised  # the problem there, the corners eliminated
+    linearised: Linearised  # the problem there, corners eliminated
     gradient: Tensor  # of the cost there by y
-    spread: Spread  # how the pairs move with frames and cameras
+    spread: Spread  # Jacobians of the pairs by frames and cameras
     reduced_factor: TiledCholesky  # L_S
-    smallest_pivot: float  # least share of an unknown's own information that the others leave it
-    jitter: float  # share of U's diagonal that had to be added to it for there to be an L_S
+    smallest_pivot: float  # least fraction of an unknown's information that the others leave
+    jitter: float  # relative addition to U's diagonal that made L_S exist
 
     @property
     def terms(self) -> dict[str, float]:
@@ -58,7 +57,7 @@ class Whitening:
 
     @property
     def is_singular(self) -> bool:
-        """Whether the observations and priors leave a direction of the reduced unknowns free."""
+        """Whether the observations and priors leave a direction of the reduced unknowns undetermined."""
         return self.jitter > 0 or self.smallest_pivot < SINGULAR_PIVOT
 
     @property
@@ -67,11 +66,11 @@ class Whitening:
         return self.reduced_factor.size + 2 * self.engine.arrays.corner_count
 
     def pull(self, by_residual: Tensor) -> Gradient:
-        """The gradient by x of a scalar, from that by the whitened residuals (2, K)."""
+        """Gradient by x of a scalar, from that by the whitened residuals (2, K)."""
         return self.engine.pull(self.estimate, self.spread, by_residual)
 
     def whiten(self, gradients: Sequence[Gradient]) -> Tensor:
-        """Gradients by x as those (n, size) by y, under the factors of this Hessian."""
+        """Gradients by x, as (n, size) by y under this Hessian's factors."""
         carried = [self.linearised.carry(one.corners_map) for one in gradients]
         rest = [
             _less_corners(self.plan, one, coupled, corners)
@@ -82,9 +81,9 @@ class Whitening:
         return torch.cat([reduced.mT, own.flatten(1)], dim=1)
 
     def step(self, whitened: Tensor) -> tuple[Gradient, Tensor, Tensor]:
-        """The step x of whitened variables but for its corners, the pairs' left tangents (C, M, 6) under it.
+        """Step x of whitened variables, except corners, and the pairs' left tangents (C, M, 6) under it.
 
-        The third are the corners' whitened variables (N, 2), of kept ones the step itself.
+        Then the corners' whitened variables (N, 2), for kept corners the step itself.
         """
         arrays = self.engine.arrays
         tip = len(self.reduced_factor.tip)
@@ -106,13 +105,13 @@ class Whitening:
 def whitened_gradient(
     plan: Plan, factor: TiledCholesky, gradient: Gradient, coupled: Coupled, corners: Tensor
 ) -> Tensor:
-    """The gradient by y, of the part of the corners (N, 2) and ``coupled``, W V^-1 g_c."""
+    """Gradient by y from that by x, the corners' part (N, 2) and ``coupled``, W V^-1 g_c."""
     rest = _less_corners(plan, gradient, coupled, corners)
     return torch.cat([factor.solve(rest[:, None])[:, 0], _less_kept(plan, corners).flatten()])
 
 
 def _less_corners(plan: Plan, gradient: Gradient, coupled: Coupled, corners: Tensor) -> Tensor:
-    """The gradient by the reduced unknowns, g_r - W V^-1 g_c."""
+    """Gradient by the reduced unknowns, g_r - W V^-1 g_c."""
     rest = (torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera).flatten()
     if plan.tile_count:
         by_state = gradient.frame_state - coupled.frame_state
@@ -127,9 +126,9 @@ def _less_kept(plan: Plan, corners: Tensor) -> Tensor:
 def factorise(
     engine: Engine, plan: Plan, estimate: Estimate, robust: Loss, hold_cameras: bool = False
 ) -> Whitening:
-    """Whitening at ``estimate``, under the weights that the loss gives there; held cameras' unknowns stay.
+    """Whitening at ``estimate`` under the loss's weights there; held cameras' unknowns stay fixed.
 
-    Raises AdjustError where the normal equations cannot be factorised.
+    Raises AdjustError if the normal equations cannot be factorised.
     """
     spread, priors = engine.spread(estimate), engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:

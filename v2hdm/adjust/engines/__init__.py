@@ -1,4 +1,4 @@
-"""Engines that evaluate and linearise the model: autograd of kornia, or kernels compiled by numba."""
+"""Engines that evaluate and linearise the model: autograd on kornia, or kernels compiled by numba."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def make_engine(engine: str, arrays: Arrays) -> Engine:
-    """The engine by its name over a problem; ``auto`` is numba on the CPU, torch elsewhere."""
+    """The engine of this name for a problem; ``auto`` is numba on the CPU, torch elsewhere."""
     if engine == "numba" or (engine == "auto" and arrays.centre.device.type == "cpu"):
         from v2hdm.adjust.engines.numba.engine import NumbaEngine
 

@@ -1,8 +1,8 @@
-"""The engine ``torch``: the model differentiated by autograd, on any device; kernels are tested against it.
+"""The engine ``torch``: the model differentiated by autograd on any device, the reference of the kernels.
 
-Observations are taken run by run. Each has leaves of its own, a left tangent of its pair and its corner, so
-that one backward pass a pixel coordinate gives the blocks of all. The blocks W' that couple corners to pairs
-are kept with the linearisation: 12 numbers an observation.
+Runs of observations have leaves of their own, a left tangent of the pair and the corner, so that one backward
+pass per pixel coordinate yields all blocks. The linearisation keeps the couplings W' of corners and pairs: 12
+numbers per observation.
 """
 
 from __future__ import annotations
@@ -35,12 +35,11 @@ from v2hdm.adjust.tiles import TIP, find_pattern
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray
 
-# Observations whose part of the Schur complement is one dense product: neighbours share their frames.
-_BLOCK = 512
+_BLOCK = 512  # observations per dense product of the Schur complement: neighbours share their frames
 
 
 def jacobians(residual: Tensor, leaves: Sequence[Tensor]) -> list[Tensor]:
-    """Derivatives (..., m, w) of residuals (..., m), each by its own row of the leaves (..., w)."""
+    """Derivatives (..., m, w) of residuals (..., m), each by its own row of leaves (..., w)."""
     rows = [
         torch.autograd.grad(column.sum(), leaves, retain_graph=True, materialize_grads=True)
         for column in residual.unbind(-1)
@@ -49,22 +48,22 @@ def jacobians(residual: Tensor, leaves: Sequence[Tensor]) -> list[Tensor]:
 
 
 def leaf(values: Tensor) -> Tensor:
-    """A copy of values to differentiate by."""
+    """A differentiable copy of ``values``."""
     return values.detach().clone().requires_grad_()
 
 
 class TorchEngine(Engine):
-    """The engine ``torch`` over one problem's arrays."""
+    """The engine ``torch`` for one problem's arrays."""
 
     @cached_property
     def _tiles(self) -> list[tuple[int, ...]]:
-        """The tiles that each block of observations touches; none where frames have no states."""
+        """Tiles that each block of observations touches; none if frames have no states."""
         arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
         blocks = arrays.runs(_BLOCK) if arrays.states else ()
         return [tuple(torch.unique(arrays.frame_of(run.pair) // per_tile).tolist()) for run in blocks]
 
     def plan(self) -> Plan:
-        """How the reduced system is cut into tiles: all corners are eliminated before the frames."""
+        """The division of the reduced system into tiles; all corners are eliminated before the frames."""
         arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
         count = -(-arrays.frame_count // per_tile) if arrays.states else 0
         along = pairwise(range(count)) if bool(arrays.state_transition.any()) else ()
@@ -86,7 +85,7 @@ class TorchEngine(Engine):
             ).T
 
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
+        """In problem order: residuals (K, 2), px, squared Mahalanobis distances, points behind."""
         arrays, poses = self.arrays, self.poses(estimate).flatten(0, 1)
         corners_map, order = estimate.corners_map[arrays.corner.long()], arrays.order.cpu().numpy()
         points = model.points_in_camera(poses[arrays.pair.long()], corners_map)
@@ -100,7 +99,7 @@ class TorchEngine(Engine):
         return out
 
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners (N, 2) by weighted back-projection from recorded poses, and which a ray fixes."""
+        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined."""
         arrays = self.arrays
         state = torch.zeros_like(arrays.state_information_root)
         at = Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())
@@ -125,7 +124,7 @@ class TorchEngine(Engine):
         return corners, fixed
 
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
-        """The cost, by name."""
+        """The cost by name."""
         squared = self.residuals(self.poses(estimate), estimate.corners_map).square().sum(0)
         with torch.no_grad():
             priors = model.prior_terms(self.arrays, estimate)
@@ -135,13 +134,13 @@ class TorchEngine(Engine):
     def cost_and_gradient(
         self, base: Estimate, step: Tensor, robust: Loss
     ) -> tuple[Estimate, dict[str, float], Gradient]:
-        """The cameras moved by tangents (C, 6), the cost there by name, and its gradient by ``step``."""
+        """Extrinsics moved by tangents (C, 6), the cost there by name, and its gradient by ``step``."""
         arrays = self.arrays
         leaves = [leaf(one) for one in (step, base.frame_state, base.corners_map, base.clock_s)]
         tangent, state, corners_map, clock_s = leaves
         estimate = Estimate(model.rigid(tangent) @ base.cam_from_vehicle, state, corners_map, clock_s)
         poses = model.cam_from_map(arrays, estimate.cam_from_vehicle, state, clock_s).flatten(0, 1)
-        # By runs: the gradient by poses and corners is summed up, and carried back to their unknowns once.
+        # The gradient by poses and corners is summed over runs and carried back to their unknowns once.
         pose, corner = leaf(poses), leaf(corners_map)
         observations = poses.new_zeros(())
         for run in arrays.runs():
@@ -157,7 +156,7 @@ class TorchEngine(Engine):
         return moved, terms, Gradient(*gradient)
 
     def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
-        """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
+        """Gradient of a scalar from that by the whitened residuals (2, K)."""
         arrays = self.arrays
         tangent = estimate.cam_from_vehicle.new_zeros(arrays.camera_count, 6)
         leaves = [
@@ -171,7 +170,7 @@ class TorchEngine(Engine):
         )
 
     def spread(self, estimate: Estimate) -> Spread:
-        """How pairs move with frame states and clock offsets."""
+        """Jacobians of the pairs by frame states and clock offsets."""
         arrays = self.arrays
         shape = (arrays.camera_count, arrays.moment_count)
         state = leaf(arrays.at_moments(estimate.frame_state).expand(*shape, -1))
@@ -182,7 +181,7 @@ class TorchEngine(Engine):
         return Spread(arrays, *jacobians(model.left_tangent(poses, poses.detach()), [state, clock]))
 
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
-        """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
+        """Gauss-Newton Hessian of the priors by the reduced unknowns."""
         arrays, each = self.arrays, self.arrays.camera_unknowns
         camera = leaf(estimate.clock_s.new_zeros(arrays.camera_count, each))
         moved = model.rigid(camera[:, :6]) @ estimate.cam_from_vehicle
@@ -202,7 +201,7 @@ class TorchEngine(Engine):
         return PriorBlocks(cameras, frame, by_own.mT @ by_before)
 
     def linearise(self, run: Run, poses: Tensor, corners_map: Tensor, robust: Loss) -> tuple[Tensor, Tensor]:
-        """Derivatives (k, 2, 6) and (k, 2, 2) of a run's residuals by pair and corner, times root weights."""
+        """Jacobians (k, 2, 6) and (k, 2, 2) of a run's residuals by pair and corner, times root weights."""
         tangent, corner = leaf(poses.new_zeros(len(run.pair), 6)), leaf(corners_map[run.corner])
         points = model.points_in_camera(model.rigid(tangent) @ poses[run.pair], corner)
         residual = model.corner_residual(points, run.measured, run.root_information)
@@ -246,7 +245,7 @@ class TorchEngine(Engine):
         return by_corner.mT @ by_corner
 
     def _by_length(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
-        """Derivatives (M, 2) of the lengths' residuals by their first and second corners."""
+        """Derivatives (M, 2) of the lengths' residuals by first and second corner."""
         known, corners = self.arrays.lengths, estimate.corners_map
         first, second = leaf(corners[known.first]), leaf(corners[known.second])
         residual = model.length_residual(self.arrays, first, second)
@@ -307,7 +306,7 @@ def _residual(run: Run, poses: Tensor, corners_map: Tensor) -> Tensor:
 
 
 def _by_frame(system: ReducedSystem, run: Run, tiles: tuple[int, ...], by_state: Tensor) -> Tensor:
-    """W' of a block by the states of the frames of its tiles, (n, 2, tiles * F * S)."""
+    """W' of a block by the frame states of its tiles, (n, 2, tiles * F * S)."""
     per_tile, frame = system.plan.frames_per_tile, system.arrays.frame_of(run.pair)
     index, slots = torch.tensor(tiles, device=frame.device), per_tile * len(tiles)
     slot = torch.searchsorted(index, frame // per_tile) * per_tile + frame % per_tile

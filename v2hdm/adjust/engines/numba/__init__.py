@@ -1,5 +1,5 @@
-"""The engine ``numba``: kernels, compiled when they are first called, for what is done to every observation.
+"""The engine ``numba``: kernels, compiled on first use, for all work per observation.
 
-All that is particular to a model, such as states, clocks, drifts and extrinsics, acts through the table of
-pairs, so that kernels know none of it.
+States, clocks, drifts and extrinsics act through the table of pairs, so that kernels are independent of the
+model.
 """

@@ -35,16 +35,16 @@ from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_COLUMN_RANGES = 8  # ranges of columns that threads take in turn
-# Multiplications of a factorisation above which other orders of elimination are tried, and the share of
-# them from which another order pays.
+_COLUMN_RANGES = 8  # ranges of columns shared among threads
+# Multiplications of a factorisation above which other elimination orders are tried, and the fraction of them
+# below which another order pays.
 _WORTH_ANOTHER_ORDER = 1e9
 _CLEARLY_LESS = 0.5
 _PAIR_BLOCK = torch.triu_indices(6, 6)
 
 
 class NumbaEngine(Engine):
-    """The kernels over one problem's arrays."""
+    """The kernels for one problem's arrays."""
 
     @cached_property
     def _whole(self) -> Layout:
@@ -52,15 +52,15 @@ class NumbaEngine(Engine):
 
     @cached_property
     def layout(self) -> Layout:
-        """The problem as kernels read it, with the corners marked that the plan keeps."""
+        """The problem as kernels read it, with the corners that the plan keeps marked."""
         return self._with_kept(self._plan.kept)
 
     def share(self, work: Callable[[int, int], None]) -> None:
-        """Call ``work(begin, end)`` for ranges of chunks that are all of them together."""
+        """Call ``work(begin, end)`` for ranges that partition the chunks."""
         share(work, len(self._whole.chunk) - 1, len(self._whole.pair))
 
     def plan(self) -> Plan:
-        """How the reduced system is cut into tiles."""
+        """The division of the reduced system into tiles."""
         return self._plan
 
     @cached_property
@@ -94,18 +94,18 @@ class NumbaEngine(Engine):
         return self._whole._replace(kept=mask[self._whole.unit[:-1]])
 
     def _shared_corners(self) -> Tensor:
-        """Corners (n,) that several drives observed, with those that known lengths join to them."""
+        """Corners (n,) that several drives observed, and all that known lengths join to them."""
         arrays, layout = self.arrays, self._whole
         visit = arrays.visit[arrays.frame_of(arrays.pair).long()].numpy()
         begin = layout.begin[layout.unit[:-1]]
         shared = np.minimum.reduceat(visit, begin) < np.maximum.reduceat(visit, begin)
         size = np.diff(layout.unit)
-        # A unit of more than a tile would reach beyond the next one.
+        # A unit larger than a tile would reach beyond the next one.
         most = frames_per_tile(arrays) * len(arrays.states) // 2
         return torch.from_numpy(np.flatnonzero(np.repeat(shared & (size <= most), size)))
 
     def _coupled_tiles(self, layout: Layout, per_tile: int, tile_count: int) -> tuple[list[list[int]], int]:
-        """The pairs of tiles that eliminated corners couple, and how many tiles a unit touches at most."""
+        """Pairs of tiles coupled by eliminated corners, and the largest number of tiles of a unit."""
         tile = layout.frame[layout.pair % layout.moments] // per_tile
         units, seen = len(layout.kept), layout.begin[layout.unit]
         touched = csr_array((np.ones(len(tile), dtype=np.int32), tile, seen), shape=(units, tile_count))
@@ -120,7 +120,7 @@ class NumbaEngine(Engine):
         return cam_from_map(self.arrays, estimate)
 
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners (N, 2) by weighted back-projection from recorded poses, and which a ray fixes."""
+        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined."""
         arrays, count = self.arrays, self.arrays.corner_count
         corners, fixed = np.empty((count, 2)), np.empty(count, dtype=np.bool_)
         state = torch.zeros_like(arrays.state_information_root)
@@ -136,7 +136,7 @@ class NumbaEngine(Engine):
         return torch.from_numpy(out)
 
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
+        """In problem order: residuals (K, 2), px, squared Mahalanobis distances, points behind."""
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         count = len(self._whole.pair)
         out = evaluate.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
@@ -145,13 +145,13 @@ class NumbaEngine(Engine):
         return out
 
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
-        """The cost, by name."""
+        """The cost by name."""
         spread = self.spread(estimate)
         system = ReducedSystem(self.arrays, self.plan(), spread)
         return self.eliminate(system, estimate, robust).terms
 
     def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
-        """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
+        """Gradient of a scalar from that by the whitened residuals (2, K)."""
         table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
         wrench, by_corner = np.zeros((len(table), 6)), np.zeros_like(corners)
         evaluate.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
@@ -160,15 +160,15 @@ class NumbaEngine(Engine):
         return Gradient(camera[:, :6], gathered.frame_state, torch.from_numpy(by_corner), camera[:, 6:])
 
     def spread(self, estimate: Estimate) -> Spread:
-        """How pairs move with frame states and clock offsets."""
+        """Jacobians of the pairs by frame states and clock offsets."""
         return spread_of(self.arrays, estimate)
 
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
-        """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
+        """Gauss-Newton Hessian of the priors by the reduced unknowns."""
         return prior_blocks_of(self.arrays, estimate)
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
-        """Linearise and eliminate the corners; raises AdjustError where joined ones cannot be solved for."""
+        """Linearise and eliminate the corners; raises AdjustError if a block of joined ones is singular."""
         arrays, layout, spread = self.arrays, self.layout, system.spread
         clock, width, pairs = _by_pair(spread.clock), system.tip, arrays.pair_count
         touched, chunks = len(layout.touched), len(layout.chunk) - 1
@@ -223,7 +223,7 @@ class NumbaEngine(Engine):
         )
 
     def _keep(self, system: ReducedSystem, base: Base) -> None:
-        """Add the kept corners' blocks, found where factors belong, to the system; factors are then 1."""
+        """Add the kept corners' blocks, stored as factors, to the system; sets those factors to 1."""
         layout, kept = self.layout, system.plan.kept
         number = np.full(self.arrays.corner_count, -1)
         number[kept.numpy()] = np.arange(len(kept))
@@ -248,7 +248,7 @@ class NumbaEngine(Engine):
         system.add_kept(run, coupling, torch.tensor(np.array(index).T), torch.from_numpy(np.array(blocks)))
 
     def coupling(self, run: Run, base: Base) -> Tensor:
-        """W' (k, 2, 6) of a run's observations, whose corners (n, 2) are the base's."""
+        """W' (k, 2, 6) of a run's observations of the base's corners (n, 2)."""
         layout = self._whole._replace(
             pair=run.pair.to(torch.int32).numpy(),
             measured=_rows(run.measured),
@@ -283,7 +283,7 @@ class NumbaEngine(Engine):
         share(work, len(cuts) - 1, len(layout.pair))
 
     def coupled(self, by_pair: FloatArray, carried: FloatArray, spread: Spread) -> Coupled:
-        """W V^-1 g, from what chunks add up by pair (R, 6) or by the cameras' unknowns (Q, D)."""
+        """W V^-1 g, from the chunks' sums by pair (R, 6) or by the cameras' unknowns (Q, D)."""
         if self.arrays.states:
             return spread.gather(self.pairs(by_pair))
         cameras = torch.from_numpy(carried.sum(0)).view(self.arrays.camera_count, -1)
@@ -364,11 +364,11 @@ class NumbaLinearised(Linearised):
 def _kept_tiles(
     arrays: Arrays, kept: Tensor, per_corner_tile: int, first: int, per_tile: int
 ) -> list[Sequence[int]]:
-    """The pairs of tiles that observations of kept corners couple, and that corners joined to them may."""
+    """Pairs of tiles coupled by observations of kept corners, or by corners joined to them."""
     run = arrays.gather(kept)
     tile = first + run.corner // per_corner_tile
     pairs = torch.unique(torch.stack([arrays.frame_of(run.pair) // per_tile, tile]), dim=1).T.tolist()
-    # Joined corners lie side by side: those of one unit may reach into the next tile.
+    # Joined corners are adjacent: a unit may reach into the next tile.
     tiles = torch.unique(tile).tolist()
     return [*pairs, *pairwise(tiles)]
 
@@ -381,7 +381,7 @@ def _gather(touched: IntArray, parts: FloatArray, out: FloatArray) -> None:
 
 
 def _corner_factor(arrays: Arrays, base: Base) -> CornerFactor:
-    """The kernels' factors of V for torch, on the same memory."""
+    """The kernels' factors of V for torch, sharing memory."""
     if not len(base.joint):
         return CornerFactor(torch.from_numpy(base.lower), ())
     joint, begin = [], 0
@@ -405,13 +405,13 @@ def _table(transforms: Tensor) -> FloatArray:
 
 
 def _by_pair(spread: Tensor) -> FloatArray:
-    """Derivatives (C, J, 6, n) as rows (P, 6 n)."""
+    """Jacobians (C, J, 6, n) as rows (P, 6 n)."""
     cameras, frames, tangent, unknowns = spread.shape
     return _rows(spread.reshape(cameras * frames, tangent * unknowns))
 
 
 def _symmetric(entries: Tensor, cameras: int) -> Tensor:
-    """Full blocks (C, J or 1, 6, 6) of their 21 entries (n, 21)."""
+    """Full blocks (C, J or 1, 6, 6) from their 21 entries (n, 21)."""
     row, column = _PAIR_BLOCK
     blocks = entries.new_empty(len(entries), 6, 6)
     blocks[:, row, column] = entries

@@ -1,4 +1,4 @@
-"""Corners started and moved, cost and gradient, carried back, and what the report says of observations."""
+"""Start and motion of corners, cost and gradient, back-propagation, and the report on observations."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 class Evaluation(NamedTuple):
-    """The output of :func:`evaluate`, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
+    """Output of :func:`evaluate`, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
 
-    ``corners`` (N, 2) are those moved; ``whitened`` (2 N,) is the gradient by their whitened variables.
+    ``corners`` (N, 2) have moved; ``whitened`` (2 N,) is the gradient by their whitened variables.
     """
 
     costs: FloatArray
@@ -42,7 +42,7 @@ class Evaluation(NamedTuple):
 
 @inlined
 def _oppose(known: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple[float, float, float]:
-    """The force with which the observation in row i of ``known`` opposes a motion of its point."""
+    """Force with which the observation in row i of ``known`` opposes a motion of its point."""
     along = known[i, 4] * mz
     x, y = mx * known[i, 3] + known[i, 0] * along, my * known[i, 3] + known[i, 1] * along
     fu, fv = known[i, 5] * x + known[i, 6] * y, known[i, 6] * x + known[i, 7] * y
@@ -117,7 +117,7 @@ def _pushed(
     first: int,
     known: FloatArray,
 ) -> tuple[float, float]:
-    """The push of a step of cameras and frames on corner c, of a unit from ``first`` on, not yet whitened."""
+    """Unwhitened push of a step of cameras and frames on corner c; its unit begins at ``first``."""
     sx = sy = 0.0
     for p in range(len(cameras) if len(base.rows) else 0):
         sx += base.rows[2 * c, p] * cameras[p]
@@ -145,7 +145,7 @@ def _at_corner(
     total: float,
     product: float,
 ) -> tuple[float, float, float, float]:
-    """The gradient at corner c where it has moved to, and the loss so far; adds to the pairs' gradients."""
+    """Gradient at corner c's new position, and the loss so far; adds to the pairs' gradients."""
     gx = gy = 0.0
     for k in range(layout.begin[c], layout.begin[c + 1]):
         px, py, pz, inverse, slope, du, dv = see(layout, table, k, out.corners[c, 0], out.corners[c, 1])
@@ -177,9 +177,9 @@ def evaluate(
     scratch: Scratch,
     out: Evaluation,
 ) -> None:
-    """Evaluate chunks ``begin`` to ``end`` at a step from where the whitening was made.
+    """Evaluate chunks ``begin`` to ``end`` after a step from the whitening's estimate.
 
-    ``table`` (P, 16) is of the pairs after the step, ``motion`` (P, 6) the step as their left tangents, where
+    ``table`` (P, 16) is of the pairs after the step; ``motion`` (P, 6) is the step as their left tangents, if
     frames have states, ``cameras`` (D,) that of the cameras' unknowns, ``own`` (2 N,) the corners' whitened
     variables.
     """
@@ -218,13 +218,13 @@ def evaluate(
 def back_project(
     begin: int, end: int, layout: Layout, table: FloatArray, corners: FloatArray, fixed: BoolArray
 ) -> None:
-    """Start the corners (N, 2) of chunks ``begin`` to ``end``, and say which (N,) a ray fixes."""
+    """Start the corners (N, 2) of chunks ``begin`` to ``end``, flagging (N,) those that a ray determines."""
     for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
         xx = yx = yy = x = y = 0.0
         for k in range(layout.begin[c], layout.begin[c + 1]):
             t = layout.pair[k]
             u, v = layout.measured[0, k], layout.measured[1, k]
-            # The ray and the camera's centre in the map, by the transposed rotation.
+            # The ray in the map, by the transposed rotation.
             dx = table[t, 0] * u + table[t, 4] * v + table[t, 8]
             dy = table[t, 1] * u + table[t, 5] * v + table[t, 9]
             dz = table[t, 2] * u + table[t, 6] * v + table[t, 10]
@@ -312,7 +312,7 @@ def pull(
     wrench: FloatArray,
     by_corner: FloatArray,
 ) -> None:
-    """Add the gradients by the pairs (P, 6) and by corner (N, 2), from that by the residuals (2, K)."""
+    """Add the gradients by pairs (P, 6) and corners (N, 2) from that by the residuals (2, K)."""
     for c in range(len(corners)):
         for k in range(layout.begin[c], layout.begin[c + 1]):
             differentiate(layout, table, k, corners[c, 0], corners[c, 1], jacobian)
@@ -325,7 +325,7 @@ def pull(
 
 @kernel
 def couplings(layout: Layout, base: Base, corner: IntArray, jacobian: FloatArray, out: FloatArray) -> None:
-    """Write W' (k, 12) of the layout's observations, of the base's corners, numbered by ``corner``."""
+    """Write W' (k, 12) of the layout's observations of the base's corners, numbered by ``corner``."""
     for k in range(len(corner)):
         x, y = base.corners[corner[k], 0], base.corners[corner[k], 1]
         r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)

@@ -1,7 +1,7 @@
 """Common parts of the kernels: an observation, a loss, the factor of a unit's corners.
 
-The formulas are the closed forms of :mod:`~v2hdm.adjust.model` and :mod:`~v2hdm.adjust.reduced`, which
-tests hold these to. A pair's table is its ``cam_from_map``, row by row (16,).
+They are the closed forms of :mod:`~v2hdm.adjust.model` and :mod:`~v2hdm.adjust.reduced`, tested against them.
+A pair's table is its ``cam_from_map``, row by row (16,).
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from v2hdm.records import FloatArray, IntArray
 
 _Seen = tuple[float, float, float, float, float, float, float]
 
-_LARGE = 1e150  # a product of the Cauchy loss's terms is taken the logarithm of before it can overflow
+_LARGE = 1e150  # above it the Cauchy loss takes the logarithm of its product, before that overflows
 
 
 @inlined
 def see(layout: Layout, table: FloatArray, k: int, x: float, y: float) -> _Seen:
-    """Observation k of the ground point x, y: p, the inverse depth and its slope, and how far it is off."""
+    """Observation k of ground point x, y: point in the camera, inverse depth and its slope, and residual."""
     t = layout.pair[k]
     px = table[t, 0] * x + table[t, 1] * y + table[t, 3]
     py = table[t, 4] * x + table[t, 5] * y + table[t, 7]
@@ -43,7 +43,7 @@ def whiten(layout: Layout, k: int, u: float, v: float) -> tuple[float, float]:
 
 @inlined
 def weigh(base: Base, squared: float) -> float:
-    """The derivative of the loss."""
+    """Derivative of the loss."""
     if base.code == 0:
         return 1.0
     cut = base.scale * base.scale
@@ -55,13 +55,13 @@ def weigh(base: Base, squared: float) -> float:
 
 @inlined
 def floored(weight: float) -> float:
-    """A weight as the Hessian has it."""
+    """A weight with the Hessian's floor."""
     return WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight
 
 
 @inlined
 def add_loss(base: Base, squared: float, total: float, product: float) -> tuple[float, float]:
-    """Add the loss to a total, the Cauchy loss as a factor of a product: one logarithm for many."""
+    """Add the loss to a total; the Cauchy loss to a product instead: one logarithm for many terms."""
     if base.code == 0:
         return total + squared, product
     cut = base.scale * base.scale
@@ -95,7 +95,7 @@ def add_force(
 def add_corner_priors(
     layout: Layout, u: int, corners: FloatArray, gradient: FloatArray, costs: FloatArray
 ) -> None:
-    """Add a unit's survey and known lengths to its gradient (2g,) and to ``costs[1]`` and ``costs[2]``."""
+    """Add a unit's survey and known lengths to its gradient (2g,), and to ``costs[1]`` and ``costs[2]``."""
     first = layout.unit[u]
     for c in range(first, layout.unit[u + 1]):
         x, y = layout.control_root[c, 0], layout.control_root[c, 2]
@@ -117,7 +117,7 @@ def add_corner_priors(
 
 @inlined
 def length_residual(layout: Layout, m: int, corners: FloatArray) -> tuple[float, float, float]:
-    """The whitened residual of a known length and its derivative by its first corner."""
+    """Whitened residual of a known length, and its derivative by the first corner."""
     a, b = layout.length_first[m], layout.length_second[m]
     dx, dy = corners[a, 0] - corners[b, 0], corners[a, 1] - corners[b, 1]
     distance = math.sqrt(dx * dx + dy * dy)
@@ -128,14 +128,14 @@ def length_residual(layout: Layout, m: int, corners: FloatArray) -> tuple[float,
 
 @inlined
 def unit_of(layout: Layout, u: int) -> tuple[int, int, int]:
-    """Twice a unit's number of corners, the first of them, and where its factor begins if they are joined."""
+    """Twice a unit's number of corners, its first corner, and the offset of its factor if joined."""
     first = layout.unit[u]
     return 2 * (layout.unit[u + 1] - first), first, layout.joint_at[u]
 
 
 @inlined
 def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> bool:
-    """Factorise a unit's block (2g, 2g): into ``base.lower``, or ``base.joint`` where corners are joined."""
+    """Factorise a unit's block (2g, 2g) into ``base.lower``, or ``base.joint`` for joined corners."""
     (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
     for i in range(n):
         block[i, i] += CORNER_FLOOR
@@ -166,7 +166,7 @@ def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> boo
 
 @inlined
 def keep_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> None:
-    """Write a unit's block as it is, in the place of its factor."""
+    """Write a unit's block, unfactorised, in place of its factor."""
     n, c, at = unit_of(layout, u)
     for i in range(n):
         block[i, i] += CORNER_FLOOR
@@ -180,7 +180,7 @@ def keep_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> None:
 
 @inlined
 def solve_unit(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
-    """L^-1 b in the place of b (2g,)."""
+    """Replace b (2g,) by L^-1 b."""
     (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
     if n == 2:
         right[0] /= lower[0, c]
@@ -195,7 +195,7 @@ def solve_unit(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
 
 @inlined
 def solve_unit_transposed(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
-    """L^-T b in the place of b (2g,)."""
+    """Replace b (2g,) by L^-T b."""
     (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
     if n == 2:
         right[1] /= lower[2, c]
@@ -210,7 +210,7 @@ def solve_unit_transposed(layout: Layout, base: Base, u: int, right: FloatArray)
 
 @inlined
 def solve_unit_rows(layout: Layout, base: Base, u: int, rows: FloatArray, begin: int, end: int) -> None:
-    """L^-1 b in the place of b (2g, end - begin), the columns of ``rows`` from ``begin`` to ``end``."""
+    """Replace b (2g, end - begin), columns ``begin`` to ``end`` of ``rows``, by L^-1 b."""
     (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
     if n == 2:
         first, below, last = lower[0, c], lower[1, c], lower[2, c]
@@ -230,7 +230,7 @@ def solve_unit_rows(layout: Layout, base: Base, u: int, rows: FloatArray, begin:
 
 @inlined
 def along_axes(table: FloatArray, t: int, fx: float, fy: float, fz: float) -> tuple[float, float]:
-    """The gradient by a corner of what has the gradient f by its point in pair t."""
+    """Gradient by a corner from the gradient f by its point in pair t."""
     return (
         table[t, 0] * fx + table[t, 4] * fy + table[t, 8] * fz,
         table[t, 1] * fx + table[t, 5] * fy + table[t, 9] * fz,
@@ -239,7 +239,7 @@ def along_axes(table: FloatArray, t: int, fx: float, fy: float, fz: float) -> tu
 
 @inlined
 def number_touched(layout: Layout, q: int, slot: IntArray) -> None:
-    """Number in ``slot`` (P,) the pairs that chunk q touches."""
+    """Number the pairs of chunk q in ``slot`` (P,)."""
     begin = layout.touched_at[q]
     for i in range(begin, layout.touched_at[q + 1]):
         slot[layout.touched[i]] = i

@@ -1,9 +1,8 @@
-"""The constants of a solve as the kernels read them: :class:`~v2hdm.adjust.arrays.Arrays` in chunks.
+"""The constants of a solve as kernels read them: :class:`~v2hdm.adjust.arrays.Arrays` in chunks.
 
-A *unit* is corners that known lengths join, mostly one. A *chunk* is neighbouring units with some thousand
-observations. Sums over all observations are added up chunk by chunk and then over the chunks in their order,
-so that they do not depend on the number of threads; those by pair only over the pairs that a chunk touches.
-Threads take chunk after chunk.
+A *unit* is a set of corners joined by known lengths, mostly one corner. A *chunk*, the work item of a thread,
+is a run of units with some thousand observations. Sums are taken per chunk and then over chunks in order, so
+that results do not depend on the number of threads; sums by pair run over a chunk's pairs alone.
 """
 
 from __future__ import annotations
@@ -31,37 +30,31 @@ LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 class Layout(NamedTuple):
     """K observations of N corners in M units and Q chunks."""
 
-    # as in :class:`~v2hdm.adjust.arrays.Arrays`
-    pair: IntArray
+    pair: IntArray  # (K,) this and the next two as in :class:`~v2hdm.adjust.arrays.Arrays`
     measured: FloatArray
     root: FloatArray
     moments: int  # M
-    frame: IntArray  # (M,) of each moment
-    begin: IntArray  # (N + 1,) where each corner's observations begin
-    unit: IntArray  # (M + 1,) where each unit's corners begin
-    joint_at: IntArray  # (M,) where the factor of a unit of several corners begins among those of all
-    chunk: IntArray  # (Q + 1,) where each chunk's units begin
-    # the pairs that chunks touch, ascending in each, and (Q + 1,) where they begin
-    touched: IntArray
+    frame: IntArray  # (M,) frame of each moment
+    begin: IntArray  # (N + 1,) first observation of each corner
+    unit: IntArray  # (M + 1,) first corner of each unit
+    joint_at: IntArray  # (M,) offset of the factor of a unit of several corners
+    chunk: IntArray  # (Q + 1,) first unit of each chunk
+    touched: IntArray  # pairs of each chunk, ascending; chunks begin at ``touched_at`` (Q + 1,)
     touched_at: IntArray
-    # as in Arrays
-    control: FloatArray
+    control: FloatArray  # this and the next as in Arrays
     control_root: FloatArray
-    length_at: IntArray  # (M + 1,) where each unit's known lengths begin
-    # the lengths, sorted by unit
-    length_first: IntArray
+    length_at: IntArray  # (M + 1,) first known length of each unit
+    length_first: IntArray  # this and the next three are the lengths, sorted by unit
     length_second: IntArray
     length_m: FloatArray
     length_root: FloatArray
-    # observations and corners of a unit, at most
-    most_seen: int
+    most_seen: int  # largest number of observations, and of corners, of a unit
     most_joined: int
-    # (M,) units that are not eliminated: their factor is the identity, and nothing couples to them
-    kept: BoolArray
+    kept: BoolArray  # (M,) units that are not eliminated: their factor is 1, and nothing couples to them
 
 
 def make_layout(arrays: Arrays) -> Layout:
-    """The layout of arrays that lie in the processor's memory."""
+    """The layout of arrays in the processor's memory."""
     begin = np.searchsorted(arrays.corner.numpy(), np.arange(arrays.corner_count + 1, dtype=np.int32))
     unit = arrays.units.numpy()
     chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
@@ -97,14 +90,14 @@ def make_layout(arrays: Arrays) -> Layout:
 
 
 def _distinct(pair: IntArray, pairs: int) -> IntArray:
-    """The different ones among a chunk's pairs: by a mask of them all, which takes less than to sort."""
+    """The distinct pairs of a chunk, by a mask over all pairs, which is faster than sorting."""
     there = np.zeros(pairs, dtype=np.bool_)
     there[pair] = True
     return np.flatnonzero(there).astype(np.int32)
 
 
 def joint_offsets(joined: IntArray) -> IntArray:
-    """Where the factors (2g, 2g) of units of g > 1 corners begin (M,), those of a size side by side."""
+    """Offsets (M,) of the factors (2g, 2g) of units of g > 1 corners; equal sizes are contiguous."""
     out, begin = np.zeros(len(joined), dtype=np.int64), 0
     for size in np.unique(joined[joined > 1]):
         same = np.flatnonzero(joined == size)
@@ -114,22 +107,19 @@ def joint_offsets(joined: IntArray) -> IntArray:
 
 
 class Base(NamedTuple):
-    """Where a problem is linearised, and the factors of V there."""
+    """The point of linearisation, and the factors of V there."""
 
     table: FloatArray  # of the pairs (P, 16)
     corners: FloatArray  # (N, 2)
-    # of the loss
-    code: int
+    code: int  # this and the next are the loss
     scale: float
-    # L of corners that stand alone (3, N), and of units of several, one after the other
-    lower: FloatArray
+    lower: FloatArray  # L (3, N) of single corners; ``joint`` is that of larger units, concatenated
     joint: FloatArray
-    # L^-1 W' (2 N, D) where frames have no states; else (0, D): it is computed anew, by observation
-    rows: FloatArray
+    rows: FloatArray  # L^-1 W' (2 N, D) if frames have no states; else (0, D), recomputed by observation
 
 
 class Scratch(NamedTuple):
-    """A workspace: numbers of pairs (P,), and what belongs to one observation or to those of a unit."""
+    """A workspace for the pairs' numbers (P,), one observation, and the observations of a unit."""
 
     slot: IntArray
     jacobian: FloatArray
@@ -142,13 +132,13 @@ class Scratch(NamedTuple):
 
     @classmethod
     def of(cls, layout: Layout, pairs: int, width: int = 0) -> Scratch:
-        """Room for any unit, and rows of ``width`` columns."""
+        """A workspace for any unit, with rows of ``width`` columns."""
         n = 2 * layout.most_joined
         sizes = (16,), (layout.most_seen, 12), (layout.most_seen, 8), (n, n), (n,), (n,), (n, width)
         return cls(np.empty(pairs, dtype=np.int32), *(np.empty(size) for size in sizes))
 
 
-_WORTH_THREADS = 50_000  # below this many observations starting threads costs more than they save
+_WORTH_THREADS = 50_000  # fewer observations do not repay starting threads
 
 _granted: int | None = None
 
@@ -157,8 +147,8 @@ _granted: int | None = None
 def one_thread_in_torch(observations: int, alone: bool) -> Iterator[None]:
     """Within, torch computes on one thread, and kernels on as many as torch had.
 
-    Its products are small here, and threads that wait for each other cost more than they save. ``alone`` says
-    that torch has nothing large to do, whatever the number of ``observations``.
+    Products are small here, and waiting threads cost more than they save. ``alone`` states that torch has
+    nothing large to do, for any number of ``observations``.
     """
     global _granted
     before, granted = torch.get_num_threads(), _granted
@@ -175,7 +165,7 @@ def one_thread_in_torch(observations: int, alone: bool) -> Iterator[None]:
 
 
 def share(work: Callable[[int, int], None], chunks: int, observations: int) -> None:
-    """Call ``work(begin, end)`` for ranges that together are all ``chunks``."""
+    """Call ``work(begin, end)`` for ranges that partition the ``chunks``."""
     threads = min(_granted or torch.get_num_threads(), chunks)
     if threads <= 1 or observations < _WORTH_THREADS:
         work(0, chunks)
@@ -195,7 +185,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class Seen(NamedTuple):
-    """K observations, and the intrinsics of the cameras, as kernels read them."""
+    """K observations, and the cameras' intrinsics, as kernels read them."""
 
     camera: IntArray
     frame: IntArray
@@ -206,7 +196,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, columns: Iterable[NDArray[Any]], intrinsic: FloatArray) -> Seen:
-        """Of columns in this order, copied only where their kind or layout is another."""
+        """From columns in this order, copied only to change type or layout."""
         kinds = 3 * (np.int64,) + 3 * (np.float64,)
         both = zip((*columns, intrinsic), kinds, strict=True)
         made: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in both]
@@ -217,7 +207,7 @@ class Seen(NamedTuple):
 def first_unsound(
     seen: Seen, frames: int, symmetric_to: float, max_slope: float, by_corner: IntArray, by_camera: IntArray
 ) -> int:
-    """The first observation that is unsound, or -1; adds up how often each corner and camera is seen."""
+    """Index of the first unsound observation, or -1; counts the observations of each corner and camera."""
     for k in range(len(seen.camera)):
         c, n = seen.camera[k], seen.corner[k]
         if not (0 <= c < len(by_camera) and 0 <= seen.frame[k] < frames and 0 <= n < len(by_corner)):
@@ -248,7 +238,7 @@ def lay_out(
     measured: FloatArray,
     root: FloatArray,
 ) -> int:
-    """Write observations in an order (K,); returns a place there that repeats the one before, or -1."""
+    """Write observations in an order (K,); returns the position of a duplicate of the one before, or -1."""
     again = -1
     for i in range(len(order)):
         k = order[i]

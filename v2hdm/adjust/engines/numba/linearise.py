@@ -1,4 +1,4 @@
-"""Cost, gradient and Gauss-Newton blocks in one pass, corners eliminated unit by unit, and the frames."""
+"""One pass for cost, gradient and Gauss-Newton blocks, corners eliminated unit by unit, and the frames."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from v2hdm.records import FloatArray, IntArray
 
 
 class Linearisation(NamedTuple):
-    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks."""
+    """Output of :func:`linearise` for Q chunks; R counts the pairs of each chunk, summed over chunks."""
 
     costs: FloatArray  # (Q, 3) of observations, survey and known lengths
-    wrench: FloatArray  # (R, 6) the gradient by the pairs
-    coupled: FloatArray  # (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states
-    carried: FloatArray  # (Q, D) the same by the cameras' unknowns, where they have none
-    whitened: FloatArray  # (2 N,) the gradient by the corners, L^-1 g
-    own: FloatArray  # J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21)
-    tip: FloatArray  # (Q, D, D) B'B of the cameras' unknowns, its lower triangle
-    failed: FloatArray  # (Q,) units whose block has no factor
+    wrench: FloatArray  # (R, 6) gradient by the pairs
+    coupled: FloatArray  # (R, 6) W V^-1 times the gradient by corners, by pair, if frames have states
+    carried: FloatArray  # (Q, D) the same by the cameras' unknowns, if not
+    whitened: FloatArray  # (2 N,) L^-1 g, gradient by the corners
+    own: FloatArray  # J'J by pair (R, 21), or by camera (Q C, 21) where pairs move with it alone
+    tip: FloatArray  # (Q, D, D) B'B of the cameras' unknowns, lower triangle
+    failed: FloatArray  # (Q,) units whose block is singular
 
 
 @inlined
 def differentiate(
     layout: Layout, table: FloatArray, k: int, x: float, y: float, jacobian: FloatArray
 ) -> tuple[float, float, float, float, float]:
-    """Write the derivatives (16,) of observation k's residual, by pair and corner; it and its point."""
+    """Write the Jacobian (16,) of observation k by pair and corner; returns residual and point."""
     px, py, pz, inverse, slope, u, v = see(layout, table, k, x, y)
     a, b, c = layout.root[0, k], layout.root[1, k], layout.root[2, k]
     ad, bd, cd = a * inverse, b * inverse, c * inverse
@@ -63,7 +63,7 @@ def differentiate(
 
 @inlined
 def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None:
-    """Write W' of an observation, (12,), from its :func:`differentiate`, in row i of ``out``."""
+    """Write W' of an observation, (12,), from :func:`differentiate`, in row i of ``out``."""
     for p in range(6):
         top, low = weight * jacobian[p], weight * jacobian[6 + p]
         out[i, p] = jacobian[12] * top + jacobian[14] * low
@@ -74,7 +74,7 @@ def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None
 def add_camera(
     coupling: FloatArray, j: int, clock: FloatArray, t: int, each: int, rows: FloatArray, i: int, column: int
 ) -> None:
-    """Add W' in row j of ``coupling``, by pair t, to rows i, i + 1 at its camera's ``each`` unknowns."""
+    """Add W' in row j of ``coupling``, of pair t, to rows i, i + 1 at its camera's ``each`` unknowns."""
     for p in range(6):
         rows[i, column + p] += coupling[j, p]
         rows[i + 1, column + p] += coupling[j, 6 + p]
@@ -98,7 +98,7 @@ def _add_corner(
     total: float,
     product: float,
 ) -> tuple[float, float]:
-    """Add the observations of corner c, of a unit from ``first`` on, to gradients, blocks, rows and loss."""
+    """Add the observations of corner c to gradients, blocks, rows and loss; its unit begins at ``first``."""
     slot, jacobian, coupling, _, block, _, gradient, rows = scratch
     cameras, i = len(base.table) // layout.moments, 2 * (c - first)
     each, states = out.tip.shape[1] // cameras, len(base.rows) == 0
@@ -133,7 +133,7 @@ def _add_corner(
 
 @inlined
 def _add_square(jacobian: FloatArray, weight: float, own: FloatArray, owner: int) -> None:
-    """Add J'J of an observation by its pair, the upper triangle row by row, to row ``owner`` of ``own``."""
+    """Add J'J of an observation by its pair, upper triangle row by row, to row ``owner`` of ``own``."""
     m = 0
     for p in range(6):
         top, low = weight * jacobian[p], weight * jacobian[6 + p]
@@ -175,10 +175,10 @@ def linearise(
     scratch: Scratch,
     out: Linearisation,
 ) -> None:
-    """Linearise chunks ``begin`` to ``end``; factors and rows of ``base`` are written.
+    """Linearise chunks ``begin`` to ``end``, writing factors and rows of ``base``.
 
-    ``clock`` (P, 6 Q) are the pairs' left tangents by the clock offset of their camera; ``by_pair`` asks for
-    J'J by pair.
+    ``clock`` (P, 6 Q) are the pairs' left tangents by their camera's clock offsets; ``by_pair`` requests J'J
+    by pair.
     """
     states, width = len(base.rows) == 0, out.tip.shape[1]
     block, gradient, rows = scratch.block, scratch.gradient, scratch.rows
@@ -240,20 +240,19 @@ def _add_lengths(layout: Layout, u: int, corners: FloatArray, block: FloatArray)
 
 
 class TileMap(NamedTuple):
-    """Where the tiles of a :class:`~v2hdm.adjust.tiles.TiledMatrix` lie among its ``values``."""
+    """Positions of the tiles of a :class:`~v2hdm.adjust.tiles.TiledMatrix` among its ``values``."""
 
-    per_tile: int  # frames of a tile
-    size: int  # rows of a tile
-    position: IntArray  # (G,) of each tile along the route in the order of elimination
-    begin: IntArray  # (G,) the first tile of each column, that on the diagonal
-    # the row of each tile, G for the tip's, and where it lies
-    row: IntArray
+    per_tile: int  # frames per tile
+    size: int  # rows per tile
+    position: IntArray  # (G,) elimination order of each tile along the route
+    begin: IntArray  # (G,) diagonal tile of each column
+    row: IntArray  # of each tile, G for the tip's; its offset is ``at``
     at: IntArray
 
 
 @inlined
 def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
-    """List the tiles that unit u touches in order of elimination, with ``marks`` by tile; their number."""
+    """List the tiles of unit u in elimination order, with ``marks`` by tile; returns their number."""
     mark, place, touched = marks[0], marks[1], marks[2]
     count = 0
     for k in range(layout.begin[layout.unit[u]], layout.begin[layout.unit[u + 1]]):
@@ -276,7 +275,7 @@ def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
 def _subtract_products(
     begin: int, end: int, tiles: TileMap, marks: IntArray, count: int, rows: FloatArray, values: FloatArray
 ) -> None:
-    """Take B'B of a unit's ``rows`` (2g, ...) off the columns ``begin`` to ``end`` of its ``count`` tiles."""
+    """Subtract B'B of a unit's ``rows`` (2g, ...) in columns ``begin`` to ``end`` of its ``count`` tiles."""
     size, touched, low, high = tiles.size, marks[2], marks[3], marks[4]
     for a in range(count):
         column = tiles.position[touched[a]]
@@ -292,7 +291,7 @@ def _subtract_products(
                     x, y = rows[i, b * size + r], rows[i + 1, b * size + r]
                     if x == 0.0 and y == 0.0:
                         continue
-                    # Of a tile on the diagonal the lower triangle counts.
+                    # Diagonal tiles are lower triangular.
                     stop = r + 1 if a == b else high[a]
                     at, right = tiles.at[found] + r * size, a * size
                     out = values[at + low[a] : at + stop]
@@ -316,12 +315,12 @@ def subtract_frames(
     scratch: Scratch,
     values: FloatArray,
 ) -> None:
-    """Take B'B of all corners off the columns ``begin`` to ``end`` of the reduced system's ``values``.
+    """Subtract B'B of all corners from columns ``begin`` to ``end`` of the reduced system's ``values``.
 
-    Whoever takes off other columns, each tile's parts come in the same order. ``by_state`` (P, 6 S) and
-    ``clock`` (P, 6 Q) are the pairs' left tangents by the states of their frame and the clock offset of their
-    camera, of which ``each`` is the number of unknowns. ``marks`` (5, G + 1), -1 at first, is room to work
-    in; its last two rows are the columns of each touched tile, and of the tip behind them, that are not zero.
+    Every column is summed in the same order, for any division among threads. ``by_state`` (P, 6 S) and
+    ``clock`` (P, 6 Q) are the pairs' left tangents by frame states and clock offsets; a camera has ``each``
+    unknowns. ``marks`` (5, G + 1), initially -1, is scratch: its last two rows are the nonzero columns of
+    each touched tile and of the tip.
     """
     states, size = by_state.shape[1] // 6, tiles.size
     width = len(base.table) // layout.moments * each

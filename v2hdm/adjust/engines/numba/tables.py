@@ -1,8 +1,8 @@
-"""Closed forms for pairs and priors, which are few: an evaluation is no slower for them.
+"""Closed forms for pairs and priors, which are too few to matter for speed.
 
-With ``A = [r1 r2 t]`` of a pair's ``cam_from_map`` a corner l lies at p = A (l_x, l_y, 1) in the camera. A
-gradient of the cost by p is a force, so that of a pair by its left tangent is a *wrench*: the sums of the
-forces and of their moments p x force. Extrinsics, frame states and clock offsets act through pairs:
+With ``A = [r1 r2 t]`` of a pair's ``cam_from_map`` a corner l lies at p = A (l_x, l_y, 1) in the camera. The
+cost's gradient by p is a force; that by the pair's left tangent is a *wrench*, the sums of forces and of
+moments p x force. Extrinsics, frame states and clock offsets act through pairs:
 
 - a left perturbation of ``cam_from_vehicle`` is one of every pair of the camera;
 - ds in ``exp(-s)`` perturbs the pair by -Ad(cam_from_vehicle exp(-q v)) J_l(-s) ds;
@@ -65,7 +65,7 @@ def _series(terms: FloatArray, column: int, x: float) -> float:
 
 @inlined
 def _hat(out: FloatArray, i: int, j: int, x: float, y: float, z: float) -> None:
-    """Write the skew matrix of a vector from row i and column j on."""
+    """Write the skew matrix of a vector at row i and column j."""
     out[i, j], out[i, j + 1], out[i, j + 2] = 0.0, -z, y
     out[i + 1, j], out[i + 1, j + 1], out[i + 1, j + 2] = z, 0.0, -x
     out[i + 2, j], out[i + 2, j + 1], out[i + 2, j + 2] = -y, x, 0.0
@@ -139,7 +139,7 @@ def _adjoint(dst_from_src: Tensor) -> Tensor:
 
 
 def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
-    """Cameras from where the vehicle is at each frame's stated time, (C, M or 1, 4, 4)."""
+    """Poses T exp(-q v) of the cameras from the vehicle at each frame's stamp, (C, M or 1, 4, 4)."""
     cam_from_vehicle = estimate.cam_from_vehicle[:, None]
     return cam_from_vehicle @ _exp(-moved(arrays, estimate.clock_s)) if arrays.moves else cam_from_vehicle
 
@@ -155,7 +155,7 @@ def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
 
 
 def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
-    """How pairs move with frame states and clock offsets."""
+    """Jacobians of the pairs by frame states and clock offsets."""
     state = clock = arrays.centre.new_zeros(arrays.camera_count, arrays.moment_count, 6, 0)
     if arrays.states:
         tangent = -frame_tangent(arrays, estimate.frame_state)
@@ -174,9 +174,9 @@ def _half_square(residual: Tensor) -> float:
 def with_priors(
     arrays: Arrays, estimate: Estimate, spread: Spread, costs: FloatArray, wrench: Tensor
 ) -> tuple[dict[str, float], Gradient]:
-    """The cost by name and its gradient; by corners, where it is whitened already, (0, 2).
+    """The cost by name, and its gradient; that by corners, already whitened, is (0, 2).
 
-    ``costs`` (3,) are of observations, survey and known lengths, ``wrench`` (C, M, 6) the observations'
+    ``costs`` (3,) are of observations, survey and known lengths, ``wrench`` (C, M, 6) is the observations'
     gradient by the pairs' left tangents.
     """
     cameras, centre_root = estimate.cam_from_vehicle.numpy(), arrays.centre_information_root.numpy()
@@ -194,7 +194,7 @@ def with_priors(
     gathered = spread.gather(wrench)
     by_corner = state.new_empty(0, 2)
     gradient = Gradient(gathered.camera[:, :6], gathered.frame_state, by_corner, gathered.camera[:, 6:])
-    # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
+    # A left perturbation moves the centre by minus its translation in vehicle axes.
     by_centre = (centre * centre_root)[..., None]
     gradient.extrinsic.numpy()[:, :3] -= (cameras[:, :3, :3] @ by_centre)[..., 0]
     if arrays.states:
@@ -207,7 +207,7 @@ def with_priors(
 
 
 def prior_blocks_of(arrays: Arrays, estimate: Estimate) -> PriorBlocks:
-    """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
+    """Gauss-Newton Hessian of the priors by the reduced unknowns."""
     count, each = arrays.camera_count, arrays.camera_unknowns
     by_camera = np.zeros((count, each, count, each))
     root, clock_root = arrays.centre_information_root.numpy(), arrays.clock_information_root.numpy()
