@@ -1,4 +1,4 @@
-"""Where things lie that may be markings, and how often they were seen: the data of the site model."""
+"""Positions of possible markings and counts of their sightings: the data of the site model."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.planar import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_UNSEEN_M2 = 1e4  # variance of a corner that was not seen, m^2: infinite beside the size of a site
+_UNSEEN_M2 = 1e4  # variance of an unseen corner, m^2: effectively infinite at the size of a site
 
-# Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too small.
-CORRELATION = 0.2
+CORRELATION = 0.2  # of a corner's errors between images; .3 overstates sides' sigmas, .1 understates corners'
 
-_KNOWN_SIGMA_M = 0.5  # sigma, m, below which a corner counts as known: a fraction of any marking's length
+_KNOWN_SIGMA_M = 0.5  # largest sigma, m, of a known corner: a fraction of any marking's length
 
 TOO_UNCERTAIN, LACKS_A_CORNER = "its position is too uncertain", "a corner was never seen twice"
 
 _OTHER_EDGE_M = 0.3
-"""Sigma, m, of where a sighting sees an edge of the same marking that others do not: a worn end's, as in the
-posterior; what lies farther off is of something else."""
+"""Sigma, m, of a sighting's edge, such as a worn end's, about where others see it; beyond lies something
+else."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Corners (G, 4, 2), m, and joint covariances (G, 8, 8), m^2; of unseen ones :data:`_UNSEEN_M2`."""
+    """Corners (G, 4, 2), m, and joint covariances (G, 8, 8), m^2; :data:`_UNSEEN_M2` for unseen corners."""
 
     corners_map: FloatArray
     covariance_m2: FloatArray
@@ -37,7 +36,7 @@ class Candidates:
     def seen(
         cls, corners_map: FloatArray, covariance_m2: FloatArray, about: FloatArray | float = 0.0
     ) -> Candidates:
-        """Candidates of corners and covariances that are nan if unseen; ``about`` (G, 2) without any."""
+        """Candidates of corners and covariances, nan if unseen, ``about`` (G, 2) if all are."""
         unseen = np.isnan(corners_map[..., 0]) | np.isnan(corners_map[..., 1])
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
@@ -55,32 +54,32 @@ class Candidates:
 
     @property
     def sigma_m(self) -> FloatArray:
-        """Standard deviation (G, 4) of each corner, both directions together."""
+        """Standard deviation (G, 4) of each corner over both directions."""
         variance = np.diagonal(self.covariance_m2, axis1=1, axis2=2).reshape(-1, 4, 2)
         return np.asarray(np.sqrt(variance.sum(axis=2)))
 
     def along(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Covariances (G,) of what moves along two directions (G, 8) each."""
+        """Covariances (G,) of motions along two directions (G, 8) each."""
         return np.asarray(np.einsum("ni,nij,nj->n", first, self.covariance_m2, second))
 
     @property
     def known(self) -> BoolArray:
-        """Which corners (G, 4) were seen as points."""
+        """Corners (G, 4) known as points."""
         return np.asarray(self.sigma_m < _KNOWN_SIGMA_M)
 
 
 @dataclass(frozen=True)
 class Counts:
-    """How often G candidates were seen, each (G,)."""
+    """Counts of the sightings of G candidates, (G,) each."""
 
     images: IntArray  # with accepted observations
-    observations: IntArray  # of corners
-    agreeing: IntArray  # of these, with the solution
-    log_odds: FloatArray  # mean of the detector's, of these
-    easy_views: IntArray  # images with the whole candidate in easy view
-    found: IntArray  # of these, where it was found
-    pointed: IntArray  # (G, 4) of these, where each corner is a point that agrees
-    as_symbol: IntArray  # images in which a symbol lies on it, or a solid line goes on behind it
+    observations: IntArray  # corner observations
+    agreeing: IntArray  # of these, consistent with the solution
+    log_odds: FloatArray  # the detector's mean log-odds over these
+    easy_views: IntArray  # images with an unobstructed view of the whole candidate
+    found: IntArray  # of these, with a detection
+    pointed: IntArray  # (G, 4) of these, with the corner as a consistent point
+    as_symbol: IntArray  # images with a symbol on it, or a solid line that continues it
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
         """The candidates at ``rows``."""
@@ -98,14 +97,14 @@ def with_dissent(
 ) -> Candidates:
     """The candidates (G,), less certain where sightings contradict what ``fused`` ones agree on.
 
-    The joint solution rejected R corners: the ``corner`` (R,) of candidate ``group`` (R,), which sighting
-    ``row`` (R,) saw at ``seen_map`` (R, 2), m, of the covariance ``covariance_m2`` (R, 2, 2). Either is right
-    in proportion to its information, since images of one view err alike; a mixture of two places has the
-    variance p (1 - p) of their distance squared. Corners of one sighting go together.
+    The joint solution rejected R corners: ``corner`` (R,) of candidate ``group`` (R,), which sighting ``row``
+    (R,) saw at ``seen_map`` (R, 2), m, with ``covariance_m2`` (R, 2, 2). Images of one view share errors, so
+    either is right with a probability p in proportion to its information; the mixture adds the variance p
+    (1 - p) of their squared distance. Corners of one sighting are treated jointly.
     """
     off = seen_map - candidates.corners_map[group, corner]
     away_m = np.linalg.norm(off, axis=1)
-    # x' C^-1 x is the information along the line between both places, times its length squared.
+    # x' C^-1 x is the information along the line between both positions, times the squared length.
     agreed = fused.covariance_m2[group, corner]
     usable = fused.valid[group, corner] & (away_m < 3 * _OTHER_EDGE_M)
     usable &= np.isfinite(covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
@@ -123,34 +122,33 @@ def with_dissent(
 
 
 def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: FloatArray) -> Candidates:
-    """The solved candidates (G,), with the errors that all images of a corner share, as of a worn end.
+    """The solved candidates (G,), plus errors common to all images of a corner, as of a worn end.
 
-    Of errors that are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey
-    Sampling, 1965): about r times a single image's, as in ``fused``. ``scatter`` (G, 4) makes a corner less
-    known.
+    With correlation r, the mean of n images has the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
+    1965): about r times a single image's, as in ``fused``. ``scatter`` (G, 4) inflates a corner's variance.
     """
     seen = np.maximum(fused.seen, 1)
     share = scatter - 1 + CORRELATION * seen * scatter
     unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))
     shared = np.where(unseen[..., None, None], 0.0, share[..., None, None] * fused.covariance_m2)
-    # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
+    # Images that are cut alike share one error: their number does not locate the corner.
     no_point = (fused.seen == 0) & ~unseen
     shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
 
 
-_LARGEST = 1e9  # variance of residuals, squared sigmas, beyond which (and below whose inverse) all are alike
+_LARGEST = 1e9  # of residual variances, squared sigmas: beyond it, and below its inverse, all are equal
 
 _PRIOR_FREEDOM = (1.0, 1e4)
-"""Between these is the freedom of the prior of a variance: from tails as heavy as Cauchy's to none."""
+"""Limits of the prior's degrees of freedom for a variance: from tails as heavy as Cauchy's to none."""
 
-_LEAST_TO_COMPARE = 3  # variances from which they have a spread
+_LEAST_TO_COMPARE = 3  # least number of variances with a spread
 
 
 def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, float]:
-    """Scale and freedom of the inverse-gamma prior of variances (M,), each estimated with ``freedom`` (M,).
+    """Scale and degrees of freedom of the inverse-gamma prior of variances (M,) with ``freedom`` (M,).
 
-    By moments of their logarithms (Smyth, 2004, section 6.2); of fewer than three nothing is known.
+    By moments of their logarithms (Smyth, 2004, section 6.2); fewer than three are uninformative.
     """
     if len(variance) < _LEAST_TO_COMPARE:
         return _LARGEST, _PRIOR_FREEDOM[1]
@@ -163,7 +161,7 @@ def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, fl
 
 
 def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
-    """How many times the usual the variance (G, 4) of corners' images is, at least once, by all corners'."""
+    """Variance inflation (G, 4) of corners' images relative to the usual, at least 1; all are shrunk."""
     known = freedom > 0
     squared = np.minimum(squared, _LARGEST * np.maximum(freedom, 1.0))  # infinite in the camera's plane
     scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])

@@ -1,9 +1,9 @@
-"""An earlier map brought up to date by a new drive: ids stay, what changed is listed with its evidence.
+"""Update of an earlier map by a new drive: ids persist, changes are listed with their evidence.
 
-Corners that both maps have are estimated anew from both. Given the errors that markings share
-(:mod:`v2hdm.site.map_errors`), each is a mean of two by its own errors alone; what both maps have in common
-tells the shared ones. So a drift of one map counts once, however many markings it moved, and what only one
-map has is shifted along with its surroundings.
+Corners in both maps are re-estimated from both. Given the errors common to markings
+(:mod:`v2hdm.site.map_errors`), each is the mean of two under their own errors; the common ones follow from
+the differences of all. So one map's drift counts once, however many markings it moved, and what one map alone
+has moves with its surroundings.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from v2hdm.site.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_s
 
 
 def fused(old: Marking, new: Marking, turn: int, pair: int, shift: Shift) -> Marking:
-    """A marking that both maps have: the old one's id and order of corners, both maps' sightings."""
+    """A marking in both maps, with the old one's id and order of corners, and the sightings of both."""
     of_old, of_new = shift.of_old.own_m2[shift.old[pair]], shift.of_new.own_m2[shift.new[pair]]
     order = SHIFTS[turn]
     rows = (2 * order[:, None] + np.arange(2)).ravel()
@@ -44,13 +44,13 @@ def fused(old: Marking, new: Marking, turn: int, pair: int, shift: Shift) -> Mar
         corners_map=(parts[0] + parts[1]).reshape(4, 2),
         sightings=old.sightings + new.sightings,
         covariance_m2=(covariance + covariance.T) / 2,
-        # The standard deviation of a coordinate of the centre by the marking's own errors.
+        # Standard deviation of a coordinate of the centre from the marking's own errors.
         relative_sigma_m=float(np.sqrt(np.einsum("iaja->", own.reshape(4, 2, 4, 2)) / 32)),
     )
 
 
 def shifted_with(markings: Sequence[Marking], errors: Errors, of_old: bool, shift: Shift) -> list[Marking]:
-    """Markings that one map alone has, moved by the error that it shares with those which both have."""
+    """Markings in one map alone, corrected by the estimated common error of their surroundings."""
     at = shift.of_old_at if of_old else shift.of_new_at
     mean, spread = at(errors.centres_map, errors.shared_m2)
     covariance = errors.own_m2 + SHIFT @ spread @ SHIFT.T
@@ -63,7 +63,7 @@ def shifted_with(markings: Sequence[Marking], errors: Errors, of_old: bool, shif
 def fused_markings(
     old: Sequence[Marking], new: Sequence[Marking], decision: Decision
 ) -> tuple[dict[int, Marking], dict[int, Marking]]:
-    """The markings as they are now: by old one all that there were, by new one those without a partner."""
+    """The updated markings, by old one and, for those without a partner, by new one."""
     shift = decision.shift
     by_old = dict(enumerate(shifted_with(old, shift.of_old, True, shift)))
     by_new = dict(enumerate(shifted_with(new, shift.of_new, False, shift)))
@@ -74,7 +74,7 @@ def fused_markings(
         if both is not None:
             by_old[pair.old] = fused(old[pair.old], new[pair.new], pair.turn, both, shift)
         else:
-            # It was painted elsewhere: where the new map has it, under the old one's id.
+            # Repainted elsewhere: at the new map's position, under the old id.
             order = SHIFTS[pair.turn]
             rows, covariance = (2 * order[:, None] + np.arange(2)).ravel(), moved.covariance_m2
             by_old[pair.old] = replace(
@@ -87,32 +87,32 @@ def fused_markings(
     return by_old, by_new
 
 
-_DRIFT_OVER_M = 30.0  # distance over which the error that markings share fades, m, where the map does not say
+_DRIFT_OVER_M = 30.0  # correlation length of markings' common error, m, if the map does not state it
 
-_LIKELY = 0.5  # probability from which a marking is reported as moved, gone or new: the likelier of two
+_LIKELY = 0.5  # probability at which a marking is reported as moved, gone or new
 
-_LEAST_PAIRED = 0.3  # least share of the markings looked at that a drive finds again, if the site is the same
+_LEAST_PAIRED = 0.3  # least fraction of inspected markings that a drive of the same site finds again
 
-_LOOKED = 3  # easy views from which a drive has looked at a place for that share
+_LOOKED = 3  # easy views of a place that count as an inspection for that fraction
 
 
 @dataclass(frozen=True)
 class Base:
-    """An earlier map, with ids, and from where its drives looked."""
+    """An earlier map with ids, and the poses of its drives."""
 
     hd_map: HdMap
-    poses: FloatArray  # (F, 4, 4) of its images, (0, 4, 4) where not known
-    left_out: tuple[tuple[str, FloatArray, int], ...] = ()  # class, place (2,), sightings of candidates
+    poses: FloatArray  # (F, 4, 4) of its images, (0, 4, 4) if unknown
+    left_out: tuple[tuple[str, FloatArray, int], ...] = ()  # class, position (2,), sightings of candidates
 
 
 def update_map(
     base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
 ) -> tuple[HdMap, Changes, IntArray, IntArray]:
-    """Bring the ``base`` map up to date with ``made``, the new drive's own map, in the same frame.
+    """Update the ``base`` map with ``made``, the new drive's own map in the same frame.
 
-    Returns it, what changed, the ids in it of the M markings of ``made`` (M,), 0 for none, and where each
-    corner (M, 4) stands in its order. ``mapped`` (S,) are the sightings of ``made``, ``drift_over_m`` is the
-    way over which the poses' error fades. Raises MappingError where the drive finds too little of the map
+    Returns the map, the changes, the ids in it of the M markings of ``made`` (M,), 0 for none, and their
+    corners' positions (M, 4) in its order. ``mapped`` (S,) are sightings of ``made``, ``drift_over_m`` is the
+    correlation length of the poses' error. Raises MappingError if the drive finds too little of the map
     again.
     """
     old, new = base.hd_map.markings, made.markings
@@ -133,7 +133,7 @@ def update_map(
     )
     _check_site(decision, now, len(old))
     by_old, by_new = fused_markings(old, new, decision)
-    # Ids that no feature of the map has or ever had.
+    # Ids that no feature of the map has, or ever had.
     known = [one.id or 0 for some in (old, base.hd_map.lanes, base.hd_map.symbols) for one in some]
     number = itertools.count(1 + max([base.hd_map.largest_id, *known])).__next__
     fresh = {k: replace(one, id=number()) for k, one in by_new.items()}
@@ -159,7 +159,7 @@ def update_map(
 
 
 def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Looks:
-    """How often the earlier drive looked at ``places``, as often as the new one's cameras at its poses."""
+    """Looks of the earlier drive at ``places``, assuming the new drive's cameras at its poses."""
     poses, count = base.poses, len(observer.cameras)
     views = Views(
         image=np.arange(count * len(poses)),
@@ -180,7 +180,7 @@ def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Look
 
 
 def _check_site(decision: Decision, now: Looks, count: int) -> None:
-    """Refuse a map of which the drive finds nearly nothing where it looked."""
+    """Reject a map of which the drive finds nearly nothing where it looked."""
     paired = np.zeros(count, dtype=bool)
     paired[[pair.old for pair in decision.pairs if pair.moved <= _LIKELY]] = True
     looked = (now.views >= _LOOKED) | paired
@@ -199,7 +199,7 @@ def _changes(
     now: Looks,
     before: Looks,
 ) -> list[Change]:
-    """The markings that moved, are missing or are new, by the looks at the old places and at the new."""
+    """Moved, missing and new markings, from the looks at old and new places."""
     shift, out = decision.shift, []
     for pair in decision.pairs:
         if pair.moved <= _LIKELY:

@@ -1,4 +1,4 @@
-"""A person's word on candidates: it counts before all that images say, but for where other corners lie."""
+"""A person's corrections of candidates: they override the images, except on the position of other corners."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
 from v2hdm.records import Exclusion, FloatArray, HdMap, IntArray
 from v2hdm.site.candidates import Candidates
 
-_SAME_M = 0.4  # how far the middle of a candidate may be from that which a person saw, m
-MAX_OVERLAP = 0.2  # share of the smaller area from which two outlines are of one paint: none overlap
+_SAME_M = 0.4  # largest distance, m, between a candidate's centre and the one that a person corrected
+MAX_OVERLAP = 0.2  # overlap of outlines, relative to the smaller, from which they are one paint
 
 
 @dataclass(frozen=True)
 class Stated:
-    """Corrections by candidate: ``rejected`` with their reasons, ``kept`` with the one that says so."""
+    """Corrections by candidate: ``rejected`` with reasons, ``kept`` with the correction."""
 
     rejected: dict[int, str]
     kept: dict[int, Correction]
 
     @classmethod
     def of(cls, corrections: Sequence[Correction], corners_map: FloatArray, kinds: Sequence[str]) -> Stated:
-        """The corrections of candidates (G, 4, 2), of the nearest, its class first; all on rejected paint."""
+        """Corrections of the nearest candidates (G, 4, 2), own class first; rejections are of all there."""
         rejected: dict[int, str] = {}
         kept: dict[int, Correction] = {}
         for one in corrections:
@@ -40,11 +40,11 @@ class Stated:
         return cls({group: why for group, why in rejected.items() if group not in kept}, kept)
 
     def placed(self, candidates: Candidates, uncorrected: Candidates) -> Candidates:
-        """The candidates with the corners that a person has moved.
+        """The candidates with the corners that a person moved.
 
-        The other corners of the ``uncorrected`` ones say how the map has shifted since the person saw it. A
-        corner was placed beside the others of its marking, so it has their error in common, and its own
-        sigma: a shift of the whole map does not make it less, nor do many of them make the map more certain.
+        The other corners of the ``uncorrected`` ones give the map's shift since the correction. A corner
+        placed beside others of its marking has their common error and its own sigma: a shift of the whole map
+        does not reduce its weight, nor do many corrections make the map more precise.
         """
         corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
         for group, one in self.kept.items():
@@ -71,12 +71,12 @@ class Stated:
 
 
 def reason_of(one: Correction) -> str:
-    """Why a marking that a person has rejected is not in the map."""
+    """The reason for a marking that a person rejected."""
     return "rejected by a person" + (f": {one.reason}" if one.reason else "")
 
 
 def _same(one: Correction, corners_map: FloatArray) -> IntArray:
-    """The candidates that are the paint that a person saw."""
+    """The candidates on the paint that a person corrected."""
     outline = np.array(one.outline_map)
     away_m = np.linalg.norm(corners_map.mean(axis=1) - outline.mean(axis=0), axis=1)
     if len(outline) != 4:
@@ -87,7 +87,7 @@ def _same(one: Correction, corners_map: FloatArray) -> IntArray:
 
 
 def overlap(a: FloatArray, b: FloatArray) -> float:
-    """Common area of two convex quadrilaterals as a share of the smaller one's."""
+    """Common area of two convex quadrilaterals, relative to the smaller."""
     common = abs(float(signed_area(clip_convex(a, b))))
     return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)
 
@@ -95,7 +95,7 @@ def overlap(a: FloatArray, b: FloatArray) -> float:
 def with_symbols_corrected(
     hd_map: HdMap, corrections: Sequence[Correction]
 ) -> tuple[HdMap, tuple[Exclusion, ...]]:
-    """The map with what a person says of its symbols, and those that this rejects."""
+    """The map with a person's corrections to its symbols, and the rejected symbols."""
     kept, out = [], []
     for symbol in hd_map.symbols:
         middle = symbol.outline_map.mean(axis=0)
@@ -113,7 +113,7 @@ def with_symbols_corrected(
 
 
 def unmet(corrections: Sequence[Correction], hd_map: HdMap) -> list[str]:
-    """The corrections that a finished map does not show: nothing was found where they are."""
+    """Corrections that found nothing at their position in a finished map."""
     corners = np.array([one.corners_map for one in hd_map.markings]).reshape(-1, 4, 2)
     missing = []
     for one in corrections:

@@ -1,9 +1,8 @@
-"""Which marking of a new map is which of an old one: the likeliest of all that may have happened to them.
+"""The most likely assignment of a new map's markings to an old one's, and their fates.
 
-An old marking was seen where it was, or elsewhere because it was painted anew there, or not: it is gone, no
-image showed its place, or it was missed. A new one that is none of the old is new paint, or was missed
-before. How often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
-prior), and one assignment makes all of it as likely as can be.
+An old marking was found again, in place or repainted elsewhere, or is gone, out of every image's view, or was
+missed. A new marking without an old one is new paint, or was missed before. The rates are learned from the
+pair of maps (expectation maximisation with a Dirichlet prior); one assignment maximises the joint likelihood.
 """
 
 from __future__ import annotations
@@ -22,41 +21,41 @@ from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions
 
-_MOVED_SIGMA_M = 0.5  # sigma of how far a marking is painted from its old place, m a coordinate: a new line
+_MOVED_SIGMA_M = 0.5  # per coordinate, m, of a repainted marking about its old place: a new line
 
-_TURNED_SIGMA_RAD = 0.2  # sigma of how far it is turned then, rad
-_REACH_M = 4 * _MOVED_SIGMA_M  # markings farther apart are never one, m
+_TURNED_SIGMA_RAD = 0.2  # of its rotation, rad
+_REACH_M = 4 * _MOVED_SIGMA_M  # largest distance of one marking in both maps, m
 _OTHER_SHAPE_M = 0.1
-"""Sigma by which corners of two markings of one class differ, m: two shapes, or two lengths of one line."""
+"""Standard deviation, m, of corners between two markings of a class: two shapes, or two lengths."""
 
-_MISREAD_M = 0.3  # sigma of an end or corner that one of two drives took from another edge, m
+_MISREAD_M = 0.3  # standard deviation, m, of an end or corner that one drive took from another edge
 
-_MISREAD_SHARE = 0.05  # share of markings of which one of two drives has misread an end or a corner
+_MISREAD_SHARE = 0.05  # fraction of markings with an end or corner that one of two drives misread
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
-"""Dirichlet prior: of fifty markings about so many stay, are painted elsewhere, are gone."""
+"""Dirichlet prior: of fifty markings, the numbers that stay, are repainted elsewhere, are gone."""
 
-_PRIOR_NEW = (1.0, 50.0)  # Gamma prior: one new marking where there were fifty
-_PASSES = 4  # rounds of shift, odds and assignment; the assignment settles within three
+_PRIOR_NEW = (1.0, 50.0)  # Gamma prior: one new marking per fifty old ones
+_PASSES = 4  # of shift, odds and assignment; the assignment settles within three
 
 STAYED, MOVED = range(2)
 
 
 @dataclass(frozen=True)
 class Watched:
-    """Log likelihoods (N,) of images of places where the map has nothing, if there is a marking, if not."""
+    """Log-likelihoods (N,) of the images of unmapped places, with and without a marking there."""
 
     there: FloatArray
     bare: FloatArray
 
     @classmethod
     def never(cls, count: int) -> Watched:
-        """Of places that no image shows."""
+        """For places in no image."""
         return cls(np.zeros(count), np.zeros(count))
 
 
 @dataclass(frozen=True)
 class Pair:
-    """An old and a new marking that are one, corner c (c + ``turn``) mod 4, ``moved`` by probability."""
+    """An old and a new marking that are one; corner c is (c + ``turn``) mod 4; probability of ``moved``."""
 
     old: int
     new: int
@@ -68,23 +67,23 @@ class Pair:
 class Decision:
     """The fates of the markings."""
 
-    pairs: tuple[Pair, ...]  # seen again
-    gone: dict[int, float]  # probability, by old marking not seen again
-    fresh: dict[int, float]  # that a new marking without partner is new paint
-    shift: Shift  # how the maps lie to each other
+    pairs: tuple[Pair, ...]  # found again
+    gone: dict[int, float]  # probability, by old marking not found again
+    fresh: dict[int, float]  # probability of new paint, by new marking without partner
+    shift: Shift  # relative shift of the maps
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off."""
+    """P pairs of markings that may be one: indices, the new one's turn, and differences of corners."""
 
     old: IntArray
     new: IntArray
     turn: IntArray
     off: FloatArray  # (P, 8) m
-    noise: FloatArray  # (P, 8, 8) m^2, of both
-    basis: FloatArray  # (P, 8, 8) rows of two shifts, the turn and five deformations
-    arm_m: FloatArray  # (P,) how often the turn counts
+    noise: FloatArray  # (P, 8, 8) m^2, of both markings
+    basis: FloatArray  # (P, 8, 8) rows: two of translation, one of rotation, five deformations
+    arm_m: FloatArray  # (P,) scale of the rotation
 
     def __len__(self) -> int:
         return len(self.old)
@@ -92,7 +91,7 @@ class _Candidates:
 
 @dataclass(frozen=True)
 class _Rates:
-    """Log probabilities of an old marking's fate, and log densities per m^2 of new and of older paint."""
+    """Log probabilities of an old marking's fates, and log densities per m^2 of new and of older paint."""
 
     stayed: float
     moved: float
@@ -110,10 +109,10 @@ def decide(
     watched_now: Watched,
     watched_before: Watched,
 ) -> Decision:
-    """Decide what became of ``old`` markings of an earlier map, and what the ``new`` ones of a drive are.
+    """Decide the fates of the ``old`` markings of an earlier map and of a drive's ``new`` ones.
 
-    ``watched_now`` is how often the new drive looked at the old markings that it has not mapped,
-    ``watched_before`` the earlier drive at the places of the new ones.
+    ``watched_now`` are the new drive's looks at unmapped old markings, ``watched_before`` the earlier drive's
+    at the places of new ones.
     """
     candidates = _candidates(old, new, of_old, of_new)
     shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))
@@ -149,9 +148,9 @@ def decide(
 
 
 def _rates(counts: FloatArray, new: tuple[float, float]) -> _Rates:
-    """Rates by how often each fate was met, with ``new`` markings for so many old ones."""
+    """Rates from the ``counts`` of the fates, and ``new`` markings per number of old ones."""
     stayed, moved, gone = np.log(counts / counts.sum())
-    # Of the paint within the reach of an old marking about one is older: that much ground counts for each.
+    # About one older marking lies within reach of an old one: its density over that area.
     older = -float(np.log(np.pi * _REACH_M**2))
     return _Rates(stayed, moved, gone, float(np.log1p(-np.exp(gone))), older + np.log(new[0] / new[1]), older)
 
@@ -180,7 +179,7 @@ def _candidates(
 
 
 def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntArray) -> Shift:
-    """How the maps lie to each other, by the candidates ``stayed``."""
+    """Relative shift of the maps from the candidates ``stayed``."""
     information = np.linalg.inv(candidates.noise[stayed])
     common = SHIFT.T @ information @ SHIFT
     pulled = SHIFT.T @ information @ candidates.off[stayed][..., None]
@@ -191,7 +190,7 @@ def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntA
 
 
 def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates: _Rates) -> FloatArray:
-    """Log likelihood (P, 2) of each candidate pair having stayed or moved, its prior included."""
+    """Log-likelihood (P, 2) of each candidate pair having stayed or moved, prior included."""
     of_pair = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(shift.old, shift.new, strict=True))}
     out = np.empty((len(candidates), 2))
     for p in range(len(candidates)):
@@ -200,7 +199,7 @@ def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates:
         mean, spread = shift.at(old, new) if own is None else shift.without_itself(own)
         off = candidates.basis[p] @ (candidates.off[p] - SHIFT @ mean)
         noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
-        # In the basis a shift counts twice its length, a turn by its arm.
+        # In this basis a shift counts twice its length, a rotation its arm.
         free = np.zeros(8)
         free[:2], free[2] = (2 * _MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * _TURNED_SIGMA_RAD) ** 2
         out[p, STAYED] = rates.stayed + _read(off, noise)
@@ -209,7 +208,7 @@ def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates:
 
 
 def _read(off: FloatArray, noise: FloatArray) -> float:
-    """Log likelihood of a deviation (8,), of which an end or corner may have been misread."""
+    """Log-likelihood of a deviation (8,) with a possible misread end or corner."""
     plain = np.log1p(-_MISREAD_SHARE) + _normal(off, noise)
     misread = noise + np.diag(np.repeat([0.0, _MISREAD_M**2], [3, 5]))
     return float(np.logaddexp(plain, np.log(_MISREAD_SHARE) + _normal(off, misread)))
@@ -222,7 +221,7 @@ def _normal(off: FloatArray, covariance: FloatArray) -> float:
 
 
 def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
-    """Log density (P,) of each pair's new marking, in its basis, if it is another one anywhere."""
+    """Log density (P,) of each pair's new marking, in its basis, as an unrelated marking."""
     off = (candidates.basis @ candidates.off[..., None])[..., 0]
     noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
     noise = noise[:, 3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5)
@@ -231,13 +230,13 @@ def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
 
 
 def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
-    """The candidates that together have the largest score; each marking is in one of them at most."""
+    """Candidates with the largest total score; each marking is in at most one."""
     better = np.flatnonzero(score > 0)
     if not len(better):
         return better
     old, row = np.unique(candidates.old[better], return_inverse=True)
     new, column = np.unique(candidates.new[better], return_inverse=True)
-    # An old marking that stays alone takes a column of its own.
+    # A dummy column per old marking lets it stay unassigned.
     alone, most = np.arange(len(old)), 1.0 + score[better].max()
     cost = np.append(most - score[better], np.full(len(old), most))
     places = np.append(row, alone), np.append(column, len(new) + alone)

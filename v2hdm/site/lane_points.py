@@ -1,8 +1,8 @@
-"""Detected lane paint as a cloud of directed points on the ground, and the nodes on its ridges.
+"""Detected lane paint as a cloud of directed ground points, and nodes on its ridges.
 
-Seeds spread over the cloud are moved across their line onto the local regression line of the points around
-them, a mean shift that is one-dimensional because every point carries its direction; points of a crossing or
-a parallel line take no part. The rest is thinned to single nodes, half a metre apart.
+Seeds over the cloud move across their line onto the local regression line of the points around them: a mean
+shift in one dimension, as every point has a direction and points of crossing or parallel lines are excluded.
+They are then thinned to single nodes, half a metre apart.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from v2hdm.records import (
 )
 
 NODE_SPACING_M = 0.5  # between the vertices of a polyline
-HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # across and along a line, of the neighbourhood that is averaged
+HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # half size across and along a line of the averaged neighbourhood
 
-CENTRE_SIGMA_PX = 1.0  # noise of a detected centre point across its line: a cell of the network's output
+CENTRE_SIGMA_PX = 1.0  # noise of a detected centre across its line: a cell of the network's output
 
-OWN_SIGMA_M = 0.01  # sigma of a point beyond its pixel's, m: the nearest image must not outvote all others
+OWN_SIGMA_M = 0.01  # sigma, m, besides pixel noise: the nearest image must not outvote all others
 
-_TANGENT_REACH = 2  # points to either side whose difference gives a point's direction
-_GUIDE_RANGE = 1.8  # whole lines are followed so many times farther than paint: they only say what is one
+_TANGENT_REACH = 2  # points to either side whose difference gives the direction
+_GUIDE_RANGE = 1.8  # range of whole lines relative to paint's: they only show what is one line
 
 
 @dataclass(frozen=True)
 class Guides:
-    """Whole lines as single images saw them, gaps included: points (G, 2), m, their lines and images."""
+    """Whole lines of single images, gaps included: points (G, 2), m, line and image indices."""
 
     points_map: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -56,33 +56,31 @@ class LaneCloud:
     """P points on lane paint."""
 
     points_map: FloatArray  # (P, 2) m
-    tangent: FloatArray  # (P, 2) unit, of either sense
+    tangent: FloatArray  # (P, 2) unit, of either sign
     weight: FloatArray  # (P,) 1 / variance across the line, 1 / m^2
-    image: IntArray  # (P,) that it was seen in
-    dash: BoolArray  # (P,) its detection was one
+    image: IntArray  # (P,) image index
+    dash: BoolArray  # (P,) whether detected as a dash
     guides: Guides = field(default_factory=Guides)
     points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (P, 2) pinhole
     row_share: FloatArray = field(default_factory=lambda: np.zeros(0))
-    # (P, 2, 2) of a point by its pixel
-    jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (P, 2, 2) by pixel
 
 
 @dataclass(frozen=True)
 class ImageGround:
-    """How each image of a drive maps to the ground; nan for images of cameras that are not used."""
+    """Ground mapping of each image of a drive; nan for unused cameras."""
 
     map_from_pinhole_px: FloatArray  # (I, 3, 3)
     centre_map: FloatArray  # (I, 3) of the camera
-    # (I, 2, 3) from (x, y, 1) to its motion with the vehicle during read-out, if any
-    moved_map: FloatArray | None = None
-    # moves pinhole px (P, 2) of images (P,) to where z = 0 would show the same
+    moved_map: FloatArray | None = None  # (I, 2, 3) from (x, y, 1) to its motion during read-out
+    # moves pinhole px (P, 2) of images (P,) to those of the plane z = 0
     flattened_px: Callable[[IntArray, FloatArray], FloatArray] = lambda image, points_px: points_px
 
     @classmethod
     def of_images(
         cls, count: int, rows: IntArray, homographies: FloatArray, extrinsic: FloatArray, poses: FloatArray
     ) -> ImageGround:
-        """Of ``count`` images those at ``rows``."""
+        """The mapping of the images ``rows``, of ``count``."""
         out = cls(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
         centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
         out.map_from_pinhole_px[rows], out.centre_map[rows] = homographies, centre
@@ -91,7 +89,7 @@ class ImageGround:
     def rolling(
         self, rows: IntArray, camera: IntArray, frame: IntArray, poses: FloatArray, rig: Rig
     ) -> ImageGround:
-        """With the images at ``rows`` read row by row, as ``rig`` has it, the vehicle being at ``poses``."""
+        """With the images ``rows`` read out row by row as in ``rig``, from vehicle ``poses``."""
         if rig.read_out_s is None or rig.twist_vehicle is None:
             return self
         moved = rig.twist_vehicle[frame] * rig.read_out_s[camera, None]
@@ -102,7 +100,7 @@ class ImageGround:
         return replace(self, moved_map=out)
 
     def at_rows(self, points_map: FloatArray, image: IntArray, row_share: FloatArray) -> FloatArray:
-        """Points (..., 2) of images (...) by the poses at which their rows were read, to first order."""
+        """Points (..., 2) of images (...) under the poses at their rows' read-out, to first order."""
         if self.moved_map is None:
             return points_map
         motion = self.moved_map[image]
@@ -113,7 +111,7 @@ class ImageGround:
 def ground_by_ipm(
     drive: Drive, ipm: Mapping[str, FloatArray], cam_from_vehicle: Mapping[str, FloatArray], rig: Rig
 ) -> ImageGround:
-    """By an IPM per camera and the recorded poses, and of ``rig`` read-out times and twists alone."""
+    """From an IPM per camera and the recorded poses; read-out times and twists are ``rig``'s."""
     rows, camera = _rows(drive, list(ipm))
     poses = np.stack([drive.images[i].map_from_vehicle for i in rows])
     forward = [facing_ipm(ipm[name], drive.cameras[name].roi_vehicle.mean(axis=0)) for name in ipm]
@@ -126,7 +124,7 @@ def ground_by_ipm(
 def ground_by_rig(
     drive: Drive, cameras: Sequence[str], rig: Rig, surface: Surface | None = None
 ) -> ImageGround:
-    """By optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
+    """From optimised extrinsics and the adjusted pose of each frame; ``rig`` is over ``cameras``."""
     rows, camera = _rows(drive, cameras)
     frame = frames_of(drive).frame_of_image[rows]
     poses = rig.map_from_vehicle[frame]
@@ -154,7 +152,7 @@ def collect_lane_points(
     max_range_m: float,
     jitter_rad: float,
 ) -> LaneCloud:
-    """Back-project lane detections up to ``max_range_m``; near ones count more by a direction's jitter."""
+    """Back-project lane detections up to ``max_range_m``, weighted by pixel noise and direction jitter."""
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
     lanes = _lanes(detections, ground, whole=False)
     if not lanes:
@@ -184,7 +182,7 @@ def collect_lane_points(
 def _lanes(
     detections: Sequence[ImageDetections], ground: ImageGround, whole: bool
 ) -> list[tuple[int, LaneDetection]]:
-    """The images and lane detections, ``whole`` lines or pieces, of the images that ``ground`` covers."""
+    """Images and lane detections, ``whole`` lines or pieces, of the images that ``ground`` covers."""
     covered = np.isfinite(ground.centre_map[:, 0])
     return [
         (found.image, lane)
@@ -198,7 +196,7 @@ def _lanes(
 def _points(
     drive: Drive, lanes: Sequence[tuple[int, LaneDetection]]
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Of all points of ``lanes`` their lane (P,), image (P,), pinhole pixels (P, 2) and row shares (P,)."""
+    """Lane (P,), image (P,), pinhole pixels (P, 2) and row shares (P,) of all points of ``lanes``."""
     of_lane = np.repeat(np.arange(len(lanes)), [len(lane.points_px) for _, lane in lanes])
     image = np.array([i for i, _ in lanes], dtype=np.int64)[of_lane]
     camera = np.array([one.camera for one in drive.images])[image]
@@ -214,7 +212,7 @@ def _points(
 def _guides(
     drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, max_range_m: float
 ) -> Guides:
-    """The whole lines of the images that ``ground`` covers, as far as ``max_range_m``."""
+    """Whole lines of the images that ``ground`` covers, up to ``max_range_m``."""
     lanes = _lanes(detections, ground, whole=True)
     if not lanes:
         return Guides()
@@ -228,14 +226,14 @@ def _guides(
 
 
 def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, IntArray]:
-    """The images of ``cameras``, and the index of the camera of each."""
+    """The images of ``cameras``, and the camera index of each."""
     index = {name: c for c, name in enumerate(cameras)}
     rows = [(i, index[image.camera]) for i, image in enumerate(drive.images) if image.camera in index]
     return np.array(rows)[:, 0], np.array(rows)[:, 1]
 
 
 def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
-    """Unit direction (P, 2) at each point of its piece, from the points up to two places away."""
+    """Unit direction (P, 2) at each point of its piece, from points up to two places away."""
     length = np.bincount(piece)
     first = (np.cumsum(length) - length)[piece]
     last = first + length[piece] - 1
@@ -247,11 +245,11 @@ def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
         return np.asarray(difference / np.linalg.norm(difference, axis=1, keepdims=True))
 
 
-_SEED_CELL_M = 0.25  # side of the cells that each give a seed, m
-_DIRECTION_BINS = 8  # number of directions distinguished within a cell, over half a circle
-_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
+_SEED_CELL_M = 0.25  # side of the cells with one seed each, m
+_DIRECTION_BINS = 8  # directions distinguished within a cell, over half a circle
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine of directions within one line
 _ITERATIONS = 4  # mean shifts of each seed
-_THIN_SPACINGS = 0.7  # spacings of nodes within which the best supported one suppresses others of its line
+_THIN_SPACINGS = 0.7  # radius, in spacings, in which the best supported node suppresses others of its line
 
 
 @dataclass(frozen=True)
@@ -259,20 +257,20 @@ class Nodes:
     """N points on the ridges."""
 
     points_map: FloatArray  # (N, 2)
-    tangent: FloatArray  # (N, 2) unit, of either sense
-    images: IntArray  # (N,) that support a node
-    dash: FloatArray  # (N,) share of its points seen as a dash
+    tangent: FloatArray  # (N, 2) unit, of either sign
+    images: IntArray  # (N,) number of supporting images
+    dash: FloatArray  # (N,) fraction of its points from dashes
 
 
 def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
-    """Nodes on the ridges of ``cloud`` that so many images show, about :data:`NODE_SPACING_M` apart."""
-    # A seed for each cell of position and direction.
+    """Nodes on the ridges of ``cloud`` in at least ``least_images``, about :data:`NODE_SPACING_M` apart."""
+    # One seed per cell of position and direction.
     angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
     place = np.floor(cloud.points_map / _SEED_CELL_M)
     cell = np.column_stack([place, np.floor(angle / np.pi * _DIRECTION_BINS)]).astype(np.int64)
     seeds = np.unique(cell, axis=0, return_index=True)[1]
     points, tangent = cloud.points_map[seeds], cloud.tangent[seeds]
-    # Pairs of seed and point of the cloud that may ever lie in its neighbourhood.
+    # Pairs of seeds and points that can be neighbours in any iteration.
     reach_m = float(np.hypot(_HALF_LENGTH_M, 2 * HALF_WIDTH_M))
     apart = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
     pairs = apart["i"].astype(np.int64), apart["j"].astype(np.int64)
@@ -293,7 +291,7 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
 def _coordinates(
     points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """For each pair: position of the point along and across the seed's line, cosine of directions."""
+    """Coordinates of each pair's point along and across the seed's line, and cosine of directions."""
     seed, point = pairs
     offset = cloud.points_map[point] - points[seed]
     along = np.einsum("pi,pi->p", offset, tangent[seed])
@@ -310,7 +308,7 @@ def _shift(
     near = (np.abs(along) <= _HALF_LENGTH_M) & (np.abs(across) <= HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
     x, y = along[near], across[near]
-    # Gaussian across, so that of two lines within reach the nearer one wins.
+    # Gaussian across, so that the nearer of two lines wins.
     kernel = np.exp(-0.5 * (2.0 * y / HALF_WIDTH_M) ** 2) * (1 - (x / _HALF_LENGTH_M) ** 2)
     weight = cloud.weight[pairs[1][near]] * kernel
     count = len(points)
@@ -320,7 +318,7 @@ def _shift(
 
     w, wx, wy, wxx, wxy = (total(weight * v) for v in (np.ones_like(x), x, y, x * x, x * y))
     safe = np.maximum(w, 1e-12)
-    # A little stiffness keeps the direction where all neighbours lie at one place.
+    # A little regularisation keeps the direction if all neighbours coincide.
     spread = wxx - wx**2 / safe + 1e-3 * safe
     slope = np.clip((wxy - wx * wy / safe) / np.maximum(spread, 1e-12), -0.5, 0.5)
     offset = np.clip((wy - slope * wx) / safe, -HALF_WIDTH_M, HALF_WIDTH_M)
@@ -330,7 +328,7 @@ def _shift(
 
 
 def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray:
-    """Indices of the best supported nodes, no two closer than .7 of the spacing along or beside a line."""
+    """Indices of the best supported nodes, at least .7 of the spacing apart along and beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     reach_m = _THIN_SPACINGS * NODE_SPACING_M

@@ -1,8 +1,7 @@
-"""Lanes: nodes on lane paint strung into polylines, and pieces of one line joined across its gaps.
+"""Lanes: nodes on lane paint strung into polylines, and pieces of a line joined across gaps.
 
-Pieces are joined by their directions; paint under trees or worn away leaves gaps too long for that. Where the
-detector saw, in several images, one whole line pass the end of one piece and the start of the next, they are
-one lane, and those lines say where it runs between them.
+Pieces are joined by direction; trees and wear leave longer gaps. Pieces are one lane if the detector saw, in
+several images, one whole line pass both ends of the gap; those lines give its course there.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
 
-_MAX_DASH_GAP_M, _MAX_BREAK_M = 9.0, 3.0  # longest gap of two dashes, break in solid paint, that is bridged
-_LEAST_PIECE_M = 2.0  # length of a lane line at least
-_SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # cosine from which two nodes are of one line
-_MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings of nodes
+_MAX_DASH_GAP_M, _MAX_BREAK_M = 9.0, 3.0  # longest bridged gap between dashes, and break in solid paint
+_LEAST_PIECE_M = 2.0  # least length of a lane line
+_SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # least cosine between nodes of one line
+_MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings
 _MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
-"""Largest angle of a gap's chord and an end's tangent, and difference of the angles at both ends, rad."""
+"""Limits, rad: angle between a gap's chord and an end's tangent, and its difference between the two ends."""
 
-_END_SIGMA_M = 0.05  # lateral error of an end, m, which short gaps must allow for in angles
-_END_LENGTH_M = 2.0  # length, m, over which an end's direction is taken
+_END_SIGMA_M = 0.05  # lateral error of an end, m: the angular tolerance of short gaps
+_END_LENGTH_M = 2.0  # length, m, that gives an end's direction
 
 
 @dataclass(frozen=True)
 class Path:
-    """A polyline: ``points_map`` (N, 2), ``dash`` share and supporting ``images``, both means."""
+    """A polyline: ``points_map`` (N, 2), mean ``dash`` fraction and mean number of supporting ``images``."""
 
     points_map: FloatArray
     dash: float
@@ -46,12 +45,12 @@ class Path:
         return float(length_along(self.points_map)[-1])
 
     def turned(self, turn: bool) -> Path:
-        """The same from its other end if it is to ``turn``, else as it is."""
+        """The path, reversed if ``turn``."""
         return replace(self, points_map=self.points_map[::-1]) if turn else self
 
 
 def string_nodes(nodes: Nodes) -> list[Path]:
-    """String nodes into paths that never fork: linked are mutually nearest ones ahead and behind."""
+    """String nodes into paths without forks, by links of mutually nearest nodes ahead and behind."""
     if not len(nodes.points_map):
         return []
     return [
@@ -62,7 +61,7 @@ def string_nodes(nodes: Nodes) -> list[Path]:
 
 
 def join_paths(paths: list[Path]) -> list[Path]:
-    """Join paths end to end where both ends lie on one arc, shortest gaps first."""
+    """Join paths whose ends lie on one arc, shortest gaps first."""
     joined = []
     for run in _runs(len(paths), _joints(paths)):
         own = [paths[path].turned(backwards) for path, backwards in run]
@@ -74,7 +73,7 @@ def join_paths(paths: list[Path]) -> list[Path]:
 
 
 def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
-    """For each node (N, 2) the node linked ahead and behind it, -1 where there is none."""
+    """Nodes (N, 2) linked ahead of and behind each node, -1 for none."""
     pairs = cKDTree(nodes.points_map).query_pairs(reach_m, output_type="ndarray")
     source, target = np.concatenate([pairs, pairs[:, ::-1]]).T
     offset = nodes.points_map[target] - nodes.points_map[source]
@@ -88,7 +87,7 @@ def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
     fits = (straight >= _SAME_DIRECTION) & (parallel >= _SAME_DIRECTION)
     source, target, along, cost = source[fits], target[fits], along[fits], (distance / straight**4)[fits]
     best = np.full((len(nodes.points_map), 2), -1, dtype=np.int64)
-    # Written from the costliest to the cheapest, so that the cheapest stays.
+    # In order of falling cost: the cheapest is written last and stays.
     order = np.argsort(-cost, kind="stable")
     best[source[order], (along[order] < 0).astype(int)] = target[order]
     own = np.arange(len(best))[:, None, None]
@@ -96,7 +95,7 @@ def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
 
 
 def _walk(links: IntArray) -> list[IntArray]:
-    """Follow links (N, 2) from end to end, then around closed loops (whose start is repeated)."""
+    """Follow links (N, 2) from end to end, then around closed loops, repeating their start."""
     degree = (links >= 0).sum(axis=1)
     left = np.ones(len(links), dtype=bool)
     paths = []
@@ -116,7 +115,7 @@ def _walk(links: IntArray) -> list[IntArray]:
 
 
 def _joints(paths: list[Path]) -> list[tuple[int, int, int, int]]:
-    """Pairs of path ends (path, end, path, end) that fit, by growing gap; end 0 first, 1 last."""
+    """Matching path ends (path, end, path, end) by increasing gap; end 0 is the first, 1 the last."""
     if len(paths) < 2:
         return []
     end = np.array([path.points_map[[0, -1]] for path in paths]).reshape(-1, 2)
@@ -140,7 +139,7 @@ def _joints(paths: list[Path]) -> list[tuple[int, int, int, int]]:
 
 
 def _outward(points: FloatArray) -> FloatArray:
-    """Direction (2,) in which a polyline leaves its last point, over its last two metres."""
+    """Direction (2,) of a polyline at its last point, over its last two metres."""
     distance = np.linalg.norm(points - points[-1], axis=1)
     inner = np.flatnonzero(distance <= _END_LENGTH_M)
     start = int(inner[0]) if len(inner) > 1 else max(len(points) - 2, 0)
@@ -152,7 +151,7 @@ def _unit(way: FloatArray) -> FloatArray:
 
 
 def _runs(count: int, joints: list[tuple[int, int, int, int]]) -> list[list[tuple[int, bool]]]:
-    """Runs of (path, whether it is walked backwards): each end is joined once at most, never into a ring."""
+    """Runs of (path, whether reversed), joining each end at most once and never into a ring."""
     run_of = [[(path, False)] for path in range(count)]
     for a, end_a, b, end_b in joints:
         before = _ending_with((a, end_a == _FIRST), run_of[a])
@@ -166,7 +165,7 @@ def _runs(count: int, joints: list[tuple[int, int, int, int]]) -> list[list[tupl
 
 
 def _ending_with(last: tuple[int, bool], run: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
-    """The run walked so that it ends with ``last``; empty where another path follows that."""
+    """The run, ordered to end with ``last``; empty if another path follows that."""
     return next((way for way in (run, _backwards(run)) if way[-1] == last), [])
 
 
@@ -175,7 +174,7 @@ def _backwards(run: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
 
 
 def _merged(points_map: FloatArray, paths: Sequence[Path]) -> Path:
-    """A path along ``points_map``, with the means of what it was made of."""
+    """A path along ``points_map``, with the mean attributes of ``paths``."""
     length_m = [max(path.length_m, 1e-9) for path in paths]
     dash = float(np.average([path.dash for path in paths], weights=length_m))
     return Path(points_map, dash, float(np.average([path.images for path in paths], weights=length_m)))
@@ -190,15 +189,15 @@ def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArr
     return np.asarray(CubicHermiteSpline([0.0, 1.0], [start, stop], [leave, arrive])(t))
 
 
-_MAX_BRIDGE_M = 25.0  # longest gap that images' whole lines bridge, m
-_PASSES_M = 0.4  # a line that comes so near the end of a piece passes it
-_LEAST_COSINE = np.cos(np.deg2rad(30.0))  # cosine of a gap's way and the directions of its ends at least
+_MAX_BRIDGE_M = 25.0  # longest gap bridged by images' whole lines, m
+_PASSES_M = 0.4  # largest distance, m, of a whole line from the end of a piece that it passes
+_LEAST_COSINE = np.cos(np.deg2rad(30.0))  # least cosine between a gap and the directions of its ends
 _FIRST, _LAST = 0, 1
-_DIRECTION_LENGTH_M = 5.0  # a bridge leaves a piece in about the direction of so much of its end
+_DIRECTION_LENGTH_M = 5.0  # length, m, of a piece's end that gives a bridge's direction
 
 
 def bridge_paths(paths: list[Path], guides: Guides, least_images: int) -> list[Path]:
-    """The paths, those joined that ``least_images`` images saw as one line, shortest gaps first."""
+    """The paths, joined where ``least_images`` images saw one line, shortest gaps first."""
     if not len(guides.points_map):
         return paths
     tree = cKDTree(guides.points_map)
@@ -217,11 +216,11 @@ def bridge_paths(paths: list[Path], guides: Guides, least_images: int) -> list[P
 
 
 def _gaps(ends: FloatArray) -> NDArray[np.int64]:
-    """Path, end, path, end (G, 4) of all gaps whose way is roughly that of both paths, the shortest first."""
+    """Path, end, path, end (G, 4) of all gaps roughly aligned with both paths, shortest first."""
     place, outward = ends.reshape(-1, 2, 2).swapaxes(0, 1)
     gap = place[None] - place[:, None]
     gap_m = np.linalg.norm(gap, axis=2)
-    # From i to j one leaves i outwards and arrives at j against what is outwards there.
+    # A gap from i to j leaves along i's outward direction and arrives against j's.
     leaving = np.einsum("ijk,ik->ij", gap, outward)
     straight = np.minimum(leaving, leaving.T) >= _LEAST_COSINE * gap_m
     path = np.arange(len(place)) // 2
@@ -238,7 +237,7 @@ def _ends(path: Path) -> FloatArray:
 
 
 def _end_direction(points: FloatArray) -> FloatArray:
-    """Direction (2,) in which a polyline ends, over its last metres."""
+    """Direction (2,) of a polyline's end, over its last metres."""
     away = np.linalg.norm(points - points[-1], axis=1)
     at = int(np.argmin(np.abs(away - min(_DIRECTION_LENGTH_M, float(away.max())))))
     return _unit(points[-1] - points[at])
@@ -247,7 +246,7 @@ def _end_direction(points: FloatArray) -> FloatArray:
 def _course_between(
     start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, least_images: int
 ) -> FloatArray | None:
-    """Vertices (N, 2) between two ends, where the lines seen run; None unless enough images saw one."""
+    """Vertices (N, 2) between two ends, along the whole lines there; None unless enough images saw one."""
     first, last = (np.unique(guides.line[tree.query_ball_point(end, _PASSES_M)]) for end in (start, stop))
     common = np.intersect1d(first, last)
     if len(np.unique(guides.image_of_line[common])) < least_images:
@@ -264,18 +263,18 @@ def _course_between(
         order = np.argsort(along)
         courses.append(np.interp(at, along[order], across[order]))
     course = np.median(courses, axis=0)
-    # The paint is where the ends are: what the lines seen are off there is taken off along the way.
+    # The paint is at the ends: the whole lines' offset there is removed along the gap.
     course -= np.interp(at, [0.0, gap_m], [course[0], course[-1]])
     points = start + at[:, None] * ahead + course[:, None] * np.array([-ahead[1], ahead[0]])
     return np.asarray(points[1:-1])
 
 
 _LEAST_LENGTH_M = 6.0
-"""Length, m, at which a lane that just enough images saw is one; a shorter one must be seen more often."""
+"""Length, m, at which a lane seen in just enough images is accepted; shorter ones need more."""
 
 
 def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
-    """Polylines along the lane paint, vertices half a metre apart; dashes of a line are one lane."""
+    """Polylines of the lane paint, with vertices half a metre apart; a line of dashes is one lane."""
     if len(cloud.points_map) < 2:
         return ()
     paths = join_paths(string_nodes(find_nodes(cloud, options.min_images)))
@@ -292,8 +291,8 @@ def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
 
 
 def _resample(points: FloatArray, spacing_m: float) -> FloatArray:
-    """Vertices at equal steps of about ``spacing_m`` along a smoothed polyline, both ends kept."""
-    # Binomial smoothing takes out the nodes' own lateral noise.
+    """Vertices at equal steps of about ``spacing_m`` along a smoothed polyline, keeping both ends."""
+    # Binomial smoothing removes the nodes' lateral noise.
     inner = 0.25 * points[:-2] + 0.5 * points[1:-1] + 0.25 * points[2:]
     points = np.concatenate([points[:1], inner, points[-1:]])
     length_m = float(length_along(points)[-1])

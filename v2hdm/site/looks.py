@@ -1,8 +1,8 @@
-"""How often images looked at places of a map, and whether they show paint or bare ground there.
+"""Looks of images at places of a map, and whether they show paint or bare ground there.
 
-A marking that was found in no image may be gone, or it may be worn, or a parked truck may hide it. The
-contrast of its outline's inside to the ground around it decides: bare ground has next to none. The drive's
-own markings show what contrast paint has in this light, and bare ground between them.
+An undetected marking may be gone, worn or hidden by a parked truck. The contrast of its outline's inside to
+the ground around it decides: bare ground has nearly none. The drive's own markings give the contrast of paint
+in this light, bare ground between them that of ground.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 
-Grey = Callable[[int], NDArray[np.float32]]  # the grey values (H, W) of an image, by its number in the drive
+Grey = Callable[[int], NDArray[np.float32]]  # grey values (H, W) of an image, by its index in the drive
 
 _INSIDE = np.linspace(0.2, 0.8, 7)
-"""Where along either side an outline's inside is sampled: off its edges, which a pose's error blurs."""
+"""Fractions along either side at which the inside is sampled: off the edges, which pose errors blur."""
 
-_BESIDE_M = (0.12, 0.25)  # how far beside its edges the ground is sampled, m
-_MOST_VIEWS = 6  # near views of a place that are looked at: the errors of more repeat themselves
-_MOST_LEARNED = 40  # markings of a drive that its paint and its ground are learned from
-_ASIDE_M = 1.3  # how far beside a marking bare ground is looked for, m
-_CLEAR_M = 1.0  # distance from all known paint that makes ground bare, m
-_LEAST_LEARNED = 8  # places from which the drive's own paint or ground is known; with fewer nothing is said
-_HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of whatever else hides the ground
+_BESIDE_M = (0.12, 0.25)  # offsets from its edges at which the ground is sampled, m
+_MOST_VIEWS = 6  # nearest views of a place in use: errors of more repeat
+_MOST_LEARNED = 40  # of a drive, for the contrast of paint and ground
+_ASIDE_M = 1.3  # distance of bare ground from a marking, m
+_CLEAR_M = 1.0  # least distance of bare ground from all known paint, m
+_LEAST_LEARNED = 8  # least places for the drive's own contrast of paint or ground; with fewer it is unknown
+_HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
 
-_HIDDEN_SHARE = 0.5  # share of the markings there and not found that are hidden; the others are worn
+_HIDDEN_SHARE = 0.5  # fraction of the existing, undetected markings that are hidden; the others are worn
 
-_STRANGE_SHARE = 0.05  # share of bare places that are not: a stain, the edge of a shadow
+_STRANGE_SHARE = 0.05  # fraction of bare places with something else: a stain, the edge of a shadow
 _LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
 
 
 @dataclass(frozen=True)
 class Paint:
-    """Contrasts of a drive's ``painted`` and ``bare`` places by mean and sigma, log ratios of grey values."""
+    """Contrasts of a drive's ``painted`` and ``bare`` places: mean and sigma, log ratios of grey values."""
 
     painted: tuple[float, float]
     bare: tuple[float, float]
 
     def log_there(self, contrast: FloatArray) -> FloatArray:
-        """Log density (N,) of contrasts where there is a marking that was not found: worn, or hidden."""
+        """Log density (N,) of contrasts at undetected markings: worn, or hidden."""
         worn = norm.logpdf(contrast, self.painted[0] / 2, abs(self.painted[0]) / 3 + self.painted[1])
         hidden = norm.logpdf(contrast, 0.0, _HIDDEN_SIGMA)
         return _mixed(hidden, worn, _HIDDEN_SHARE)
@@ -70,7 +70,7 @@ def _mixed(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
 
 
 def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points within an outline (4, 2), and beside its four edges."""
+    """Points within an outline (4, 2), and beside its four sides."""
     inside = Quad(corners).at(*(grid.ravel() for grid in np.meshgrid(_INSIDE, _INSIDE)))
     beside = []
     for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -84,14 +84,14 @@ def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 def learn_paint(
     observer: Observer, markings: Sequence[Marking], paint_map: FloatArray
 ) -> Mapping[str, Paint]:
-    """By class, of enough markings, the contrast of paint, at ``paint_map`` (N, 2), and of bare ground."""
+    """By class with enough markings, the contrast of paint at ``paint_map`` (N, 2), and of bare ground."""
     out = {}
     paint = cKDTree(paint_map)
     for kind in sorted({one.kind for one in markings}):
         own = np.stack([one.corners_map for one in markings if one.kind == kind])
         own = own[np.linspace(0, len(own) - 1, min(len(own), _MOST_LEARNED)).astype(int)]
         painted = observer.contrasts(own)
-        # Across the longest extent, side or diagonal, of each.
+        # Across the longest side or diagonal of each.
         every = own[:, [1, 2, 2, 3]] - own[:, [0, 1, 0, 1]]
         extent_m = np.linalg.norm(every, axis=2)
         rows, longest = np.arange(len(every)), np.argmax(extent_m, axis=1)
@@ -107,36 +107,36 @@ def learn_paint(
 
 
 def _robust(values: FloatArray) -> tuple[float, float]:
-    """Median, and the sigma that the median deviation of normal values has."""
+    """Median, and the standard deviation that its median deviation implies."""
     middle = float(np.median(values))
     return middle, max(1.4826 * float(np.median(np.abs(values - middle))), _LEAST_SIGMA)
 
 
 _MOST_SQUARED = 25.0
-"""Squared distance of a sighting's corners from a place, in sigmas, up to which it shows what is there."""
+"""Largest squared Mahalanobis distance of a sighting's corners from a place that it shows."""
 
-_NEAR_M = 12.0  # distance from the camera, m, within which markings are found at about one rate
+_NEAR_M = 12.0  # largest range, m, of a constant detection rate
 
-_SAME_PLACE_M = 0.05  # a marking that has one of its class nearer than this is there, m
-_REACH_M = 2.0  # how far a sighting's middle may be from a place's centre, m: one may see a dash's end only
+_SAME_PLACE_M = 0.05  # largest distance, m, of another marking of the class that occupies a place
+_REACH_M = 2.0  # largest distance, m, of a sighting's centre from a place's: it may show a dash's end alone
 
 
 @dataclass(frozen=True)
 class Looks:
-    """Of N places, how many images had each in near ``views`` (N,), and in how many it was ``found`` (N,)."""
+    """Numbers of near ``views`` (N,) of N places, and of detections ``found`` in them (N,)."""
 
     views: IntArray
     found: IntArray
 
     def watched(self, rate: FloatArray) -> Watched:
-        """The log odds of that, where markings of the class are found at a ``rate`` (N,)."""
+        """Log-likelihoods with and without a marking, whose detection rate is ``rate`` (N,)."""
         there = [log_found(k, n, r) for k, n, r in zip(self.found, self.views, rate, strict=True)]
         return Watched(np.array(there), log_found_where_none_is(self.found, self.views))
 
 
 @dataclass(frozen=True)
 class Observer:
-    """The observations of a drive under a ``rig``; ``grey`` gives its images, None if not to be had."""
+    """The observations of a drive under a ``rig``; ``grey`` reads its images, None if unavailable."""
 
     sightings: Sightings
     views: Views
@@ -146,11 +146,11 @@ class Observer:
     grey: Grey | None = None
 
     def easy_views(self, corners_map: FloatArray) -> tuple[IntArray, IntArray]:
-        """(place, image) in which each of the places (N, 4, 2) is wholly in view, and near."""
+        """(place, image) of unobstructed near views of whole places (N, 4, 2)."""
         return easy_views(self.views, self.rig, list(self.cameras), corners_map, _NEAR_M)
 
     def looks(self, markings: Sequence[Marking], free: BoolArray) -> Looks:
-        """How often it looked at ``markings``, and found one among the sightings that are ``free`` (S,)."""
+        """Views of ``markings``, and detections of them among the sightings ``free`` (S,)."""
         if not markings:
             return Looks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
         corners, count = np.stack([one.corners_map for one in markings]), len(markings)
@@ -163,7 +163,7 @@ class Observer:
     def _shown(
         self, markings: Sequence[Marking], corners: FloatArray, free: BoolArray
     ) -> set[tuple[int, int]]:
-        """(place, image) of the sightings that fit a place."""
+        """(place, image) of sightings that match a place."""
         located = locate(self.sightings, self.rig)
         rows = np.flatnonzero(free & (located.informs.sum(axis=1) >= 2))
         if not len(rows):
@@ -179,7 +179,7 @@ class Observer:
         return set(zip(place[fits].tolist(), self.sightings.image[row[fits]].tolist(), strict=True))
 
     def contrasts(self, corners_map: FloatArray) -> FloatArray:
-        """The median contrast (N,) of places (N, 4, 2) over their nearest views; nan without a view."""
+        """Median contrast (N,) of places (N, 4, 2) over their nearest views; nan without any."""
         assert self.grey is not None
         place, image = self.easy_views(corners_map)
         row_of = {int(one): row for row, one in enumerate(self.views.image)}
@@ -198,10 +198,10 @@ class Observer:
         return np.array([np.nanmedian(own) if np.isfinite(own).any() else np.nan for own in found])
 
     def _contrast(self, grey: NDArray[np.float32], row: int, corners: FloatArray) -> float:
-        """The log ratio of the mean grey values within an outline (4, 2) and beside it."""
+        """Log ratio of mean grey values within an outline (4, 2) and beside it."""
         camera, frame = self.views.camera[row], self.views.frame[row]
         info, cam_from_map = self.cameras[camera].info, self.rig.cam_from_map(camera, frame)
-        if self.rig.read_out_s is not None:  # the row that shows its middle says when the outline was read
+        if self.rig.read_out_s is not None:  # its middle's row gives the outline's read-out
             seen, _ = project_ground(self.rig.intrinsic[camera], cam_from_map, corners)
             middle = distort_points(info, seen.mean(axis=0, keepdims=True))
             cam_from_map = self.rig.cam_from_map(camera, frame, row_shares(info, middle)[0])
@@ -217,7 +217,7 @@ class Observer:
 
 
 def find_rates(observer: Observer, markings: Sequence[Marking]) -> Mapping[str, float]:
-    """By class the share of its easy views in which a marking of the drive's own map is found."""
+    """Detection rate by class in easy views of the drive's own markings."""
     looks = observer.looks(markings, np.ones(len(observer.sightings), dtype=bool))
     kinds = np.array([one.kind for one in markings])
     return {
@@ -229,7 +229,7 @@ def find_rates(observer: Observer, markings: Sequence[Marking]) -> Mapping[str, 
 def with_paint(
     watched: Watched, observer: Observer, old: Sequence[Marking], new: Sequence[Marking]
 ) -> Watched:
-    """How ``old`` markings were ``watched``, and what images show where no ``new`` one of a class lies."""
+    """``watched`` old markings with the images' evidence at places without a ``new`` one of the class."""
     if observer.grey is None or not old or not new:
         return watched
     old_at, new_at = (np.array([one.corners_map.mean(axis=0) for one in some]) for some in (old, new))

@@ -1,10 +1,10 @@
-r"""The errors that markings of a map share, how two maps therefore lie to each other, and lines carried over.
+r"""Errors common to a map's markings, the relative shift of two maps that they cause, and lines carried over.
 
-Beside its own error a corner has one that it shares with its surroundings: the receiver's drift, which fades
-along the route, and a survey's. It is a Gaussian process over the ground with the covariance :math:`\sigma_a
-\sigma_b \exp(-d / l)` for two markings at the distance d: common markings tell how two maps are shifted near
-to them, and averaging many does not average it away. Lane lines and symbols of an earlier map stay where the
-new drive has none.
+Besides its own error a corner has one in common with its surroundings: GNSS drift, which decorrelates along
+the route, and a survey's. It is a Gaussian process over the ground, with the covariance :math:`\sigma_a
+\sigma_b \exp(-d / l)` of two markings at the distance d: common markings show how two maps are shifted near
+them, and averaging many does not remove it. Lane lines and symbols of an earlier map stay where the new drive
+has none.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from scipy.spatial import cKDTree
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
-_UNKNOWN_SIGMA_M = 0.02  # sigma of a corner whose map states none, m a coordinate: drawn over an image
+_UNKNOWN_SIGMA_M = 0.02  # per coordinate, m, of corners whose map states none: drawn over an image
 
 _LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
 
-SHIFT = np.tile(np.eye(2), (4, 1))  # how the stacked corners (8,) move with a shift (2,)
+SHIFT = np.tile(np.eye(2), (4, 1))  # derivative of the stacked corners (8,) by a shift (2,)
 
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors of M markings, taken apart."""
+    """The errors of M markings, decomposed."""
 
     centres_map: FloatArray  # (M, 2) m
-    own_m2: FloatArray  # (M, 8, 8) of each marking's own errors
-    shared_m2: FloatArray  # (M,) a coordinate, of the shift shared with its surroundings
-    over_m: float  # how far that is shared
+    own_m2: FloatArray  # (M, 8, 8) each marking's own
+    shared_m2: FloatArray  # (M,) per coordinate, of the shift common with its surroundings
+    over_m: float  # correlation length of that
 
     @classmethod
     def of(cls, markings: Sequence[Marking], over_m: float) -> Errors:
-        """The errors that ``markings`` state: covariance in all, relative sigma alone."""
+        """The stated errors of ``markings``: own ones from the relative sigma, common ones from the rest."""
         centres = np.array([one.corners_map.mean(axis=0) for one in markings]).reshape(-1, 2)
         unknown = np.eye(8) * _UNKNOWN_SIGMA_M**2
         stated = [unknown if one.covariance_m2 is None else one.covariance_m2 for one in markings]
@@ -45,7 +45,7 @@ class Errors:
         whole, own_m2 = np.array(stated).reshape(-1, 8, 8), np.array(relative_m) ** 2
         centre_m2 = np.einsum("miaja->m", whole.reshape(-1, 4, 2, 4, 2)) / 32
         shared_m2 = np.maximum(centre_m2 - own_m2, 0.0)
-        # One without neighbours has no relative sigma: it shares what the others do.
+        # A marking without neighbours has no relative sigma: its common error is the others'.
         usual_m2 = float(np.nanmedian(shared_m2)) if np.isfinite(shared_m2).any() else 0.0
         shared_m2 = np.where(np.isfinite(shared_m2), shared_m2, np.minimum(usual_m2, centre_m2))
         own = whole - shared_m2[:, None, None] * (SHIFT @ SHIFT.T)
@@ -55,11 +55,11 @@ class Errors:
         return len(self.centres_map)
 
     def at(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 2) as places of the process: themselves and the variance (N,) usual in the map."""
+        """Points (N, 2) of the process, with the variance (N,) typical of the map."""
         return points_map, np.full(len(points_map), float(np.median(self.shared_m2)) if len(self) else 0.0)
 
     def kernel(self, rows: IntArray, points_map: FloatArray, variance_m2: FloatArray) -> FloatArray:
-        """Covariances (R, N), m^2 a coordinate, of the shifts of markings ``rows`` and of other places."""
+        """Covariances (R, N), m^2 per coordinate, of the shifts of markings ``rows`` and of other points."""
         apart_m = np.linalg.norm(self.centres_map[rows][:, None] - points_map[None], axis=2)
         sigma = np.sqrt(self.shared_m2[rows][:, None] * variance_m2[None])
         return np.asarray(sigma * np.exp(-apart_m / self.over_m))
@@ -70,7 +70,7 @@ class Errors:
 
 
 def _positive(covariance: FloatArray) -> FloatArray:
-    """The nearest covariances whose sigmas are no smaller than the floor."""
+    """The nearest covariances with no standard deviation below the floor."""
     values, vectors = np.linalg.eigh((covariance + np.swapaxes(covariance, 1, 2)) / 2)
     values = np.maximum(values, _LEAST_SIGMA_M**2)
     return np.asarray((vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2))
@@ -78,18 +78,18 @@ def _positive(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Shift:
-    """How a new map lies to an old one, by P pairs of markings that both have."""
+    """Relative shift of a new map to an old one, from P pairs of common markings."""
 
     of_old: Errors
     of_new: Errors
     old: IntArray  # (P,)
     new: IntArray  # (P,)
-    off_map: FloatArray  # (P, 2) of the new one from the old
-    noise_m2: FloatArray  # (P, 2, 2) of that, by their own errors
+    off_map: FloatArray  # (P, 2) new minus old
+    noise_m2: FloatArray  # (P, 2, 2) of that, from the markings' own errors
 
     @cached_property
     def _inverse(self) -> FloatArray:
-        """Of the joint covariance (2 P, 2 P) of all that is off."""
+        """Inverse joint covariance (2 P, 2 P) of all differences."""
         shared = self.of_old.between(self.old, self.old) + self.of_new.between(self.new, self.new)
         total = np.kron(shared, np.eye(2))
         for k in range(len(self.old)):
@@ -98,11 +98,11 @@ class Shift:
 
     @cached_property
     def _weighed(self) -> FloatArray:
-        """The inverse times what is off, (P, 2)."""
+        """That inverse times the differences, (P, 2)."""
         return np.asarray((self._inverse @ self.off_map.ravel()).reshape(-1, 2))
 
     def without_itself(self, pair: int) -> tuple[FloatArray, FloatArray]:
-        """Mean (2,) and covariance (2, 2) of the shift at a pair, by all others (leave one out)."""
+        """Mean (2,) and covariance (2, 2) of the shift at a pair, from all others (leave one out)."""
         own = slice(2 * pair, 2 * pair + 2)
         spread = np.linalg.inv(self._inverse[own, own])
         mean = self.off_map[pair] - spread @ self._weighed[pair]
@@ -120,15 +120,15 @@ class Shift:
         return gain @ self.off_map.ravel(), _positive(covariance[None])[0]
 
     def of_old_at(self, points_map: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The old map's shared errors at places: means (N, 2) and covariances (N, 2, 2)."""
+        """Common errors of the old map at points: means (N, 2) and covariances (N, 2, 2)."""
         return self._of_one(-self.of_old.kernel(self.old, points_map, variance_m2), variance_m2)
 
     def of_new_at(self, points_map: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The new map's shared errors at places: means (N, 2) and covariances (N, 2, 2)."""
+        """Common errors of the new map at points: means (N, 2) and covariances (N, 2, 2)."""
         return self._of_one(self.of_new.kernel(self.new, points_map, variance_m2), variance_m2)
 
     def _of_one(self, known: FloatArray, variance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """By the covariances (P, N) of one map's shared errors at places with what is off."""
+        """From covariances (P, N) of one map's common errors at points with the differences."""
         count, places = known.shape
         prior = variance_m2[:, None, None] * np.eye(2)
         if not count:
@@ -138,7 +138,7 @@ class Shift:
         return known.T @ self._weighed, _positive(prior - taken)
 
     def of_both(self, pair: int) -> tuple[FloatArray, FloatArray]:
-        """The shared errors of the old and the new map at a pair: mean (4,) and covariance (4, 4)."""
+        """Common errors of the old and the new map at a pair: mean (4,) and covariance (4, 4)."""
         one, other = np.array([self.old[pair]]), np.array([self.new[pair]])
         known = [-self.of_old.between(self.old, one)[:, 0], self.of_new.between(self.new, other)[:, 0]]
         gain = np.concatenate([np.kron(part[None], np.eye(2)) for part in known])
@@ -147,9 +147,9 @@ class Shift:
         return gain @ self._weighed.ravel(), (covariance + covariance.T) / 2
 
 
-_SAME_LINE_M = 0.3  # distance up to which two maps' lines are one, m: two side by side are twice as far
+_SAME_LINE_M = 0.3  # largest distance of one line in two maps, m: parallel lines are twice as far apart
 
-_LEAST_SHARED = 0.5  # share of a new line's vertices that lie on an earlier line, from which it is that line
+_LEAST_SHARED = 0.5  # least fraction of a new line's vertices on an earlier line for it to be that line
 
 
 def updated_lanes(
@@ -173,7 +173,7 @@ def updated_lanes(
 def updated_symbols(
     old: Sequence[Symbol], new: Sequence[Symbol], shift: Shift, number: Callable[[], int]
 ) -> tuple[Symbol, ...]:
-    """The symbols of both maps: of those that lie on each other the new outline under the earlier id."""
+    """The symbols of both maps; of overlapping ones the new outline with the earlier id."""
     out = [replace(one, outline_map=_moved(one.outline_map, shift, of_old=True)) for one in old]
     centres = np.array([one.outline_map.mean(axis=0) for one in out]).reshape(-1, 2)
     taken: set[int] = set()
@@ -193,14 +193,14 @@ def updated_symbols(
 
 
 def _moved(points_map: FloatArray, shift: Shift, of_old: bool) -> FloatArray:
-    """Points without the error that they share with the markings around them."""
+    """Points without the error common with the markings around them."""
     errors = shift.of_old if of_old else shift.of_new
     at = shift.of_old_at if of_old else shift.of_new_at
     return points_map - at(*errors.at(points_map))[0]
 
 
 def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
-    """The earlier line of the same class that most of a new line lies on."""
+    """The earlier line of the same class that contains most of a new line."""
     shares = []
     for one in lanes:
         foot = points_along(one.points_map, _stations(lane.points_map, one.points_map))
@@ -211,7 +211,7 @@ def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
 
 
 def _stations(points: FloatArray, line: FloatArray) -> FloatArray:
-    """How far along a polyline (M, 2) the feet of points (N, 2) lie, m: beside its nearest vertex."""
+    """Arc lengths, m, along a polyline (M, 2) of the feet of points (N, 2), beside the nearest vertex."""
     along, nearest = length_along(line), cKDTree(line).query(points)[1]
     best = np.full(len(points), np.inf)
     station = np.asarray(along[nearest], dtype=np.float64)
@@ -228,7 +228,7 @@ def _stations(points: FloatArray, line: FloatArray) -> FloatArray:
 
 
 def _renewed(lane: Lane, pieces: Sequence[Lane]) -> Lane:
-    """The earlier line with its course replaced where new lines lie on it."""
+    """The earlier line, with its course replaced by new lines where they coincide."""
     if not pieces:
         return lane
     along, heights = length_along(lane.points_map), lane.heights_m
@@ -240,7 +240,7 @@ def _renewed(lane: Lane, pieces: Sequence[Lane]) -> Lane:
         if station[-1] < station[0]:
             station, course = station[::-1], course[::-1]
         old = (along > reached) & (along < station.min())
-        # Of two new pieces that overlap, the later one begins where the earlier one ends.
+        # Of two overlapping new pieces, the later begins where the earlier ends.
         own = (station > reached) | (reached < 0)
         points += [lane.points_map[old], course[own]]
         if heights is not None:

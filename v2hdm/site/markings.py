@@ -1,7 +1,7 @@
-"""Which candidates become markings of the map, and why the others do not.
+"""The choice of candidates that become markings of the map, with reasons against the others.
 
-How sure a marking is beside its neighbours, whatever drift or survey moves all of them alike, and how
-suspicious: unlike the others of its class in shape, in residuals, or in dispute.
+Also the relative precision of neighbouring markings, free of drift and survey, and suspicion: unlike others
+of their class in shape, residuals or disputed observations.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _CLUTTER_BY = (
 
 @dataclass(frozen=True)
 class Classified:
-    """G candidates, the reason why each is no marking of the map, if so, and the posterior's misfit (G,)."""
+    """G candidates, the reason against each, if any, and the posterior's misfit (G,)."""
 
     kind: tuple[str, ...]
     candidates: Candidates
@@ -45,11 +45,11 @@ class Classified:
 
     @property
     def accepted(self) -> IntArray:
-        """The candidates that are markings of the map."""
+        """Candidates accepted as markings."""
         return np.flatnonzero([reason is None for reason in self.verdict])
 
     def markings(self) -> tuple[Marking, ...]:
-        """The markings of the map, one for each accepted candidate; MappingError where there is none."""
+        """Markings of the map, one per accepted candidate; MappingError if there is none."""
         if not len(self.accepted):
             reasons = [exclusion.reason for exclusion in self.exclusions()]
             commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
@@ -68,7 +68,7 @@ class Classified:
         )
 
     def exclusions(self) -> tuple[Exclusion, ...]:
-        """The rejected candidates and the reasons; a group without a solved corner was no candidate."""
+        """The rejected candidates and the reasons; groups without a solved corner are no candidates."""
         return tuple(
             Exclusion(
                 kind=self.kind[group],
@@ -93,8 +93,8 @@ def classify(
 ) -> Classified:
     """Decide which ``solved`` candidates are markings of the map, and where their corners are.
 
-    Of classes ``kind`` (G,) in ``kinds``; ``counted`` says how often they were seen, ``parallax`` whether on
-    the ground.
+    ``kind`` (G,) indexes the class names ``kinds``; ``counted`` counts their sightings, ``parallax`` tests
+    that they lie on the ground.
     """
     first = posterior(solved, kind, counted(np.where(solved.known[..., None], solved.corners_map, np.nan)))
     names, number = [kinds[one] for one in kind], kind.copy()
@@ -102,10 +102,10 @@ def classify(
     known = {kinds[one]: one for one in np.unique(kind).tolist()}
     for group, correction in stated.kept.items():
         names[group] = correction.new_kind or names[group]
-        # The shape of a class is learned from its candidates: without another one there is none.
+        # The shape of a class is learned from its candidates: without other candidates there is none.
         number[group] = known.get(names[group], number[group])
     solved = stated.placed(solved, first.candidates)
-    # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
+    # With the class's shape, a missing corner has a place where it should have been visible.
     counts = counted(first.candidates.corners_map)
     found = posterior(solved, number, counts)
     found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
@@ -117,7 +117,7 @@ def classify(
         for group, odds in enumerate(found.log_odds)
     ]
     sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
-    # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
+    # The best one's uncertainty is common to all: a shift of the whole map speaks against no marking.
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
     for group in np.flatnonzero(uncertain).tolist():
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
@@ -132,7 +132,7 @@ def classify(
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:
-    """The candidates among ``standing`` that overlap another one of better odds."""
+    """Candidates of ``standing`` that overlap one with better odds."""
     if len(standing) < 2:
         return np.zeros(0, dtype=np.int64)
     corners, odds = found.candidates.corners_map, found.log_odds
@@ -147,27 +147,27 @@ def _covered(found: Posterior, standing: IntArray) -> IntArray:
 
 
 JointCovariance = Callable[[IntArray], FloatArray]
-"""Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""
+"""Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4), two corners of each."""
 
-_NEIGHBOUR_M = 10.0  # how far apart markings are compared, m: a vehicle's length, over which it manoeuvres
+_NEIGHBOUR_M = 10.0  # distance at which markings are compared, m: a vehicle's length, for manoeuvres
 
-_FARTHEST_M = 15.0  # a marking without another one within so many metres has no relative standard deviation
+_FARTHEST_M = 15.0  # largest distance to another marking, m, for a relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
 
 
 def with_relative_sigma(
     markings: Sequence[Marking], corner_index: IntArray, joint: JointCovariance
 ) -> tuple[Marking, ...]:
-    """The markings (M,) with what each contributes to the error of the distance to one about 10 m away.
+    """The markings (M,), each with its contribution to the error of the distance to one about 10 m away.
 
-    To the errors of the adjustment comes that of its own paint. ``corner_index`` (M, 4) numbers their corners
-    in the solution, -1 for one that was not seen; ``joint`` is of these.
+    Paint error is added to the adjustment's. ``corner_index`` (M, 4) numbers the corners in the solution, -1
+    for unseen ones; ``joint`` is the solution's.
     """
     seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
     if not len(seen):
         return tuple(markings)
     chosen = [markings[m] for m in seen.tolist()]
-    # Two corners that are opposite each other: of a marking at least three are known.
+    # Opposite corners: of a marking at least three are known.
     even, odd = corner_index[seen][:, [0, 2]], corner_index[seen][:, [1, 3]]
     diagonal = np.where((even >= 0).all(axis=1, keepdims=True), even, odd)
     first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
@@ -179,7 +179,7 @@ def with_relative_sigma(
     stated_m2 = np.array([chosen[k].covariance_m2 for k in first]).reshape(-1, 4, 2, 4, 2)
     stated = np.array([np.einsum("iaja->", one) for one in stated_m2]) / 32
     own = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
-    # The difference of two centres has the errors of both.
+    # A difference of two centres has both errors.
     sigma_m = np.sqrt(np.trace(apart, axis1=1, axis2=2) / 4 + own)
     out = list(markings)
     for marking, sigma in zip(seen[first].tolist(), sigma_m.tolist(), strict=True):
@@ -188,7 +188,7 @@ def with_relative_sigma(
 
 
 def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs of points (N, 2): each that has others near, with the one whose distance is nearest to 10 m."""
+    """Pairs of points (N, 2): each with neighbours, and its neighbour at the distance nearest to 10 m."""
     first, second = [], []
     tree = cKDTree(centres_map)
     for own, near in enumerate(tree.query_ball_point(centres_map, _FARTHEST_M)):
@@ -200,36 +200,36 @@ def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
     return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
 
 
-_LISTED = 10  # markings that are listed: as many as a user looks at
+_LISTED = 10  # length of the list: as many as a user looks at
 
 
 @dataclass(frozen=True)
 class Suspicion:
-    """How unlikely the marking of an id is, by p-values, were it like the others of its class."""
+    """p-values of a marking under the distribution of its class."""
 
     marking: int
-    p_shape: float  # under the posterior predictive, 1 for a class without shape
+    p_shape: float  # posterior predictive; 1 for a class without shape
     p_residuals: float  # of its accepted observations
-    p_sightings: float  # of the share ``disputed``
-    disputed: float  # of its observations that the joint solution rejected
+    p_sightings: float  # of the ``disputed`` fraction
+    disputed: float  # fraction of its observations that the joint solution rejected
 
     @property
     def p(self) -> float:
-        """The least of three p-values, as many times as there are tests (Bonferroni)."""
+        """The smallest of the three p-values, with Bonferroni's correction."""
         return min(1.0, 3 * min(self.p_shape, self.p_residuals, self.p_sightings))
 
 
 def most_suspicious(
     accepted: IntArray, misfit: FloatArray, squared: FloatArray, counts: Counts
 ) -> Sequence[Suspicion]:
-    """The most suspicious of the ``accepted`` (M,), the worst first, by p-values of shapes and residuals."""
+    """The most suspicious of the ``accepted`` (M,), worst first, by p-values of shape and residuals."""
     seen, agreed = counts.observations[accepted], counts.agreeing[accepted]
-    freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two an observation, less those of four corners
-    # Beside its freedom a variance has an inverse-gamma prior, so that it follows Fisher's F distribution.
+    freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two per observation, less eight of the corners
+    # With an inverse-gamma prior, the variance follows Fisher's F distribution.
     variance = np.nan_to_num(squared[accepted], nan=1e9) / freedom
     scale, prior = variance_prior(variance, freedom)
     residuals = f.sf(variance / scale, freedom, prior)
-    # The tail of a binomial distribution, continued to parts of an image.
+    # Binomial tail, continued to fractions of an image.
     rate = (seen - agreed).sum() / max(seen.sum(), 1)
     disputes, images = (seen - agreed) / CORNERS_OF_IMAGE, seen / CORNERS_OF_IMAGE
     sightings = np.where(disputes > 0, beta.cdf(rate, np.maximum(disputes, 1e-9), images - disputes + 1), 1.0)

@@ -1,4 +1,4 @@
-"""Settings for what enters the map."""
+"""Settings for acceptance into the map, and for lanes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from v2hdm.io.maps.corrections import Correction
 
 @dataclass(kw_only=True)
 class AcceptanceOptions:
-    """The conditions for a candidate to enter the map.
+    """Conditions for a candidate to enter the map.
 
-    It must be a marking (from its shape and the images that show it or not) and lie on the ground (from its
-    motion in the images) with at least ``min_probability``. The sigma of its worst corner may exceed that of
-    the map's best corner by at most ``max_sigma_m``. ``corrections`` are a person's decisions on candidates,
-    read from the file ``map.corrections``.
+    It must be a marking (by shape and detections) and lie on the ground (by parallax) with at least
+    ``min_probability``. Its worst corner's sigma may exceed that of the map's best corner by at most
+    ``max_sigma_m``. ``corrections`` are a person's decisions, from the file ``map.corrections``.
     """
 
     min_probability: float = 0.9
@@ -29,9 +28,9 @@ AFTER, JOINT = "after", "joint"  # values of ``mapping.lanes.model``
 class LaneOptions:
     """How lane paint becomes polylines.
 
-    ``model`` is ``after``, which draws lanes after the adjustment, or ``joint``, which makes them part of it
-    as cubic splines whose vertices have sigmas. Lane paint is used up to ``max_range_m`` from the camera. A
-    vertex needs ``min_images`` that show it.
+    ``model`` is ``after``, which draws lanes after the adjustment, or ``joint``, which adjusts them as cubic
+    splines whose vertices have sigmas. Lane paint counts up to ``max_range_m`` from the camera; a vertex
+    needs ``min_images``.
     """
 
     model: str = AFTER

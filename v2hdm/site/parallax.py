@@ -1,9 +1,8 @@
-"""Whether candidates lie on the ground: how much nearer they come as the vehicle goes on.
+"""Test whether candidates lie on the ground, by their parallax as the vehicle moves.
 
-Laid on the ground, a point of the ground comes nearer by as much as the vehicle moves, one half as high as
-the camera by twice as much, one that moves along with the vehicle not at all. With the camera at c, the ray
-from below it to where a point is seen on the ground is r = a - s c, and s = 1 on the ground. Images tell s as
-far as the vehicle has moved between them.
+Projected to the ground, a ground point approaches by the vehicle's motion, one at half the camera's height by
+twice that, one moving with the vehicle not at all. With camera c, the ray from its nadir to the projected
+point is r = a - s c, with s = 1 on the ground; images determine s by the motion between them.
 """
 
 from __future__ import annotations
@@ -24,29 +23,29 @@ NOT_OBSERVED = "not observed to be on the ground"
 NOT_ON_GROUND = "stands above the ground, or moves"
 
 _ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
-"""Mean and sigma of s of what is no marking: half as high as the camera, or moving along with the vehicle."""
+"""Mean and standard deviation of s of other things: at half the camera's height, or moving along."""
 
-_UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poorer fits from afar
+_UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poor fits from afar
 
-_ONE_VIEW_M = 0.1  # way, m, within which images show one view and err alike: the same texture by an edge
+_ONE_VIEW_M = 0.1  # motion, m, within which images are one view with one error: the same texture by an edge
 
-_POSE_SIGMAS = 4.0  # how far apart, in sigmas, the recorded positions of one place may be
-_LEVEL_RAD = 1e-5  # sigma, rad, of the attitude where it is taken for exact
-_LEAST_SIGMA_M = 1e-3  # of a point, m, however certain an image states it to be
-_ANYWHERE_M = 1e3  # sigma, m, of where a point lies about its mean
-_ANY_SLOPE = 10.0  # sigma of s before any image: nothing comes nearer much faster than the vehicle moves
+_POSE_SIGMAS = 4.0  # largest distance, in sigmas, of recorded positions of one place
+_LEVEL_RAD = 1e-5  # standard deviation, rad, of an attitude treated as exact
+_LEAST_SIGMA_M = 1e-3  # floor of a point's standard deviation, m, however precise an image states it
+_ANYWHERE_M = 1e3  # standard deviation, m, of a point's prior position about its mean
+_ANY_SLOPE = 10.0  # prior standard deviation of s: nothing approaches much faster than the vehicle moves
 
 
 @dataclass(frozen=True)
 class PointViews:
-    """N sightings of P points each, by sighting."""
+    """N sightings of P points each."""
 
-    group: IntArray  # (N,) of the candidate
+    group: IntArray  # (N,) candidate
     camera: IntArray
     points_map: FloatArray  # (N, P, 2) m, on the ground
-    ray_map: FloatArray  # (N, P, 2) there from below the camera
-    covariance_m2: FloatArray  # (N, P, 2, 2) beside that of poses
-    used: BoolArray  # (N, P) else nothing counts
+    ray_map: FloatArray  # (N, P, 2) to there from the camera's nadir
+    covariance_m2: FloatArray  # (N, P, 2, 2) without that of poses
+    used: BoolArray  # (N, P) whether informative; other entries are arbitrary
     height_m: FloatArray  # (N,) of the camera
     pose_sigma: FloatArray  # (N, 6) of the poses' errors
 
@@ -59,7 +58,7 @@ class PointViews:
         variance_factor: float,
         pose_sigma: Sequence[PoseSigma],
     ) -> PointViews:
-        """The corners that ``located`` says are informative, covariances ``variance_factor`` times."""
+        """Informative corners of ``located``, their covariances times ``variance_factor``."""
         used = association.in_group_order(located.informs)
         rows = np.flatnonzero((association.group >= 0) & used.any(axis=1))
         corners, rays, covariance = (
@@ -81,23 +80,23 @@ class PointViews:
 
 @dataclass(frozen=True)
 class Parallax:
-    """How G candidates seem to move: ``slope`` (G, P), s of each point, 1 on the ground, and covariance."""
+    """Apparent motion of G candidates: ``slope`` (G, P), s of each point, 1 on the ground, and covariance."""
 
     slope: FloatArray
     covariance: FloatArray
 
     @property
     def log_odds(self) -> FloatArray:
-        """Log odds (G,) that a candidate lies on the ground, which are even before any image is seen."""
+        """Log-odds (G,) of a candidate lying on the ground, from even prior odds."""
         count = self.slope.shape[1]
-        # What stands upright is not as high everywhere: half of the variance is that of each point.
+        # Points of an upright object differ in height: half of the variance is each point's own.
         apart = (np.ones((count, count)) + np.eye(count)) / 2
         elsewhere = [_log_normal(self.slope - at, self.covariance + own**2 * apart) for at, own in _ELSEWHERE]
         ground = _log_normal(self.slope - 1, self.covariance + _UNEVEN**2 * apart)
         return np.asarray(ground - np.logaddexp(*elsewhere) + np.log(len(_ELSEWHERE)))
 
     def objections(self, min_probability: float) -> list[str | None]:
-        """Why each candidate may not enter the map; None if it lies on the ground at this probability."""
+        """Objection to each candidate; None if it lies on the ground with this probability."""
         least = np.log(min_probability / (1 - min_probability))
         return [
             None if odds >= least else NOT_ON_GROUND if odds < -least else NOT_OBSERVED
@@ -106,9 +105,9 @@ class Parallax:
 
 
 def measure_parallax(views: PointViews, count: int) -> Parallax:
-    """Estimate s of the points of each of ``count`` candidates by weighted least squares.
+    """Estimate s of the points of ``count`` candidates by weighted least squares.
 
-    Where they lie, and a roll and pitch that is wrong in all images alike, are unknown, too.
+    Unknown as well: their positions, and a roll and pitch error common to all images.
     """
     group, used, each = views.group, views.used, views.used.shape[1]
     total, slopes = 2 * each, slice(2 * each, 3 * each)
@@ -117,11 +116,11 @@ def measure_parallax(views: PointViews, count: int) -> Parallax:
     seen = _sum(used, group, count)
     middle = _sum(points, group, count) / np.maximum(seen, 1)[..., None]
     view, images = _views(views, centre)
-    # A standing vehicle's recorded positions wander; its images are one view, from the mean of them.
+    # Recorded positions of a standing vehicle wander; its images are one view, from their mean.
     centre = (_sum(centre, view, len(images)) / images[:, None])[view]
     about = _sum(centre, group, count) / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
 
-    # At the mean place: derivatives at the ray itself would hang together with its own error.
+    # Evaluated at the mean: derivatives at the ray itself would correlate with its error.
     by_pose = _by_pose(middle[group] - centre[:, None], views.height_m) * used[..., None, None]
     by_pose = by_pose.reshape(len(group), total, 6)
     shown = np.repeat(used, 2, axis=1)
@@ -154,7 +153,7 @@ def measure_parallax(views: PointViews, count: int) -> Parallax:
 
 
 def _log_normal(off: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Log density (G,) of deviations (G, P), but for a constant."""
+    """Log density (G,) of deviations (G, P), up to a constant."""
     squared = np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1)
     return np.asarray(-0.5 * (squared + np.linalg.slogdet(covariance)[1]))
 
@@ -167,7 +166,7 @@ def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatAr
 
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
-    """Derivative (N, P, 2, 6) of ground points at the ends of rays (N, P, 2), by :data:`POSE_STATES`."""
+    """Jacobian (N, P, 2, 6) of ground points at the ends of rays (N, P, 2) by :data:`POSE_STATES`."""
     x, y = ray[..., 0], ray[..., 1]
     one, none, h = np.ones_like(x), np.zeros_like(x), np.broadcast_to(height_m[:, None], x.shape)
     columns = (
@@ -182,7 +181,7 @@ def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
 
 
 def _views(views: PointViews, centre: FloatArray) -> tuple[IntArray, IntArray]:
-    """The view (N,) of each sighting, and images of each: one until the camera (N, 2) has moved on enough."""
+    """View (N,) of each sighting, and images per view; a camera that moved enough begins a new one."""
     reach_m = _ONE_VIEW_M + _POSE_SIGMAS * views.pose_sigma[:, 0]
     begun: dict[tuple[int, int], int] = {}
     first: list[int] = []

@@ -1,16 +1,15 @@
-"""Polygons that images draw: the vertices of symbols, and the templates that the symbols of a class share.
+"""Polygons from outlines in images: the vertices of symbols, and the templates of their classes.
 
-An image's outline of a symbol is that of a polygon on the ground, plus noise that neighbouring points have in
-common, plus a shift of the whole image, whose viewing direction jitters. Each piece of it lies along an edge,
-or is of none: a rounded corner, the cut of a shadow or of the border. That mixture is all that is robust here
-(expectation maximisation: Dempster, Laird and Rubin, JRSS B 1977); the vertices follow by Gauss-Newton steps.
+The outline in an image is a polygon on the ground, plus noise correlated along it, plus a shift of the whole
+image by jitter of the viewing direction. Each piece lies along an edge, or along none: a rounded corner, the
+cut of a shadow or the border. That mixture provides the robustness (expectation maximisation: Dempster, Laird
+and Rubin, JRSS B 1977); the vertices follow by Gauss-Newton.
 
-Symbols of one class are painted with one stencil: each is the template, moved, turned, made longer or wider,
-its vertices off by some paint, all of that normal. So the template of a symbol is the prior of its vertices.
-It is learnt from the others of its class, and how far they deviate with it (empirical Bayes, as
-:mod:`v2hdm.site.shapes` has it). Whether a symbol is of a template, and how many vertices a new one has, the
-marginal likelihood decides (Laplace's approximation: MacKay, Neural Computation 4, 1992). Mirror twins have
-templates of their own.
+Symbols of one class are painted with one stencil: the template, moved, turned and stretched, with paint error
+of the vertices, all Gaussian. The template is thus the prior of a symbol's vertices, learned with its
+variances from the other members (empirical Bayes, as in :mod:`v2hdm.site.shapes`). The marginal likelihood
+decides whether a symbol has a template, and how many vertices a new one has (Laplace's approximation: MacKay,
+Neural Computation 4, 1992). Mirror images have templates of their own.
 """
 
 from __future__ import annotations
@@ -25,36 +24,36 @@ from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.shapes import EDGE_SIGMA_M, SHAPE_SIGMA_M, learn_paint_error
 
-_SPACING_PX = 4.0  # length of the pieces, px, that an outline is taken as: an element of the network's output
+_SPACING_PX = 4.0  # length, px, of an outline's pieces: an element of the network's output
 _CORRELATED_PX = 20.0
-"""Length, px, of an outline that errs as one: twice the integral of its autocorrelation in renders."""
+"""Correlation length of an outline, px: twice the integral of its autocorrelation in renders."""
 
 _SIGMA_PX, _SIGMA_WEIGHT = 0.5, 10.0
-"""How far an outline is from the paint's edge, px, and how many independent points that guess is worth."""
+"""Prior sigma of an outline about the paint's edge, px, and the number of independent points it is worth."""
 
-_TURN_SIGMA_RAD = 0.25  # by how much a piece of outline is turned against its edge
-_ROUND_PX = 3.0  # how far from a corner, px, the network rounds it
-_STRAY, _STRAY_PX = 0.2, 25.0  # share of an outline that lies along no edge, and how far off it may be, px
-LEAST_EXPLAINED = 1 - 2 * _STRAY  # least share of the outlines that lies along the edges of their polygon
+_TURN_SIGMA_RAD = 0.25  # of a piece of outline against its edge
+_ROUND_PX = 3.0  # distance from a corner, px, that the network rounds
+_STRAY, _STRAY_PX = 0.2, 25.0  # fraction of an outline along no edge, and its range, px
+LEAST_EXPLAINED = 1 - 2 * _STRAY  # least fraction of the outlines along their polygon's edges
 
-_ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline that sightings share
-UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices of which images say little beside that guess
+_ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline common to sightings
+UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices on which images add little to that prior
 _SIZE_SIGMA, _FREEDOM = 0.02, 4.0
-"""Sigma of the logarithm of a symbol's sizes about its template's, before any is known; and how many symbols
-that guess, and the one of the vertices' own deviations, are worth."""
+"""Prior sigma of the logarithm of a symbol's sizes about its template's; and the number of symbols that this
+prior, and that of the vertices' own deviations, are worth."""
 
 _MOST_VERTICES = 18
-_STEP_M = 0.1  # a step moves no vertex farther: beyond, other edges explain the pieces
-_STEPS, _FEW_STEPS, _ROUNDS = 15, 4, 3  # of a fit, of one after a vertex has gone, of learning a template
+_STEP_M = 0.1  # largest motion of a vertex in a step: beyond, other edges explain the pieces
+_STEPS, _FEW_STEPS, _ROUNDS = 15, 4, 3  # of a fit, of one after removing a vertex, of learning a template
 
 
 @dataclass(frozen=True)
 class Traces:
-    """P pieces of the outlines of one symbol that I images show.
+    """P pieces of one symbol's outlines in I images.
 
-    ``px_from_map`` (I, 3, 3) are the homographies of the ground, ``shift_px`` (I,) standard deviations of the
-    images' shifts. A piece is of an ``image`` (P,), at ``points_px`` (P, 2) in the direction ``along_px``
-    (P, 2), counter-clockwise as seen from above, and ``weight`` (P,) independent observations.
+    ``px_from_map`` (I, 3, 3) are ground homographies, ``shift_px`` (I,) the sigmas of the images' shifts. A
+    piece of ``image`` (P,) lies at ``points_px`` (P, 2), in direction ``along_px`` (P, 2), counter-clockwise
+    from above; ``weight`` (P,) is in independent observations.
     """
 
     px_from_map: FloatArray
@@ -73,7 +72,7 @@ class Traces:
         px_from_map: FloatArray,
         shift_px: FloatArray,
     ) -> Traces:
-        """The pieces of outlines (K, 2), each of an ``image`` (S,), along sides (K,) that were ``seen``."""
+        """Pieces of outlines (K, 2), each of an ``image`` (S,), along the sides (K,) that were ``seen``."""
         pieces = []
         for outline, sides, number in zip(outlines_px, seen, image, strict=True):
             clockwise = signed_area(outline) < 0
@@ -92,9 +91,9 @@ class Traces:
 class Polygon:
     """The ``vertices`` (N, 2), m, of a symbol, counter-clockwise, in the order of its template.
 
-    ``covariance`` (2N, 2N), m^2, is that of the stacked vertices, ``data`` the information that the images
-    alone have of them, ``pull`` (2N,) the derivative of the log prior; ``evidence`` is the log marginal
-    likelihood, ``explained`` the share of the images' outlines that lie along its edges.
+    ``covariance`` (2N, 2N), m^2, is of the stacked vertices, ``data`` the information from images alone,
+    ``pull`` (2N,) the gradient of the log prior; ``evidence`` is the log marginal likelihood, ``explained``
+    the fraction of the outlines along its edges.
     """
 
     vertices: FloatArray
@@ -106,13 +105,13 @@ class Polygon:
 
 
 Prior = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Mean (2N,) and covariance (2N, 2N) of the vertices, by where they are (N, 2)."""
+"""Prior mean (2N,) and covariance (2N, 2N) of vertices near (N, 2)."""
 
 
 def find_polygons(
     kinds: Sequence[str], traces: Sequence[Traces], outlines: Sequence[FloatArray]
 ) -> list[Polygon]:
-    """The polygons of symbols by class, what images show of each, and an outline (K, 2) to start from."""
+    """Polygons of symbols of classes ``kinds``, from their traces, started from ``outlines`` (K, 2)."""
     own = [_own_polygon(trace, outline) for trace, outline in zip(traces, outlines, strict=True)]
     found, classes = list(own), list[tuple[_Template, list[int]]]()
     for k in np.argsort([-trace.weight.sum() for trace in traces]).tolist():
@@ -140,7 +139,7 @@ def find_polygons(
 def _of_template(
     template: _Template, traces: Sequence[Traces], polygons: list[Polygon]
 ) -> tuple[_Template, list[Polygon]]:
-    """Symbols as polygons of the template that they teach, without vertices that only its first one had."""
+    """Symbols as polygons of their template, re-learned without vertices that only its first symbol had."""
     for _ in range(_ROUNDS):
         template, polygons = _taught(template, traces, polygons)
     while len(template.vertices) > 3:
@@ -159,14 +158,14 @@ def _of_template(
 def _taught(
     template: _Template, traces: Sequence[Traces], polygons: Sequence[Polygon]
 ) -> tuple[_Template, list[Polygon]]:
-    """The template that symbols teach, and each of them by what the others do."""
+    """The template learned from all symbols, and each symbol under that of the others."""
     template, others = template.learnt(polygons)
     each = zip(traces, polygons, others, strict=True)
     return template, [_fit(trace, one.vertices, other.prior, _FEW_STEPS) for trace, one, other in each]
 
 
 def _own_polygon(traces: Traces, outline: FloatArray) -> Polygon:
-    """The likeliest polygon about an outline, of a shape of its own: vertices go while that is likelier."""
+    """Most likely polygon of its own shape about an outline; vertices go while that is likelier."""
     vertices = outline
     while len(vertices) > _MOST_VERTICES:
         vertices = vertices[_but_flattest(vertices)]
@@ -186,7 +185,7 @@ def _anywhere(start: FloatArray) -> Prior:
 
 
 def _but_flattest(vertices: FloatArray) -> BoolArray:
-    """The vertices (N,) of a polygon but that with least of its area (Visvalingam and Whyatt, 1993)."""
+    """The vertices (N,) of a polygon except that of the smallest area (Visvalingam and Whyatt, 1993)."""
     before, after = np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0)
     area = np.abs(signed_area(np.stack([before, vertices, after], axis=1)))
     return np.asarray(np.arange(len(vertices)) != area.argmin())
@@ -194,10 +193,10 @@ def _but_flattest(vertices: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class _Template:
-    """Vertices (N, 2) about their middle, the long side along x, and their covariance (2N, 2N), m^2.
+    """Vertices (N, 2) about their centre, long side along x, and covariance (2N, 2N), m^2.
 
-    Symbols deviate from it by ``paint_m`` a coordinate and by ``sizes`` (2,), sigmas of the logarithms of
-    length and width.
+    Symbols deviate by ``paint_m`` per coordinate and ``sizes`` (2,), sigmas of the logarithms of length and
+    width.
     """
 
     vertices: FloatArray
@@ -220,7 +219,7 @@ class _Template:
 
     @property
     def spread(self) -> FloatArray:
-        """Covariance (2N, 2N) of a symbol's vertices about the template's, but for its pose."""
+        """Covariance (2N, 2N) of a symbol's vertices about the template, up to pose."""
         turning = (self.vertices @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()
         basis = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(self.vertices), 1)), turning]))[0]
         sized = self.stretch * self.sizes
@@ -228,7 +227,7 @@ class _Template:
         return np.asarray(own + _ANYWHERE_M**2 * len(self.vertices) * basis @ basis.T)
 
     def pose(self, vertices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotation (2, 2) and place (2,) that bring the template to vertices (N, 2)."""
+        """Rotation (2, 2) and translation (2,) that align the template with vertices (N, 2)."""
         middle = vertices.mean(axis=0)
         cross = (vertices - middle) @ [1, 1j] @ (self.vertices @ [1, -1j])
         c, s = np.array([cross.real, cross.imag]) / max(abs(cross), 1e-12)
@@ -236,13 +235,13 @@ class _Template:
         return rotation, middle - rotation @ self.vertices.mean(axis=0)
 
     def prior(self, vertices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (2N,) and covariance (2N, 2N) of a symbol's vertices that lie about (N, 2)."""
+        """Prior mean (2N,) and covariance (2N, 2N) of a symbol's vertices near (N, 2)."""
         rotation, place = self.pose(vertices)
         turn = np.kron(np.eye(len(vertices)), rotation)
         return (self.vertices @ rotation.T + place).ravel(), turn @ (self.covariance + self.spread) @ turn.T
 
     def laid_about(self, outline: FloatArray) -> list[FloatArray]:
-        """The template on an outline (K, 2): along it, across it, and both turned around."""
+        """The template placed on an outline (K, 2): along it, across it, and both reversed."""
         points = _evenly(outline)
         axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
         own = (self.vertices - _evenly(self.vertices).mean(axis=0)) @ [1, 1j] * (axes[0] @ [1, 1j])
@@ -250,7 +249,7 @@ class _Template:
         return [np.column_stack([one.real, one.imag]) + points.mean(axis=0) for one in turned]
 
     def learnt(self, members: Sequence[Polygon]) -> tuple[_Template, list[_Template]]:
-        """The template of all members, and for each that of the others."""
+        """The template of all members, and for each member that of the others."""
         mean, spread = self.vertices.ravel(), np.linalg.inv(self.spread)
         paint2, sizes2 = _FREEDOM * SHAPE_SIGMA_M**2, _FREEDOM * np.full(2, _SIZE_SIGMA**2)
         information, pulls = [], []
@@ -258,12 +257,12 @@ class _Template:
             rotation, place = self.pose(one.vertices)
             turn = np.kron(np.eye(len(one.vertices)), rotation)
             data, here = turn.T @ one.data @ turn, ((one.vertices - place) @ rotation).ravel()
-            # What the images say of the template, the symbol's own deviations marginalised.
+            # Information of the images on the template, the symbol's own deviations marginalised.
             gain = spread @ np.linalg.inv(data + spread)
             known, pull = gain @ data, gain @ (data @ here - turn.T @ one.pull)
             information.append(known)
             pulls.append(pull)
-            # Second moments of those deviations, given the images (expectation maximisation).
+            # Second moments of those deviations given the images (expectation maximisation).
             off, own2 = pull - known @ mean, np.square(self.sizes)
             paint2 += self.paint_m**2 * (1 + self.paint_m**2 * (off @ off - np.trace(known)) / len(off))
             by_size = self.stretch.T @ known @ self.stretch
@@ -281,7 +280,7 @@ class _Template:
         return of(everyone), [of([k for k in everyone if k != own]) for own in everyone]
 
     def edge_errors(self, members: Sequence[Polygon]) -> list[FloatArray]:
-        """Covariances (2N, 2N), m^2, of what all images misplace alike, by how each member deviates."""
+        """Covariances (2N, 2N), m^2, of errors common to all images, from each member's deviation."""
         if len(members) < 2:
             return [EDGE_SIGMA_M**2 * np.eye(self.vertices.size)]
         off, formal = [], []
@@ -294,7 +293,7 @@ class _Template:
 
 
 def _evenly(ring: FloatArray) -> FloatArray:
-    """A hundred points (100, 2) evenly along a closed polygon (N, 2)."""
+    """Points (100, 2), evenly spaced along a closed polygon (N, 2)."""
     closed = np.vstack([ring, ring[:1]])
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     wanted = np.linspace(0, at[-1], 100, endpoint=False)
@@ -302,7 +301,7 @@ def _evenly(ring: FloatArray) -> FloatArray:
 
 
 def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -> Polygon:
-    """The likeliest polygon from vertices ``start`` (N, 2)."""
+    """The maximum a posteriori polygon, from vertices ``start`` (N, 2)."""
     vertices: FloatArray = start
     shift_px, sigma_px = np.zeros((len(traces.px_from_map), 2)), 2 * _SIGMA_PX
     for _ in range(steps):
@@ -329,10 +328,10 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
 def _explained(
     traces: Traces, vertices: FloatArray, shift_px: FloatArray, sigma_px: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """Each piece beside its likeliest edge: observations that it is worth (P,), px that it is off (P,).
+    """Effective observations (P,) and offset, px, (P,) of each piece from its most likely edge.
 
-    Then the edge's outer normal (P, 2), the derivative (P, 2N) of the edge's place by the vertices, and the
-    log likelihood of all pieces.
+    Then the edge's outer normal (P, 2), the Jacobian (P, 2N) of the edge by the vertices, and the
+    log-likelihood of all pieces.
     """
     rows, image = np.arange(len(traces.image)), traces.image
     pixel = apply_in_front(traces.px_from_map, vertices)
@@ -351,7 +350,7 @@ def _explained(
     inlier = (
         np.log((1 - _STRAY) * sharp / (2 * np.pi * sigma_px * _TURN_SIGMA_RAD)) - 0.5 * squared[rows, edge]
     )
-    # Pieces lie anywhere along the polygon: of two that explain them, the shorter one is likelier.
+    # Pieces are uniform along the polygon: of two that explain them, the shorter is likelier.
     perimeter = np.maximum(np.nansum(length, axis=1), 1.0)
     inlier += np.log(
         _CORRELATED_PX * np.bincount(image, traces.weight, len(perimeter))[image] / perimeter[image]
@@ -377,9 +376,9 @@ def _explained(
 def _normal(
     traces: Traces, info: FloatArray, off_px: FloatArray, normal: FloatArray, jacobian: FloatArray
 ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
-    """Information (2N, 2N) and gradient (2N,) of the vertices, the images' shifts marginalised.
+    """Information (2N, 2N) and gradient (2N,) of the vertices, image shifts marginalised.
 
-    Lastly the shifts (I, 2), px, that follow a step (2N,).
+    Then a function from a step (2N,) to the shifts (I, 2), px.
     """
     weighted, images = info[:, None] * jacobian, len(traces.px_from_map)
     shifted = np.eye(2) / traces.shift_px[:, None, None] ** 2

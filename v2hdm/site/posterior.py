@@ -1,11 +1,10 @@
-"""The posterior of a candidate: a marking of its class, of a shape of its own, part of a symbol, or clutter.
+"""Posterior of a candidate: marking of its class, of its own shape, part of a symbol, or clutter.
 
-A hypothesis says how the painted corners scatter about a laid shape (covariance N), and how the solved
-corners scatter about the painted ones: P of the adjustment, and O for edges that all images misplace alike.
-No hypothesis says anything about rigid motions. In the five other directions the deviation r of the solved
-corners from the laid shape has the marginal likelihood N(r; 0, P + O + N). A hypothesis of more freedom
-spreads over a larger volume, so that all compare fairly. How often each kind holds is learned from the drive,
-class by class (expectation maximisation with a Dirichlet prior).
+A hypothesis has a scatter of painted corners about a laid shape, covariance N, and of solved about painted
+corners: P from the adjustment, O for edges that all images misplace alike. All are indifferent to rigid
+motions. In the other five directions the deviation r of the solved corners from the laid shape has the
+marginal likelihood N(r; 0, P + O + N), which penalises freedom. The hypotheses' frequencies are learned per
+class and drive (expectation maximisation with a Dirichlet prior).
 """
 
 from __future__ import annotations
@@ -37,80 +36,79 @@ OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, PIECE, OWN_SHAPE, PART_OF_SYMBO
 """Hypotheses about a candidate; the first six are markings."""
 
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
-"""Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
+"""Dirichlet prior: expected counts of the hypotheses among about twenty candidates."""
 
 _KINDS = len(_PRIOR_COUNT)
 
-_SIZE_SIGMA_M = 1.0  # sigma of a side, m, of a marking of its own size: any paint on a road is within it
+_SIZE_SIGMA_M = 1.0  # sigma of a side, m, of a marking of its own size: covers any paint on a road
 
-_LENGTH_SIGMA_M = 0.3  # sigma, m, of the length of paint by the metre before the drive says: a tenth of it
+_LENGTH_SIGMA_M = 0.3  # prior sigma of the length of paint rolled by the metre, m: a tenth of it
 
 _REPEATED_COUNT = 3.0
-"""Concentration of the Dirichlet process of lengths: paint of another length repeats one that was seen."""
+"""Concentration of the Dirichlet process of lengths: paint of another length repeats a known one."""
 
 _SOUND_SPREAD, _WORN_SPREAD = (0.0, 0.4), (1.5, 0.7)
-"""Mean and sigma of the logarithm of how uncertain an end is beside a typical one of its class: images of a
-sound end agree, a worn one ends elsewhere in each (229 sound ends and 10 worn ones of a rendered port)."""
+"""Mean and standard deviation of the logarithm of an end's scatter relative to its class: images agree on a
+sound end, a worn one ends elsewhere in each (229 sound and 10 worn ends of a rendered port)."""
 
 _UNCLEAR_SHARE, _CLEAR_SHARE = 0.05, 0.1
-"""Share of the sound ends that are as uncertain as worn ones, being far off, and of the worn ones that all
-images show alike (5 of 229 and 1 of 11 ends there)."""
+"""Fraction of sound ends that scatter like worn ones, being distant, and of worn ones that all images show
+alike (5 of 229 and 1 of 11 ends there)."""
 
 _MISPLACED_M = 0.3  # sigma, m, of a worn end or a corner from another edge (17 worn ends: .08 to .74 m)
 
-_WORN_SHARE = 0.5  # the same as a share of the length, where a stretch is worn away: any part may be
+_WORN_SHARE = 0.5  # the same relative to the length: any part may be worn away
 
-_CUT_SHARE = 0.1  # share of the breadth, sigma, by which a corner of a piece lies off its sides: cuts slant
+_CUT_SHARE = 0.1  # sigma, relative to the width, of a corner at a slanting cut
 
-_RUN_ON_M = 1.0  # sigma, m, of an end that runs on into other paint: letters and lines are about as long
+_RUN_ON_M = 1.0  # sigma, m, of an end that merges with other paint: about the length of letters
 
 _RATE_STRENGTH = 4.0
-"""Images that the common rate of a class is worth: how alike its markings are in how often they are found."""
+"""Images that the class's detection rate is worth: how similar its markings' rates are."""
 
-_NEGLECTED_SHARE = 0.1  # share of markings that are worn or hidden, and found at any rate
+_NEGLECTED_SHARE = 0.1  # fraction of markings that are worn or hidden, with any detection rate
 
 _CLUTTER_FOUND = (0.5, 2.0)
-"""Beta distribution of how often clutter, or part of a symbol, is found in an easy view: a fifth of them."""
+"""Beta distribution of the detection rate of clutter, or part of a symbol, in easy views: a fifth."""
 
 _BARE_FOUND = (0.05, 10.0)
-"""Beta distribution of how often bare ground is taken for a given marking: in one view of two hundred."""
+"""Beta distribution of the rate of such detections on bare ground: one view in two hundred."""
 
 _LIKE_CLASS, _LIKE_SHARE = 0.9, 0.2
-"""Share of other paint and of clutter that is shaped like the class it was taken for, of any length, and how
-far its corners lie off, as a share of the breadth: what a detector takes for a class is nearly one to look
-at, and is fitted as one."""
+"""Fraction of other paint and clutter that is shaped like the class it was taken for, at any length, and the
+sigma of its corners relative to the width: detections of a class resemble it, and are fitted as such."""
 
-_CLUTTER_REPEATS = 0.7  # probability that clutter which some images have shown is shown by one more
+_CLUTTER_REPEATS = 0.7  # probability that clutter seen in some images is seen in one more
 
-_AGREEING = (0.93, 0.6)  # share of the observations of a marking, and of clutter, that agree with the solve
+_AGREEING = (0.93, 0.6)  # fraction of observations of a marking, and of clutter, that agree with the solution
 
-CORNERS_OF_IMAGE = 4.0  # observations that err together: those of one image
+CORNERS_OF_IMAGE = 4.0  # number of correlated observations: those of one image
 
 _UNDER_SYMBOL = (0.02, 0.5)
-"""Share of the images of a marking, and of part of a symbol, in which a symbol lies on it.
+"""Fraction of a marking's images, and of a symbol part's, in which a symbol covers it.
 
-Every second part of other paint is of a letter or a drawing that no class has, and counts as a marking here.
+Half of the parts of other paint belong to letters or drawings without a class, and count as markings here.
 """
 
 _ODDS, _ODDS_SIGMA, _ODDS_FREEDOM = (5.0, 2.5), 1.2, 4.0
-"""The detector's mean log odds of a marking: mean and sigma of a class's before the drive says (in a rendered
-port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members' about it (1.0 of the
-diamonds) and their degrees of freedom in Student's t distribution, since worn ones are among them."""
+"""Log-odds of the detector, averaged over a marking: prior mean and standard deviation of a class's (in a
+rendered port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members about it
+(1.0 for diamonds), and degrees of freedom of Student's t distribution, for worn ones."""
 
-_OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same of anything else (14 candidates of a rendered port)
+_OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same for anything else (14 candidates of a rendered port)
 
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
 _FIRST, _SECOND = np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5])
-"""Of a parallelogram with the sides u and v corner k lies at its centre plus first[k] u + second[k] v."""
+"""Corner k of a parallelogram with sides u and v lies at its centre plus first[k] u + second[k] v."""
 
 _CORNERS_MOVED = np.concatenate([np.eye(4), np.eye(4)[:2] - np.eye(4)[2:]])
-"""How corners (6, 4) are taken wrongly: one alone, or two opposite ones by opposite ways.
+"""Displaced corners (6, 4): one alone, or two opposite corners in opposite directions.
 
-The shape that is fitted to an image is nearly a parallelogram, so that one wrong corner takes another along.
+The quadrilateral fitted to an image is nearly a parallelogram, so that one wrong corner drags another.
 """
 
-_NOTHING = np.zeros((8, 8))  # of what nothing misplaces
+_NOTHING = np.zeros((8, 8))  # covariance of no misplacement
 
 _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
 
@@ -119,15 +117,15 @@ _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECO
 class Posterior:
     """The posterior of G candidates."""
 
-    probability: FloatArray  # (G, 8) of each kind
+    probability: FloatArray  # (G, 8) of each hypothesis
     log_odds: FloatArray  # (G,) of being a marking
     candidates: Candidates  # with the corners of a marking
-    evidence: FloatArray  # (G, 5) nats for a marking: shape, images, easy views, agreement, look
-    misfit: FloatArray  # (G,) p-value of the deviation from its class's nearest shape, 1 without
+    evidence: FloatArray  # (G, 5) nats for a marking, from shape, images, easy views, agreement, appearance
+    misfit: FloatArray  # (G,) p-value of the deviation from the nearest shape of its class; 1 without
 
 
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
-    """The posterior of G candidates of classes ``kind`` (G,), given where and how often they were seen."""
+    """Posterior of G candidates of classes ``kind`` (G,), given their positions and counts."""
     total = len(candidates)
     probability, evidence = np.zeros((total, _KINDS)), np.zeros((total, 5))
     log_odds, misfit = np.zeros(total), np.ones(total)
@@ -142,9 +140,9 @@ def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posteri
 
 
 def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
-    """The posterior of the candidates of one class, which together say what its markings are like."""
+    """Posterior of the candidates of one class, which jointly determine its markings' distribution."""
     share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
-    # Before anything is known of the class, what agreeing images show whole is taken for a marking.
+    # Initially, candidates that agreeing images show whole are taken for markings.
     taken = candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations)
     weight, probability = np.asarray(taken, dtype=np.float64), np.zeros((len(candidates), _KINDS))
     believed = candidates
@@ -173,13 +171,13 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER].max(axis=0)
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
     like_others = [one.fit[2] for one in hypotheses if one.kind in (OF_CLASS, OTHER_LENGTH)]
-    # A paint error has the tails of Student's t distribution, its square those of Fisher's.
+    # Paint errors follow Student's t distribution, their squares Fisher's F.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
     return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence, misfit)
 
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihoods (4, N, 3) of images, easy views, the rest, looks; for marking, other paint, clutter."""
+    """Log-likelihoods (4, N, 3) of images, easy views, others, appearance; marking, other paint, clutter."""
     images = np.maximum(counts.images, 1)
     stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
     shown = np.stack([_geometric(images, stay), *2 * [_geometric(images, _CLUTTER_REPEATS)]], axis=1)
@@ -196,14 +194,14 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     there = counts.images > 0
     alike = _log_like_class(counts.log_odds, weight * there)
     unlike = norm.logpdf(counts.log_odds, *_OTHER_ODDS)
-    # The shaft of an arrow looks like a dash, most else like nothing that the detector knows.
+    # The shaft of an arrow looks like a dash; most other clutter like no known class.
     either = np.logaddexp(alike, unlike) - np.log(2)
     looks = np.stack([alike, either, unlike], axis=1) * there[:, None]
     return np.stack([shown, found, rest, looks])
 
 
 def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
-    """Log likelihood (N,) of a marking's mean log ``odds`` (N,), by those of markings (``weight``)."""
+    """Log-likelihood (N,) of a marking's mean log-odds ``odds`` (N,), under that of markings (``weight``)."""
     (usual, sigma), least, total = _ODDS, _ODDS_SIGMA**2, weight.sum()
     information = sigma**-2 + total / least
     mean = (usual / sigma**2 + weight @ odds / least) / information
@@ -213,12 +211,12 @@ def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _geometric(images: IntArray, stay: float) -> FloatArray:
-    """Log likelihood of so many images, given the probability of one more."""
+    """Log-likelihood of numbers of images, given the probability ``stay`` of one more."""
     return np.asarray(np.log1p(-stay) + (images - 1) * np.log(stay))
 
 
 def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
-    """Log likelihood (N,) of ``found`` (N,) in ``easy_views`` (N,), by the class's ``rate`` or any rate."""
+    """Log-likelihood (N,) of ``found`` out of ``easy_views`` (N,), at the class's ``rate`` or any."""
     usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
     neglected = _rates(found, easy_views, 1.0, 1.0)
     both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
@@ -226,12 +224,12 @@ def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
 
 
 def log_found_where_none_is(found: IntArray, easy_views: IntArray) -> FloatArray:
-    """Log likelihood (N,) that bare ground is taken for markings ``found`` times in ``easy_views`` (N,)."""
+    """Log-likelihood (N,) of ``found`` detections out of ``easy_views`` (N,) on bare ground."""
     return _rates(found, easy_views, *_BARE_FOUND)
 
 
 def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) -> FloatArray:
-    """Log beta-binomial likelihood (N,) of the easy views."""
+    """Beta-binomial log-likelihood (N,) of the easy views."""
     left = easy_views - found
     return np.asarray(betaln(found + hits, left + misses) - betaln(hits, misses))
 
@@ -243,22 +241,22 @@ class _Hypothesis:
     kind: int
     log_prior: float
     candidates: Candidates
-    directions: FloatArray  # (N, 5, 8) in which deviations count
-    residual: FloatArray  # (N, 5) from where a shape was laid
-    scatter: FloatArray  # (..., 8, 8) of painted corners
-    misplaced: FloatArray  # (..., 8, 8) by all images
+    directions: FloatArray  # (N, 5, 8) in which deviations are tested
+    residual: FloatArray  # (N, 5) from the laid shape
+    scatter: FloatArray  # (..., 8, 8) covariance of painted corners
+    misplaced: FloatArray  # (..., 8, 8) covariance common to all images
     paint_m2: float
-    one_way: FloatArray | None  # (N, 8, K) or only along these: paint wears inwards
-    beside: FloatArray | float  # (N,) log likelihood of what else is known
+    one_way: FloatArray | None  # (N, 8, K) one-sided directions, if any: paint wears inwards
+    beside: FloatArray | float  # (N,) log-likelihood of other data
 
     @cached_property
     def formal(self) -> FloatArray:
-        """Covariance (N, 5, 5) of the residual by that of the solved corners alone."""
+        """Covariance (N, 5, 5) of the residual from the solved corners alone."""
         return _within(self.directions, self.candidates.covariance_m2)
 
     @cached_property
     def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariance of the residual, its inverse times the residual, and the residual squared, in sigmas."""
+        """Covariance of the residual, its inverse times the residual, and squared Mahalanobis distance."""
         innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
         innovation = innovation + self.paint_m2 * np.eye(5)
         solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
@@ -266,7 +264,7 @@ class _Hypothesis:
 
     @property
     def log_likelihood(self) -> FloatArray:
-        """Marginal likelihood (N,) of the residual."""
+        """Marginal log-likelihood (N,) of the residual."""
         innovation, solved, squared = self.fit
         both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
         both_ways = both_ways + self.beside
@@ -275,18 +273,18 @@ class _Hypothesis:
         moved = self.directions @ self.one_way
         mean = np.sum(moved * solved[..., None], axis=1)
         held = np.sum(moved * np.linalg.solve(innovation, moved), axis=1)
-        # Of two ways each by itself: how their errors hang together changes the quadrant by little.
+        # Two directions are treated as independent: correlation changes the quadrant's probability little.
         inside = norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2)
         return np.asarray(both_ways + inside.sum(axis=1))
 
     def corners(self, paint_m2: FloatArray) -> Candidates:
-        """The corners under the hypothesis (a Kalman update), where edges err by ``paint_m2`` (N,)."""
+        """Corners under the hypothesis (a Kalman update) with edge errors ``paint_m2`` (N,)."""
         covariance = self.candidates.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
         noise = _within(self.directions, self.scatter)
         seen = self.directions @ covariance
         innovation = seen @ np.swapaxes(self.directions, 1, 2) + noise
         gain = np.swapaxes(np.linalg.solve(innovation, seen), 1, 2)
-        # Joseph's form: a sum of squares, so that what is nearly known keeps its small variance.
+        # Joseph's form, a sum of squares, keeps small variances positive.
         left = np.eye(8) - gain @ self.directions
         after = left @ covariance @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
         corners = self.candidates.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
@@ -299,9 +297,9 @@ def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @dataclass
 class _Space:
-    """The hypotheses on N ``candidates`` so far, ``believed`` to be where they are.
+    """Hypotheses on N ``candidates``; ``believed`` are their corners from the previous pass.
 
-    ``share`` (8,) is that of the kinds, ``paint`` how far edges err, ``series`` what the line of each says.
+    ``share`` (8,) are frequencies, ``paint`` the edge errors, ``series`` the evidence of lines of dashes.
     """
 
     candidates: Candidates
@@ -321,7 +319,7 @@ class _Space:
         one_way: FloatArray | None = None,
         beside: FloatArray | float = 0.0,
     ) -> None:
-        """Add one that has a ``part`` of its kind's share; see :class:`_Hypothesis` for the rest."""
+        """Add one with a ``part`` of its kind's frequency; see :class:`_Hypothesis` for the rest."""
         off = (self.candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
         residual = (laid.directions @ off)[..., 0]
         errors = scatter, misplaced, self.paint.sigma_m**2, one_way, beside
@@ -339,10 +337,10 @@ def _hypotheses(
     other_length: FloatArray,
     vague: FloatArray,
 ) -> _Space:
-    """All that N candidates, ``believed`` to be where they are, may be, given the shapes of their class.
+    """All hypotheses on N candidates, ``believed`` in the previous pass, given the class's shapes.
 
-    ``weight`` and ``other_length`` (N,) are probabilities of being a marking, and of another length;
-    ``vague`` (N, 4) the log likelihood ratio of views that disagree on a corner.
+    ``weight`` and ``other_length`` (N,) are the probabilities of a marking, and of another length; ``vague``
+    (N, 4) is the log-likelihood ratio of views that disagree on a corner.
     """
     space = _Space(candidates, believed, share, paint)
     total, ragged = sum(shape.share for shape in shapes), np.zeros(len(candidates))
@@ -363,7 +361,7 @@ def _hypotheses(
 def _add_shape(
     space: _Space, shape: Shape, part: float, weight: FloatArray, other_length: FloatArray, vague: FloatArray
 ) -> FloatArray:
-    """Add the hypotheses of one shape, a ``part`` of the class; log likelihood (N,) of as ragged clutter."""
+    """Add one shape's hypotheses, a ``part`` of the class; log-likelihood (N,) of equally ragged clutter."""
     candidates, share = space.candidates, space.share
     laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
     scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
@@ -408,14 +406,14 @@ def _add_shape(
     angles = [[_NOTHING, _slanted(laid.corners_map, end)] for end, _ in ends]
     for each, one, about in ways:
         _add_wrong_ends(space, each, one, [(1 - other, about), (other, longer)], ends, angles, worn)
-    # Of what is no marking any end is as likely ragged as not.
+    # An end of clutter is ragged with probability one half.
     ragged = np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
     _add_alike(space, part, laid, alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter), ragged)
     return ragged
 
 
 def _add_alike(space: _Space, part: float, laid: Laid, scatter: FloatArray, beside: FloatArray) -> None:
-    """Add other paint and clutter that are shaped like the class."""
+    """Add hypotheses of other paint and of clutter shaped like the class."""
     ragged = scatter + _MISPLACED_M**2 * np.eye(8)
     for kind, about in ((PART_OF_SYMBOL, scatter), (CLUTTER, ragged)):
         space.add(kind, part * _LIKE_CLASS, laid, about, beside=beside)
@@ -430,7 +428,7 @@ def _add_wrong_ends(
     angles: Sequence[Sequence[FloatArray]],
     worn: Sequence[FloatArray],
 ) -> None:
-    """Add those of one end that is worn, or runs on: of each length, cut at each angle."""
+    """Add hypotheses of one end worn, or merged with other paint, of any length and cut angle."""
     for (end, extent_m), cuts, ragged in zip(ends, angles, worn, strict=True):
         ways: tuple[tuple[FloatArray, FloatArray | float], ...] = (
             (_MISPLACED_M * end, ragged),
@@ -445,7 +443,7 @@ def _add_wrong_ends(
 def _add_pieces(
     space: _Space, part: float, laid: Laid, scatter: FloatArray, ends: Sequence[tuple[FloatArray, FloatArray]]
 ) -> None:
-    """Add those of a marking that lacks one end and one side, such as what another vehicle leaves in view."""
+    """Add hypotheses of a marking without one end and one side, as another vehicle may leave it in view."""
     for (one, reach_m), (other_end, other_m) in itertools.product(ends[:2], ends[2:]):
         both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, other_m * other_end], axis=2))
         slanted = _slanted(laid.corners_map, one + other_end, _CUT_SHARE)
@@ -455,10 +453,10 @@ def _add_pieces(
 def _worn_evidence(
     candidates: Candidates, ends: Sequence[FloatArray], weight: FloatArray
 ) -> list[FloatArray]:
-    """Log likelihood ratios (N,) that an end is worn rather than sound, by how far images disagree on it.
+    """Log-likelihood ratios (N,) of a worn against a sound end, from the images' disagreement on it.
 
-    ``ends`` (N, 8) move two corners by 1 m inwards, in opposite pairs, of which what both share does not
-    count.
+    ``ends`` (N, 8) move two corners by 1 m inwards, in opposite pairs; disagreement common to a pair is
+    excluded.
     """
     whole = candidates.known.all(axis=1)
     variance = [candidates.along(end / 2, (end + ends[k ^ 1]) / 2) for k, end in enumerate(ends)]
@@ -471,7 +469,7 @@ def _worn_evidence(
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
-    """Log likelihood ratio (N, 4) that a corner is worn or hidden, by the views that disagree on it."""
+    """Log-likelihood ratio (N, 4) of a worn or hidden corner, from views that disagree on it."""
     found = np.maximum(counts.found[:, None], counts.pointed)
     vague = found - counts.pointed
     rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
@@ -482,10 +480,10 @@ def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
 def _other_lengths(
     candidates: Candidates, laid: Laid, shorter: FloatArray, sigma_m: float, weight: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Sigma, m, of other lengths, and the log likelihood ratio (N,) of one as others have it, to its own.
+    """Standard deviation, m, of other lengths, and the log-likelihood ratio (N,) of a repeated to a new one.
 
-    Paint of another length, by ``weight`` (N,), may be repeated (a Dirichlet process); ``shorter`` (N, 8)
-    shortens it by 1 m.
+    Paint of another length, by ``weight`` (N,), may repeat (a Dirichlet process); ``shorter`` (N, 8) shortens
+    it by 1 m.
     """
     off_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     own_m2 = candidates.along(shorter, shorter)
@@ -499,7 +497,7 @@ def _other_lengths(
 
 
 def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """Motions (N, 8) of corners as a side moves inwards by 1 m, and how far (N, 1) it can, m."""
+    """Motions (N, 8) of corners for a side moving inwards by 1 m, and their limits (N, 1), m."""
     ways = []
     for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
         extent_m = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
@@ -512,7 +510,7 @@ def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, Flo
 
 
 def _slanted(corners: FloatArray, end: FloatArray, share: float = 0.5) -> FloatArray:
-    """Covariance (N, 8, 8), m^2, of an ``end`` cut off at any angle: by half the breadth at 45 degrees."""
+    """Covariance (N, 8, 8), m^2, of an ``end`` cut at any angle: half the width at 45 degrees."""
     breadth_m = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
     each = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
     return np.asarray((share * breadth_m)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))
@@ -523,7 +521,7 @@ def _outer(vectors: FloatArray) -> FloatArray:
 
 
 def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: BoolArray) -> PaintError:
-    """The paint error estimated from how ``whole`` candidates (N,) deviate from their class's shapes."""
+    """Paint error from the deviations of ``whole`` candidates (N,) from their class's shapes."""
     members = [
         (one.residual[k], one.formal[k])
         for one, probability in zip(hypotheses, each, strict=True)
@@ -534,7 +532,7 @@ def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: Boo
 
 
 def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintError) -> Candidates:
-    """The corners as the hypotheses that are markings have them, by mean and covariance of their mixture."""
+    """Mean and covariance of the corners under the mixture of marking hypotheses."""
     markings = [k for k, one in enumerate(hypotheses) if one.kind < PART_OF_SYMBOL]
     weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))
     each = [hypotheses[k].corners(_paint_m2(hypotheses[k], paint)) for k in markings]
@@ -547,7 +545,7 @@ def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintE
 
 
 def _paint_m2(hypothesis: _Hypothesis, paint: PaintError) -> FloatArray:
-    """Variance (N,) of the errors that all images share, given how a candidate deviates from its shape."""
+    """Variance (N,) of errors common to all images, given a candidate's deviation from its shape."""
     if hypothesis.kind != OF_CLASS:
         return np.full(len(hypothesis.residual), paint.sigma_m**2)
     pairs = zip(hypothesis.residual, hypothesis.formal, strict=True)

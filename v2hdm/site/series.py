@@ -1,7 +1,7 @@
-"""Dashes of a line: how far apart they stand says how long each is, and where its middle lies.
+"""Regularity of dashes along a line: their spacing gives each one's length, and its neighbours its centre.
 
-The outer side of a bend is longer than its inner one, paint and gaps alike. Between two others of its line a
-dash lies midway. How often both hold, and how exactly, is learned from the drive.
+In a bend, paint and gaps are longer on the outer side alike, and a dash lies midway between two others. The
+frequency and precision of both regularities are learned from the drive.
 """
 
 from __future__ import annotations
@@ -18,34 +18,34 @@ from v2hdm.site.candidates import Candidates
 from v2hdm.site.shapes import MEMBER_M, Laid
 
 _TURN_RAD, _BESIDE_M = 1.0, 0.5
-"""Most that a line turns by from one dash to the next, a bend of 6 m radius where they are 6 m apart, and how
-far at most they lie beside an arc between them: lines are farther apart."""
+"""Limits from one dash to the next: the line's rotation, as in a bend of 6 m radius at 6 m spacing, and its
+distance from an arc between them, less than that of parallel lines."""
 
 _UNEVEN = 1 / 6
-"""Of the way between two neighbours, the most by which its parts differ: none, or a third where one lacks."""
+"""Largest difference of a dash's two spacings, relative to their sum: none, or a third with one missing."""
 
-_STRETCH = 1.5  # most by which a bend stretches or shrinks a line: 4 m beside a middle of 12 m radius
-_ASIDE_M = 2.0  # sigma of how far a line lies beside the middle of its bend, along which dashes were laid out
-_NEAR = 32  # dashes nearest to one, among which those of its line are looked for
-_LEAST = 3  # dashes of their class's length that others follow: enough for a median
+_STRETCH = 1.5  # largest stretch or compression of a line in a bend: 4 m beside a centre line of 12 m radius
+_ASIDE_M = 2.0  # sigma of a line's offset from the bend's centre line, along which dashes were laid out
+_NEAR = 32  # nearest dashes searched for those of the line
+_LEAST = 3  # dashes of the class's length with successors: enough for a median
 _PASSES = 2  # rounds of expectation maximisation
 
 
 @dataclass(frozen=True)
 class Series:
-    """Length and place of N dashes by their neighbours in the line."""
+    """Length and position of N dashes from their neighbours in the line."""
 
-    longer_m: FloatArray  # (N,) than one of the class, 0 where no other follows
+    longer_m: FloatArray  # (N,) excess over the class's length, 0 without a neighbour
     longer_sigma_m: FloatArray  # (N,)
-    longer_often: float  # share of the dashes whose length follows from the way to the next ones
-    apart_m: FloatArray  # (N,) from the next one
-    middle: FloatArray  # (N, 8) takes corners to the place of their mean along the dash
-    middle_m: FloatArray  # (N,) where that is expected, nan where not two others enclose it
+    longer_often: float  # fraction of dashes whose length follows the spacing
+    apart_m: FloatArray  # (N,) spacing to the next one
+    middle: FloatArray  # (N, 8) maps corners to their mean's position along the dash
+    middle_m: FloatArray  # (N,) its expected value, nan without two neighbours
     middle_sigma_m: FloatArray  # (N,)
-    middle_often: float  # share of the dashes that lie so
+    middle_often: float  # fraction of dashes that are centred so
 
     def evidence(self, corners: Candidates) -> FloatArray:
-        """Log likelihood ratio (N,) of a marking's ``corners`` to one anywhere along its line."""
+        """Log-likelihood ratio (N,) of a marking's ``corners`` against any position along its line."""
         off_m = _times(self.middle, corners) - self.middle_m
         sigma_m = np.sqrt(self.middle_sigma_m**2 + corners.along(self.middle, self.middle))
         ratio = norm.pdf(np.nan_to_num(off_m), 0.0, sigma_m) * np.where(np.isnan(off_m), 1.0, self.apart_m)
@@ -61,10 +61,10 @@ def in_series(
     sigma_m: float,
     weight: FloatArray,
 ) -> Series | None:
-    """Learn the lines of N solved dashes, ``believed`` to be where they are; None where too few follow.
+    """Learn the lines of N solved dashes, ``believed`` in the previous pass; None if too few have neighbours.
 
     ``laid`` is a shape of sigma ``sigma_m`` laid on each, ``shorter`` (N, 8) shortens it by 1 m, ``weight``
-    (N,) is the probability of being a marking.
+    (N,) is the probability of a marking.
     """
     sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
     lengths, rows = np.linalg.norm(sides, axis=2), np.arange(len(sides))
@@ -85,7 +85,7 @@ def in_series(
     known = in_line & marking
     if known.sum() < _LEAST:
         return None
-    # A way that is hardly known says no more of a dash's length than that bends stretch by so much at most.
+    # The largest stretch in bends acts as a prior: uncertain spacings are shrunk to the class's length.
     unknown_m2, most_m2 = (length_m / step_m) ** 2 * apart_m2, (length_m * np.log(_STRETCH) / 2) ** 2
     told = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
     longer_m = length_m * told * np.where(in_line, stretch - 1, 0.0)
@@ -106,10 +106,10 @@ def in_series(
 def _ways(
     believed: Candidates, axis: FloatArray, own_m2: FloatArray, length_m: FloatArray, marking: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """For each dash the way to the next ones, m, and how far ahead their midpoint lies, m, with variances.
+    """Spacing of each dash to its neighbours and offset of their midpoint ahead, m, with variances.
 
-    ``own_m2`` (N,) is the variance of its place along ``axis`` (N, 2). The way is inf without a neighbour,
-    the midpoint nan without one on either side.
+    ``own_m2`` (N,) is the variance of its position along ``axis`` (N, 2). Spacing is inf without a neighbour,
+    the offset nan without one on either side.
     """
     centre = believed.corners_map.mean(axis=1)
     near = cKDTree(centre).query(centre, min(_NEAR, len(centre)))[1].reshape(len(centre), -1)
@@ -132,19 +132,19 @@ def _ways(
         enclosed = np.abs(ahead - behind) < _UNEVEN * (ahead + behind)
         apart_m = np.where(enclosed, (ahead + behind) / 2, np.minimum(ahead, behind))
         off_m = np.where(enclosed, (ahead - behind) / 2, np.nan)
-    # Where a bend begins, the two ways differ by the line's distance from the middle of the bend times the
-    # difference of their turns.
+    # At the start of a bend, the two spacings differ by the line's distance from the bend's centre line times
+    # the difference of their rotations.
     off_m2 = (ahead_m2 + behind_m2 + (_ASIDE_M * (ahead_rad + behind_rad)) ** 2) / 4
     apart_m2 = np.where(enclosed, off_m2, own_m2 + np.where(ahead < behind, ahead_m2, behind_m2))
     return apart_m, apart_m2, off_m, off_m2
 
 
 def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) -> tuple[float, float]:
-    """Sigma, m, of dashes about the place or length that their line gives, and the share that follows it.
+    """Standard deviation, m, of dashes about their line's prediction, and the fraction that follows it.
 
-    ``off_m`` (N,) is how far off each is, ``otherwise`` (N,) the density of that in a dash that does not.
+    ``off_m`` (N,) are deviations, ``otherwise`` (N,) their density for dashes that do not follow.
     """
-    # What scatters more than a class's markings do is in no series.
+    # Dashes that scatter more than markings of a class form no series.
     spread_m, often = min(float(np.median(np.abs(off_m)) / norm.ppf(0.75)), MEMBER_M), 0.5
     series = norm.pdf(off_m, 0.0, np.sqrt(variance + spread_m**2))
     for _ in range(_PASSES):

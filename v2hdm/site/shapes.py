@@ -1,16 +1,15 @@
-"""The shapes that the markings of a class share, and how far painted edges are from where images put them.
+"""Shapes common to the markings of a class, and errors of painted edges common to all images.
 
-The diamonds of a yard are painted with one stencil, the dashes of a road with one roller. A hundred markings
-that were seen well say how large the next one is, which was seen four times, one corner under a puddle
+The diamonds of a yard are painted with one stencil, the dashes of a road with one roller. A hundred
+well-observed markings predict the size of the next one, seen four times with one corner under a puddle
 (empirical Bayes: Efron and Morris, Stein's estimation rule and its competitors, JASA 1973). All classes are
-parallelograms: half the diagonals say all of a shape.
+parallelograms: half the diagonals define a shape.
 
-An edge that is worn or dirty is measured in the same wrong place by every image. That error does not average
-out, and no residual shows it, but each marking deviates from the shape of its class by its own error: most by
-a millimetre, some by centimetres. A normal variance per marking with an inverse-gamma prior describes both,
-so that deviations follow Student's t distribution (Lange, Little and Taylor, Robust statistical modeling
-using the t distribution, JASA 1989). The class teaches the prior; the posterior of a marking is added to the
-covariance of its corners.
+Every image measures a worn or dirty edge in the same wrong place. That error neither averages out nor shows
+in residuals, but it makes each marking deviate from the shape of its class: most by a millimetre, some by
+centimetres. A Gaussian variance per marking with an inverse-gamma prior, and hence deviations of Student's t
+distribution, describe both (Lange, Little and Taylor, Robust statistical modeling using the t distribution,
+JASA 1989). The class determines the prior; a marking's posterior variance is added to its corners'.
 """
 
 from __future__ import annotations
@@ -28,33 +27,33 @@ from v2hdm.geometry.planar import turned_left
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates
 
-_LEAST_MEMBERS = 8  # markings of one shape from which the shape is one of the class
+_LEAST_MEMBERS = 8  # least markings of one shape of a class
 
 _FEWEST_MEMBERS = 3
-"""The same where they are half of the class or more, and agree as only one stencil makes them: from three on,
-two agree against a third one. Beside a commoner shape, pieces of it are soon alike by threes."""
+"""The same if they are at least half of the class and agree as one stencil makes them: from three on, two
+agree against a third. Beside a more common shape, its fragments soon agree by threes."""
 
 _STENCIL_M = 0.03
-"""Sigma of a corner's coordinate about a shape, m, up to which markings agree so: a brush's width."""
+"""Largest sigma of a corner's coordinate about a shape, m, of such agreement: a brush's width."""
 
-_LEAST_SHARE = 0.1  # share of a class's markings from which their shape is one of the class
-MEMBER_M = 0.05  # a marking of which no corner misses a shape by more, m, is of that shape
-_MEMBER_SHARE = 0.08  # the same as a share of the longer diagonal: large paint is laid out less exactly
+_LEAST_SHARE = 0.1  # least fraction of a class's markings with a shape of the class
+MEMBER_M = 0.05  # largest deviation of a member's corners from its shape, m
+_MEMBER_SHARE = 0.08  # the same relative to the longer diagonal: large paint is laid out less exactly
 
 SHAPE_SIGMA_M = 0.01
-"""How far a painted corner lies from where the stencil would have it, m, at least."""
+"""Least sigma of a painted corner about the stencil's, m."""
 
 _ELONGATED = 2.0
-"""Paint this many times as long as wide is rolled by the metre: its width is common, its length its own."""
+"""Ratio of length to width from which paint is rolled by the metre: common width, individual length."""
 
 _GAUSS_NEWTON_STEPS = 3  # steps that refine a laid shape
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A parallelogram (4, 2) about its centre, m, that a class has in common up to ``sigma_m`` a coordinate.
+    """A parallelogram (4, 2) about its centre, m, common to a class up to ``sigma_m`` per coordinate.
 
-    ``share`` of the class's markings have it.
+    A fraction ``share`` of the class's markings has it.
     """
 
     corners: FloatArray
@@ -63,7 +62,7 @@ class Shape:
 
     @property
     def is_elongated(self) -> bool:
-        """Whether it is much longer than wide."""
+        """Whether it is rolled by the metre."""
         sides = np.linalg.norm(self.corners[1:3] - self.corners[:2], axis=1)
         return bool(sides.max() >= _ELONGATED * sides.min())
 
@@ -72,8 +71,8 @@ class Shape:
 class Laid:
     """A shape laid on each of N candidates: ``corners_map`` (N, 4, 2).
 
-    ``shift`` (N,) and ``rotation`` (N, 2, 2) took it there, ``centre`` (N, 2) is its centre, ``directions``
-    (N, 5, 8) are orthonormal directions in which corners move other than rigidly.
+    ``shift`` (N,) and ``rotation`` (N, 2, 2) placed it, ``centre`` (N, 2) is its centre, ``directions``
+    (N, 5, 8) are orthonormal non-rigid directions of the corners.
     """
 
     corners_map: FloatArray
@@ -96,16 +95,15 @@ class Laid:
 
 
 def parallelograms(corners: FloatArray) -> FloatArray:
-    """The parallelograms (..., 4, 2) about their centres that corners (..., 4, 2) come nearest to."""
+    """Nearest parallelograms (..., 4, 2), about their centres, of corners (..., 4, 2)."""
     arms = (corners[..., :2, :] - corners[..., 2:, :]) / 2
     return np.concatenate([arms, -arms], axis=-2)
 
 
 def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid, Laid]:
-    """Move and turn a parallelogram (4, 2) onto ``candidates``, corners weighted by their full covariances.
+    """Align a parallelogram (4, 2) with ``candidates``, weighted by their full covariances.
 
-    It looks the same from both ends, so that one shift by a corner is all there is to try: the better way
-    first.
+    By its symmetry there are two alignments, shifted by one corner: the better one comes first.
     """
     information = np.asarray(np.linalg.inv(candidates.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
     ways = [_lay(np.roll(shape, -shift, axis=0), candidates, information) for shift in (0, 1)]
@@ -122,15 +120,15 @@ def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid
 def _lay(
     shape: FloatArray, candidates: Candidates, information: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Placed corners (N, 4, 2), rotations, centres (N, 2) and what is left, squared, in sigmas (N,)."""
+    """Aligned corners (N, 4, 2), rotations, centres (N, 2) and squared Mahalanobis distances (N,)."""
     corners = candidates.corners_map
-    # What shifts all corners alike says nothing about their weights.
+    # A shift common to all corners is irrelevant to their weights.
     apart = candidates.covariance_m2.reshape(-1, 4, 2, 4, 2)
     common = np.einsum("naibi->n", apart) / 32
     weight = 1 / np.maximum(candidates.sigma_m**2 / 2 - common[:, None], 1e-6)
     total = weight.sum(axis=1, keepdims=True)
     target_centre, own_centre = np.einsum("nc,ncx->nx", weight, corners) / total, weight @ shape / total
-    # As complex numbers: the turn is the argument of the weighted sum of targets over shapes.
+    # With complex numbers the rotation is the argument of the weighted sum of targets over shapes.
     a, b = (
         (one - middle[:, None]) @ [1, 1j] for one, middle in ((shape, own_centre), (corners, target_centre))
     )
@@ -156,7 +154,7 @@ def _turned(angle: FloatArray) -> FloatArray:
 
 
 def rigid_motions(corners: FloatArray) -> FloatArray:
-    """Derivatives (N, 8, 3) of corners (N, 4, 2) by a shift and a turn about their centre."""
+    """Derivatives (N, 8, 3) of corners (N, 4, 2) by translation and rotation about their centre."""
     arms = corners - corners.mean(axis=1, keepdims=True)
     turning = turned_left(arms).reshape(-1, 8, 1)
     shifting = np.broadcast_to(np.tile(np.eye(2), (4, 1)), (len(corners), 8, 2))
@@ -164,7 +162,7 @@ def rigid_motions(corners: FloatArray) -> FloatArray:
 
 
 def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
-    """The shapes that the markings of a class have, commonest first."""
+    """The shapes of a class's markings, most common first."""
     whole = np.flatnonzero(candidates.known.all(axis=1))
     least = max(_LEAST_MEMBERS, _LEAST_SHARE * len(whole))
     shapes: list[Shape] = []
@@ -175,8 +173,8 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
         if count < _FEWEST_MEMBERS:
             break
         spread_m, about_m = _spread_m(corners, left.subset(members))
-        # Of so few, five directions each, mean and spread err: sigma of Student's t distribution about a mean
-        # (Gelman et al., Bayesian Data Analysis, section 3.2).
+        # With so few members, of five directions each, mean and variance are uncertain: sigma of Student's t
+        # distribution about a mean (Gelman et al., Bayesian Data Analysis, section 3.2).
         freedom = 5 * (count - 1)
         wider = float(np.sqrt((1 + 1 / count) * freedom / (freedom - 2)))
         shape = Shape(corners, spread_m * wider, count / len(candidates))
@@ -188,8 +186,8 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
 
 
 def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
-    """The shape (4, 2) that most of N candidates have, and which (N,) have it."""
-    # Sides and diagonals, each pair sorted, whichever corner comes first.
+    """The most common shape (4, 2) of N candidates, and its members (N,)."""
+    # Sides and diagonals, each pair sorted: independent of the first corner.
     corners_map = candidates.corners_map
     side = np.linalg.norm(np.roll(corners_map, -1, axis=1) - corners_map, axis=2)
     diagonals = np.linalg.norm(corners_map[:, 2:] - corners_map[:, :2], axis=2)
@@ -211,7 +209,7 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
 
 
 def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
-    """How far members' corners lie from their shape: beyond their covariances, by the median; with them."""
+    """Scatter of members' corners about their shape: net of their covariances, by the median; and total."""
     laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
     directions = laid.directions
     off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
@@ -227,30 +225,29 @@ def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
 
 
 _FREEDOM_BOUNDS = (1.0, 30.0)
-"""Degrees of freedom of the t distribution: from tails as heavy as Cauchy's to those of a normal one."""
+"""Limits of the t distribution's degrees of freedom: from Cauchy's tails to nearly Gaussian ones."""
 
 _SIGMA_BOUNDS_M = (1e-4, 0.05)
-"""Scale of a paint error, m: from the rounding of a survey to the width of a line."""
+"""Limits of the scale of a paint error, m: from a survey's rounding to a line's width."""
 
 EDGE_SIGMA_M = 0.004
-"""How far all images may misplace a painted edge alike, m: a ragged edge of a sprayed line is about so wide.
+"""Largest sigma of a painted edge common to all images, m: the raggedness of a sprayed line. A class whose
+typical marking scatters by more was painted so: that scatter is no error of the map."""
 
-A class whose typical marking scatters by more was painted so: that scatter is no error of the map."""
-
-_START = (0.002, 3.0)  # scale, m, and degrees of freedom from which the search starts
+_START = (0.002, 3.0)  # initial scale, m, and degrees of freedom of the search
 
 
 @dataclass(frozen=True)
 class PaintError:
-    """Student's t distribution of a corner's coordinate: its scale ``sigma_m`` and degrees of ``freedom``."""
+    """Student's t distribution of a corner's coordinate: scale ``sigma_m`` and degrees of ``freedom``."""
 
     sigma_m: float
     freedom: float
 
     def variance_m2(self, deviation: FloatArray, formal: FloatArray) -> float:
-        """The variance, m^2, of a marking's errors of measurement, given how it deviates from its class.
+        """Posterior variance, m^2, of a marking's edge errors, given its deviation from its class.
 
-        ``deviation`` (m,) m is in orthonormal directions, ``formal`` (m, m) its covariance without paint
+        ``deviation`` (m,), m, is in orthonormal directions, ``formal`` (m, m) its covariance without paint
         errors.
         """
         count = len(deviation)
@@ -261,9 +258,9 @@ class PaintError:
 
 
 def learn_paint_error(deviations: Sequence[FloatArray], formal: Sequence[FloatArray]) -> PaintError:
-    """The distribution under which deviations (m,) of markings are likeliest; of formal covariances (m, m).
+    """Maximum likelihood distribution of deviations (m,) with formal covariances (m, m).
 
-    Without any deviation it is the one from which the search starts.
+    Without deviations, the start of the search.
     """
     if not deviations:
         return PaintError(*_START)

@@ -1,9 +1,8 @@
-"""Symbols of the map (arrows, chevrons, users' own): polygons whose vertices most of their sightings share.
+"""Symbols of the map (arrows, chevrons, users' own), as polygons from most of their sightings.
 
-Once the cameras and poses are known, the outline of every sighting is laid on the ground. Outlines that cover
-each other are sightings of one symbol. What a good part of the images cover that show a place, near ones
-weighing more, is where its vertices start; they are fitted to the outlines in the images
-(:mod:`v2hdm.site.polygons`).
+Under known cameras and poses every sighting's outline is projected to the ground; overlapping outlines are
+one symbol. Ground that a good part of the images shows as paint, weighted towards near ones, gives the
+initial vertices, which are then fitted to the outlines in the images (:mod:`v2hdm.site.polygons`).
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.polygons import LEAST_EXPLAINED, UNSEEN_M, Polygon, Traces, find_polygons
 
 _CELL_M = 0.02
-"""Cells of the average, m; its outline is interpolated between them and simplified by half of one."""
+"""Cells of the average, m; its contour is interpolated between them and simplified by half a cell."""
 
-_MOST_CELLS = 500  # cells along the longer side of the average, beyond which they grow
+_MOST_CELLS = 500  # most cells along the longer side of the average; larger symbols have larger cells
 _PART = 0.3
-"""Share of the weight of the images that show a place from which it is painted: some miss a part."""
+"""Least weighted fraction of the images of a place that show paint there: some miss a part."""
 
 NO_POLYGON = "no simple polygon explains its outline"
 
-_COARSE_M = 0.05  # cells, m, of the raster that overlaps are measured on
-_COMMON = 0.5  # outlines are of one symbol if they share this part of the smaller one's area
+_COARSE_M = 0.05  # cells, m, of the raster for measuring overlap
+_COMMON = 0.5  # least overlap of outlines of one symbol, relative to the smaller area
 
 
 def map_symbols(
@@ -55,11 +54,11 @@ def map_symbols(
     markings: Sequence[Marking],
     options: AcceptanceOptions,
 ) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
-    """The symbols that at least three images show, and those that are no polygons on the ground.
+    """Symbols in at least three images, and rejected ones that are no polygons on the ground.
 
-    ``infos`` are those of the rig's cameras. Far outlines are less certain by ``jitter_rad``, the standard
-    deviation of the viewing direction; paint that is one of the map's ``markings`` is no symbol. Symbols
-    are held to the same ``options`` as markings.
+    ``infos`` are the rig's cameras; ``jitter_rad``, the standard deviation of the viewing direction, makes
+    distant outlines uncertain. Paint of the map's ``markings`` is no symbol; ``options`` apply as to
+    markings.
     """
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
@@ -83,7 +82,7 @@ def map_symbols(
         if any(cv2.pointPolygonTest(ring, one.tolist(), False) >= 0 for one in places[near] - middle):
             continue
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
-        # The border may cut one end in some images, and a shadow hide it: then the other tells.
+        # The border or a shadow may hide one end in some images: then the other is used.
         views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
         objections = [measure_parallax(view, 1).objections(options.min_probability)[0] for view in views]
         if None in objections:
@@ -104,7 +103,7 @@ def map_symbols(
 
 
 def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
-    """Why a polygon is not the shape of a symbol, None if nothing says so."""
+    """Reason why a polygon is not the shape of a symbol, or None."""
     if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
         return NO_POLYGON
     variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
@@ -114,7 +113,7 @@ def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
-    """The symbol as the polygon, whose cameras and poses err as those of the nearest marking do."""
+    """The symbol as the polygon, with the camera and pose errors of the nearest marking."""
     covariance = polygon.covariance
     known = [one for one in markings if one.covariance_m2 is not None]
     if known:
@@ -128,7 +127,7 @@ def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]
 
 @dataclass(frozen=True)
 class _Eyes:
-    """I images, each of a ``camera`` (I,) at a ``frame`` (I,) of a rig, and what they see of the ground."""
+    """I images, by ``camera`` and ``frame`` (I,) of a rig, and their views of the ground."""
 
     camera: IntArray
     frame: IntArray
@@ -138,12 +137,12 @@ class _Eyes:
 
     @cached_property
     def centre_map(self) -> FloatArray:
-        """Where the cameras were (I, 3)."""
+        """Camera centres (I, 3)."""
         extrinsic, pose = self.rig.cam_from_vehicle[self.camera], self.rig.map_from_vehicle[self.frame]
         return np.asarray(np.einsum("nij,nj->ni", pose[:, :3, :3], camera_centre(extrinsic)) + pose[:, :3, 3])
 
     def sigma_m(self, points_map: FloatArray) -> FloatArray:
-        """Standard deviation (I, ...), m, along the ray, of an outline's place at points (..., 2)."""
+        """Standard deviation (I, ...), m, along the ray, of an outline at points (..., 2)."""
         many = (slice(None), *(None,) * (points_map.ndim - 1))
         range_m = np.linalg.norm(points_map - self.centre_map[(*many, slice(2))], axis=-1)
         height_m = self.rig.height_m[self.camera][many]
@@ -151,9 +150,9 @@ class _Eyes:
         return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
 
     def traces(self, shapes: Sequence[FloatArray], seen: Sequence[BoolArray], image: IntArray) -> Traces:
-        """Outlines on the ground, each of an ``image`` (S,), as they are beside polygons in the images.
+        """Ground outlines, each of an ``image`` (S,), as traces beside polygons in the images.
 
-        A camera whose shutter rolls would have taken all of an image's rows in its middle.
+        Rolling shutters are treated as exposing all rows at the image's middle.
         """
         intrinsic = self.rig.intrinsic[self.camera]
         px_from_map = pinhole_px_from_ground(intrinsic, self.rig.cam_from_map(self.camera, self.frame))
@@ -161,7 +160,7 @@ class _Eyes:
         return Traces.of(outlines_px, seen, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
 
     def shows(self, points_map: FloatArray) -> BoolArray:
-        """Which points (N, 2) lie inside which images (I, N), away from the border."""
+        """Whether points (N, 2) lie inside images (I, N), away from the border."""
         cam_from_map = self.rig.cam_from_map(self.camera, self.frame)
         pixel, depth_m = project_ground(self.rig.intrinsic[self.camera], cam_from_map, points_map[None])
         limit = np.array([[info.width, info.height] for info in self.infos])[self.camera, None] - BORDER_PX
@@ -169,10 +168,10 @@ class _Eyes:
 
 
 def _ends(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes, sign: int) -> PointViews:
-    """One end of what each of I images, ``image`` (S,) of the shapes, shows of a symbol.
+    """One end of a symbol in each of I images, ``image`` (S,) of the shapes.
 
-    It is the far end for a ``sign`` of 1, the near one for -1; from the other side it is another point. The
-    points' scatter says how uncertain they are beside the jitter.
+    ``sign`` 1 is the far end, -1 the near one; seen from the other side it is another point. The points'
+    scatter gives their uncertainty besides jitter.
     """
     ends = np.zeros((len(eyes.camera), 2))
     for number, at in enumerate(eyes.centre_map[:, :2]):
@@ -193,7 +192,7 @@ def _ends(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes, sign: int)
 
 
 def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
-    """Indices of polygons that overlap, directly or by way of others."""
+    """Indices of polygons connected by overlap."""
     middle = np.array([(shape.min(axis=0) + shape.max(axis=0)) / 2 for shape in shapes])
     reach_m = np.array([np.ptp(shape, axis=0).max() for shape in shapes])
     pairs = cKDTree(middle).query_pairs(float(reach_m.max()), output_type="ndarray").reshape(-1, 2)
@@ -206,13 +205,13 @@ def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
 
 
 def _common(one: FloatArray, other: FloatArray) -> float:
-    """Common area of two polygons as a share of the smaller one's."""
+    """Common area of two polygons, relative to the smaller."""
     masks = _covered([one, other], _COARSE_M)[0]
     return float((masks[0] & masks[1]).sum() / max(min(mask.sum() for mask in masks), 1))
 
 
 def _covered(shapes: Sequence[FloatArray], cell_m: float) -> tuple[list[np.ndarray], FloatArray]:
-    """Which cells (h, w) each polygon covers, a cell of margin around all, and the centre of the first."""
+    """Cells (h, w) that each polygon covers, with a margin of one cell, and the centre of the first."""
     first = np.min([shape.min(axis=0) for shape in shapes], axis=0) - 2 * cell_m
     last = np.max([shape.max(axis=0) for shape in shapes], axis=0) + 2 * cell_m
     columns, lines = (np.ceil((last - first) / cell_m).astype(int) + 1).tolist()
@@ -226,10 +225,10 @@ def _covered(shapes: Sequence[FloatArray], cell_m: float) -> tuple[list[np.ndarr
 
 
 def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -> FloatArray | None:
-    """The outline (N, 2), counter-clockwise, of what the images take for paint; None if that is nothing.
+    """Counter-clockwise outline (N, 2) of the paint in the images, or None.
 
-    Each of I images, ``image`` (S,) of the shapes, speaks of the ground that it shows, and weighs what it
-    knows of it.
+    Each of I images, ``image`` (S,) of the shapes, votes on the ground in its view, weighted by its
+    precision.
     """
     extent_m = float(np.ptp(np.concatenate(shapes), axis=0).max())
     cell_m = max(_CELL_M, extent_m / _MOST_CELLS)

@@ -1,10 +1,9 @@
-"""How much of its paint each marking has left, as the nearest images show it.
+"""Fraction of paint left of each marking, from the nearest images.
 
-An image is decoded to linear light, in which a pixel half on paint lies half way, and divided by the ground
-beside the marking; a cell may be lit as either side's, as the edge of a shadow often lies across. Each cell
-takes the median of the images that show all corners. The cells are then a mixture of full paint, bare ground
-and cells part of each; how bright full paint is over its ground is the marking's own, with a prior from all
-of its class: dirt dims paint that is whole.
+Images are decoded to linear light, in which a pixel half on paint lies half way, and divided by the ground
+beside the marking; a cell may be lit like either side, as shadow edges often cross. Each cell takes the
+median of images that show all corners. Cells are then a mixture of full paint, bare ground and partial paint;
+the contrast of full paint is the marking's own, with a prior from its class: dirt dims whole paint.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, FloatArray, HdMap, Image, PaintLeft
 
 _CELL_M = 0.02
-_EDGE_M = 0.03  # of a marking that is left out along its sides: blurred, and uncertain by a pose's error
-_BESIDE_M = np.array([0.06, 0.10, 0.14, 0.18])  # from its long sides, where the ground is measured
+_EDGE_M = 0.03  # margin inside the sides that is left out: blurred, and uncertain by pose errors
+_BESIDE_M = np.array([0.06, 0.10, 0.14, 0.18])  # from the long sides, where the ground is measured
 _MOST_CELLS = (60, 24)  # along and across
-_NEAR_M = 12.0  # of the camera, within which images resolve flakes of paint
-_VIEWS = (2, 6)  # fewest and most images of a marking: the errors of more repeat themselves
+_NEAR_M = 12.0  # largest range, at which images resolve flakes of paint
+_VIEWS = (2, 6)  # fewest and most images of a marking: errors of more repeat
 _GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
 """Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
 
@@ -40,16 +39,16 @@ _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the b
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
 _ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
 _MODEL_SIGMA = (0.045, 0.3)
-"""Sigma of a share beside that of the fit, and its growth with what is worn: flakes finer than a pixel look
-like dirt, and a shadow narrower than a marking like wear (143 rendered markings of ports 5 to 8 and 11)."""
+"""Sigma of a fraction beside the fit's, and its growth with wear: flakes finer than a pixel look like dirt, a
+shadow narrower than a marking like wear (143 rendered markings of ports 5 to 8 and 11)."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Places (along, across, 2) in and beside a marking; the first and last columns lie on the ground."""
+    """Points (along, across, 2) in and beside a marking; the first and last columns lie on the ground."""
 
     places_map: FloatArray
-    contrasts: list[FloatArray]  # of each image (3, along, across), over one side's ground, the other's, both
+    contrasts: list[FloatArray]  # by image (3, along, across): over one side's ground, the other's, both
 
     @classmethod
     def of(cls, corners_map: FloatArray) -> Cells:
@@ -67,7 +66,7 @@ class Cells:
         return cls(Quad(corners_map).at(s.ravel(), t.ravel()).reshape(*s.shape, 2), [])
 
     def add(self, light: FloatArray) -> None:
-        """Take the light (along, across) of one image."""
+        """Add the light (along, across) of one image."""
         count = len(_BESIDE_M)
         beside = np.median([light[:, :count], light[:, -count:]], axis=2)
         padded = np.pad(beside, ((0, 0), (4, 4)), mode="edge")
@@ -76,7 +75,7 @@ class Cells:
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
     def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log likelihoods by contrast, shares of paint, and these ones' sigmas by cells and images."""
+        """Log-likelihoods by contrast, fractions of paint, and their sigmas from cells and images."""
         every = np.clip(np.median(self.contrasts, axis=0).reshape(3, -1), -0.5, 4.0)
         cells = every[:, None, :: -(-every.shape[1] // _FITTED)]
         paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
@@ -110,11 +109,11 @@ def with_wear(
     threads: int = 1,
     surface: Surface | None = None,
 ) -> HdMap:
-    """``hd_map`` with the share of paint that each marking has left, where two images or more show it near.
+    """``hd_map`` with the fraction of paint left of each marking that two or more images show near.
 
-    ``map_from_vehicle`` are the poses (4, 4) of the ``images`` on the flat road, ``grey`` reads one (H, W),
-    ``shown`` are the pairs of an image's index and a marking's that nothing hides there. A marking that the
-    ``earlier`` map has, by its id, states the change, and keeps what that says where this drive did not look.
+    ``map_from_vehicle`` (4, 4) are the poses of the ``images`` on the flat road, ``grey`` reads one (H, W),
+    ``shown`` are (image, marking) pairs without occlusion. A marking of the ``earlier`` map, by id, states
+    the change, and keeps its earlier value if unseen here.
     """
     cells = [Cells.of(one.corners_map) for one in hd_map.markings]
     ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))
@@ -132,7 +131,7 @@ def with_wear(
 
 
 def _shares(fits: Sequence[tuple[FloatArray, ...]], kinds: Sequence[str]) -> list[PaintLeft]:
-    """The shares, with the contrast of full paint of each class learned from all of its markings."""
+    """The fractions, with the contrast of full paint learned per class."""
     out: dict[int, PaintLeft] = {}
     log_contrasts = np.log(_CONTRASTS)
     for kind in set(kinds):
@@ -144,7 +143,7 @@ def _shares(fits: Sequence[tuple[FloatArray, ...]], kinds: Sequence[str]) -> lis
             posterior = np.exp(log_posterior - log_posterior.max(axis=1, keepdims=True))
             posterior /= posterior.sum(axis=1, keepdims=True)
             own = posterior @ log_contrasts
-            # A class of few markings keeps to the wide prior, as if four others had shown it.
+            # A small class keeps to the wide prior, which is worth four markings.
             middle = (own.sum() + 4 * np.log(1.3)) / (len(mine) + 4)
             spread = float(np.sqrt((((own - middle) ** 2).sum() + 4 * 0.5**2) / (len(mine) + 4)))
         mean = (posterior * share).sum(axis=1)
@@ -157,7 +156,7 @@ def _shares(fits: Sequence[tuple[FloatArray, ...]], kinds: Sequence[str]) -> lis
 
 _LIGHT = np.arange(256, dtype=np.float32) / 255
 _LIGHT = np.where(_LIGHT <= 0.04045, _LIGHT / 12.92, ((_LIGHT + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""Linear light by the grey value of sRGB, which cameras follow closely enough for a ratio."""
+"""Linear light by the grey value of sRGB, an adequate model of cameras for a ratio."""
 
 
 def _seen(
@@ -170,7 +169,7 @@ def _seen(
     threads: int,
     ground: Surface | None,
 ) -> Iterator[tuple[int, FloatArray]]:
-    """(marking, light of its cells) in those of the images that show it whole from nearest."""
+    """(marking, light of its cells) in the nearest images that show it whole."""
     if not cells:
         return
 
@@ -205,7 +204,7 @@ def _seen(
             wanted.setdefault(index, []).append(number)
     order = sorted(wanted)
     with ThreadPoolExecutor(threads) as readers:
-        for start in range(0, len(order), 8 * threads):  # of decoded images, few are in memory together
+        for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
             some = order[start : start + 8 * threads]
             for index, pixels in zip(some, readers.map(lambda one: grey(images[one]), some), strict=True):
                 own = calibrations[images[index].camera]
