@@ -1,1 +1,1 @@
-"""From detections to a map: association, the naive strategy, the joint optimisation, the lanes."""
+"""From a drive's detections to a map: association, joint optimisation, and recovery from wrong inputs."""

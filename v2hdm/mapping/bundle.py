@@ -1,4 +1,4 @@
-"""One joint solve over groups of sightings; known sizes and surveyed corners constrain it."""
+"""One joint solve of groups of sightings, constrained by known sizes and surveyed corners."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, Pose
 def vehicle_twists(
     map_from_vehicle: FloatArray, stamp_s: FloatArray, visit: IntArray | None = None
 ) -> FloatArray:
-    """Twists (F, 6) of the vehicle in its frame, m/s, rad/s, by central differences within each ``visit``."""
+    """Vehicle twists (F, 6) in its own frame, m/s, rad/s, by central differences within each ``visit``."""
     own = np.arange(len(stamp_s))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(own) - 1)
     if visit is not None:
@@ -50,31 +50,31 @@ def vehicle_twists(
 
 
 def read_outs_s(cameras: Iterable[Camera]) -> FloatArray | None:
-    """The cameras' read-out times (C,) as stated, s; None where all shutters are global."""
+    """Stated read-out times (C,) of the cameras, s; None if all shutters are global."""
     stated_s = np.array([camera.read_out_s for camera in cameras])
     return stated_s if stated_s.any() else None
 
 
 _UNSURVEYED_CENTRE_SIGMA_M = 0.3
-"""How well, m, a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
+"""Prior sigma, m, of an unsurveyed camera centre about that of a coarse IPM."""
 
 HEAVE_SIGMA_M = 0.01
-"""How far, m, a vehicle's body moves up and down on its suspension on paved ground."""
+"""Vertical motion, m, of a vehicle's body on its suspension on paved ground."""
 
 LEAST_OBSERVATIONS = 200
-"""Of fewer, the residuals cannot tell how large their variance is."""
+"""Fewer residuals do not determine their variance."""
 
 VARIANCE_FACTORS = (0.05, 20.0)
-"""Between these a detector's own statement may be corrected."""
+"""Limits of the correction of a detector's stated variance."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """The unknowns of a solve, and its noise beyond that of the corners.
+    """The unknowns of a solve, and its noise besides the corners'.
 
     ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``.
-    ``sizes`` and ``survey`` are stated by the user; ``clock_sigma_s`` is the prior of clock offsets,
-    ``pose_sigma`` that of each visit's poses.
+    ``sizes`` and ``survey`` are the user's; ``clock_sigma_s`` is the prior of clock offsets, ``pose_sigma``
+    that of each session's poses.
     """
 
     pose_sigma: tuple[PoseSigma, ...]
@@ -90,12 +90,12 @@ class Model:
 class Bundle:
     """A solved bundle and what its arrays refer to.
 
-    ``rig`` holds the adjusted extrinsics and poses, ``model`` is what was solved for. Observation k is
-    corner ``corner`` (K,) of group ``group`` (K,), seen at ``row`` (K,) of the sightings.
-    ``corner_index`` (G, 4) finds a corner in the solution, -1 where it had fewer than two observations.
-    ``camera_index`` maps camera names to rows of the solution's extrinsics, ``frames`` (J,) are those of its
-    poses. Lanes, if they took part, are the problem's last corners and observations, in the order of
-    ``knots``; what the solution says of single observations is of the markings alone.
+    ``rig`` has the adjusted extrinsics and poses, ``model`` states the unknowns. Observation k is corner
+    ``corner`` (K,) of group ``group`` (K,) in row ``row`` (K,) of the sightings. ``corner_index`` (G, 4) is a
+    corner's index in the solution, -1 with fewer than two observations. ``camera_index`` maps camera names to
+    rows of the solution's extrinsics, ``frames`` (J,) are its poses'. Lanes are the problem's last corners
+    and observations, in the order of ``knots``; the solution's values per observation are of the markings
+    alone.
     """
 
     rig: Rig
@@ -113,7 +113,7 @@ class Bundle:
 
     @property
     def corners_map(self) -> FloatArray:
-        """Adjusted corners (G, 4, 2), nan where a corner is not part of the solution."""
+        """Adjusted corners (G, 4, 2), nan for corners outside the solution."""
         out = np.full((*self.corner_index.shape, 2), np.nan)
         known = self.corner_index >= 0
         out[known] = self.solution.corners_map[self.corner_index[known]]
@@ -121,12 +121,12 @@ class Bundle:
 
     @property
     def own_corner(self) -> IntArray:
-        """Which corner (K,) of its sighting each observation is."""
+        """Index (K,) of each observation's corner in its sighting."""
         return np.asarray(self.association.corner_order()[self.row, self.corner])
 
     @property
     def inliers(self) -> BoolArray:
-        """Which observations (K,) nothing contradicts."""
+        """Accepted observations (K,)."""
         return np.isin(self.solution.verdict, (Verdict.ACCEPTED, Verdict.UNCONFIRMED))
 
 
@@ -140,7 +140,7 @@ def full_model(
 
 
 def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
-    """How far a drive's recorded poses are off, the heave of its vehicle included."""
+    """Standard deviations of a drive's recorded poses, with heave."""
     return PoseSigma(
         position_m=pose_noise.position_m,
         heading_rad=pose_noise.heading_rad,
@@ -153,7 +153,7 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
 
 
 def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:
-    """The recorded poses are exact, their errors noise in the image: enough to tell markings apart."""
+    """Exact poses, with their errors as image noise: enough to separate markings."""
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
     jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
     floor_px = float(np.hypot(options.model_floor_px, jitter_px))
@@ -174,15 +174,11 @@ def solve_bundle(
     model: Model,
     lanes: tuple[Knots, FloatArray] | None = None,
 ) -> Bundle:
-    """Estimate extrinsics, poses and the corners of all groups together, with ``lanes`` if there are any.
+    """Estimate extrinsics, poses and the corners of all groups jointly, with ``lanes`` if any.
 
-    These are knots, and where the groups' corners are about: rays to a knot meet nowhere in particular.
-
-    ``usable`` (S, 4) are the corners, in the sightings' own order, that may be used. The extrinsics start
-    from those of ``rig``, the poses always from the recorded ones.
-
-    Raises:
-        MappingError: no corner was seen twice.
+    Those are knots and the groups' approximate corners, which they need: rays to a knot have no common
+    intersection. ``usable`` (S, 4), in the sightings' own order, selects corners. Extrinsics start from
+    ``rig``, poses from the recorded ones. Raises MappingError if no corner was seen twice.
     """
     row, group, corner, corner_index = _observed_corners(association, usable)
     if not len(row):
@@ -209,7 +205,7 @@ def solve_bundle(
     if knots is not None:
         own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
         squared, solution = solution.mahalanobis2[len(row) :], replace(solution, **own)
-        # Lines have their share in what observations take of the poses' own degrees of freedom.
+        # Lines also use up degrees of freedom of the poses' priors.
         of_poses = 2 * solution.cost_terms["frame_states"] / (len(squared) + 2 * len(row))
         factor = line_variance_factor(squared, knots.count / len(squared) + of_poses)
         knots = replace(knots, variance_factor=knots.variance_factor * factor)
@@ -233,7 +229,7 @@ def observations_at(
 ) -> Observations:
     """Observations of ``corner`` (K,) by corners ``at`` (row, corner; K each) of the sightings.
 
-    Those ``on_line`` (S, 4) say on which line their corner lies, and not where on it.
+    Corners ``on_line`` (S, 4) are observed across their line alone.
     """
     covariance_px = sightings.covariance_px[at]
     if on_line is not None:
@@ -259,9 +255,9 @@ def _joined(one: _Rows, other: _Rows) -> _Rows:
 
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
-    """All cameras and frames of a drive and their priors, without any observation."""
+    """All cameras and frames of a drive with their priors, without observations."""
     none, stated = np.zeros(0, dtype=np.int64), [cameras[name] for name in sightings.cameras]
-    # Camera centres are surveyed, or else implied by the starting extrinsic.
+    # Camera centres are surveyed, or implied by the initial extrinsic.
     centre = camera_centre(rig.cam_from_vehicle)
     sigma = np.full_like(centre, _UNSURVEYED_CENTRE_SIGMA_M)
     for c, camera in enumerate(stated):
@@ -291,14 +287,14 @@ def _constraints(
     corner_index: IntArray,
     model: Model,
 ) -> tuple[KnownLengths | None, ControlPoints | None]:
-    """The constraints by stated sizes and a survey; ``rig`` must tell one corner from the next."""
+    """Constraints from stated sizes and a survey; ``rig`` must be good enough to identify corners."""
     if not model.sizes.by_class_m and not model.survey.points:
         return None, None
     located = locate(sightings, rig)
     located = replace(located, valid=located.valid & usable, informs=located.informs & usable)
     fused = fuse_groups(association, located, jitter_rad=0.0)
     points_map = np.where(fused.valid[..., None], fused.corners_map, np.nan)
-    # Points of a survey are found under the least certain poses of all visits.
+    # Surveyed points are matched under the least certain poses of all sessions.
     poses = max(model.pose_sigma, key=lambda one: one.position_m)
     kinds = group_kinds(association, sightings)
     return (
@@ -310,7 +306,7 @@ def _constraints(
 def _observed_corners(
     association: Association, usable: BoolArray
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Observations (row, group, corner; K each) of corners seen at least twice, and their numbers."""
+    """Observations (row, group, corner; K each) of corners seen at least twice, and the corners' indices."""
     in_order = association.in_group_order(usable) & (association.group >= 0)[:, None]
     row, corner = np.nonzero(in_order)
     group = association.group[row]
@@ -324,18 +320,17 @@ def _observed_corners(
 
 _DIAGONALS = (((0, 2),), ((1, 3),))
 _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
-"""Pairs of corners that are as far apart as a marking is long, or wide; the map decides which."""
+"""Pairs of corners a marking's length or width apart; the map decides which."""
 
 
 def known_lengths(
     sizes: SizeOptions, kind: Sequence[str], corners_map: FloatArray, corner_index: IntArray
 ) -> KnownLengths | None:
-    """The distances between corners that stated sizes imply, None if there are none.
+    """Distances between corners from stated sizes, None if there are none.
 
-    Of a diamond the size is that of its diagonals, of all others that of its sides. A marking that is not of
-    its class's size is another thing, or cut off; nothing is known of it. ``kind`` (G,) is the class of every
-    group, ``corners_map`` (G, 4, 2) rough positions, nan where unknown, and ``corner_index`` (G, 4) the
-    corners' numbers in the adjustment, -1 for none.
+    For diamonds the sizes are of diagonals, for others of sides. A marking of another size is something else,
+    or cut off, and unconstrained. ``kind`` (G,) is each group's class, ``corners_map`` (G, 4, 2) approximate,
+    nan if unknown, ``corner_index`` (G, 4) the index in the adjustment, -1 for none.
     """
     found: list[tuple[int, int, float]] = []
     for name, size in sizes.by_class_m.items():
@@ -345,7 +340,7 @@ def known_lengths(
             apart = [[np.linalg.norm(corners[a] - corners[b]) for a, b in span] for span in spans]
             seen = np.array([np.mean(distances) for distances in apart])
             wanted = np.array(size) if seen[0] >= seen[1] else np.array(size)[::-1]
-            # Also false where a corner is nowhere: then it is not known which of the two is the longer one.
+            # Also false if a corner is unknown: then the longer direction is unknown too.
             if not (np.abs(seen - wanted) <= sizes.tolerance * wanted).all():
                 continue
             for span, metres in zip(spans, wanted, strict=True):
@@ -360,10 +355,10 @@ def known_lengths(
 def control_points(
     survey: SurveyOptions, corners_map: FloatArray, corner_index: IntArray, poses: PoseSigma
 ) -> ControlPoints | None:
-    """The corners that surveyed points belong to, None if there are none; points out of reach are left out.
+    """Corners of surveyed points, None if there are none; points out of reach are omitted.
 
-    ``corners_map`` and ``corner_index`` are as of :func:`known_lengths`. ``poses`` is how far the recorded
-    poses are off; neighbouring corners share their drift.
+    ``corners_map`` and ``corner_index`` are as in :func:`known_lengths`, ``poses`` the sigmas of recorded
+    poses, whose drift neighbouring corners have in common.
     """
     points = np.array([one.position_map for one in survey.points], dtype=np.float64).reshape(-1, 2)
     sigma_m = np.array([one.sigma_m for one in survey.points], dtype=np.float64).reshape(-1, 2)
@@ -381,7 +376,7 @@ def control_points(
 
 
 def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> FloatArray:
-    """Joint covariance (2N, 2N), m^2, of corners minus points (N, 2), before the survey has moved the map."""
+    """Joint covariance (2N, 2N), m^2, of corners minus points (N, 2), before the survey is applied."""
     drift, apart_m = poses.position_drift, np.linalg.norm(points[:, None] - points, axis=-1)
     shared = drift.sigma**2 * np.exp(-apart_m / drift.over_m)
     own = (poses.position_m**2 - drift.sigma**2) * np.eye(len(points))
@@ -389,11 +384,11 @@ def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> Fl
 
 
 def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:
-    """The name of the control point at ``point_map`` (2,), which is one of those of the survey."""
+    """Name of the survey's control point at ``point_map`` (2,)."""
     return next(one.id for one in survey.points if np.array_equal(one.position_map, point_map))
 
 
 def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list[str]:
-    """The names of the control points that ``control`` makes no use of."""
+    """Names of the control points that ``control`` does not use."""
     used = set() if control is None else set(map(tuple, control.points_map.tolist()))
     return [one.id for one in survey.points if tuple(one.position_map) not in used]

@@ -1,4 +1,4 @@
-"""Whether a stretch is of another drive: neither has the markings that both should have in view."""
+"""Test whether a segment is of another drive: each misses markings that should be in the other's view."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from v2hdm.association.sightings import Sightings
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
-_DISTANCES = 10  # parts of a camera's views, by distance, each with its own rate of found markings
+_DISTANCES = 10  # bins of a camera's views by distance, each with its own detection rate
 
-_ENDS = 60  # places along a session where a stretch may begin or end
+_ENDS = 60  # candidate ends of a segment within a session
 
 _PSEUDO_VIEWS = 2.0
-"""Views that the drive's share of found markings counts for in that of one: some are worn or half hidden."""
+"""Views that the drive's detection rate is worth for that of one marking: some are worn or half hidden."""
 
-_BY_MISTAKE = 0.05  # share of its views in which a marking of one place is taken for one of the other
+_BY_MISTAKE = 0.05  # rate of a marking of one place being taken for one of the other
 
-_CONFUSED = 0.3  # share of the markings that are a mixture of two, one of either place
+_CONFUSED = 0.3  # fraction of markings that mix two, one of each place
 
 _HIDDEN = 0.08
-"""Share of the markings that a vehicle or a post hides in some of their views, one after the other: the
-likeliest for the 285 markings of eight made drives (right_drives, seeds 1030 to 1037)."""
+"""Fraction of markings that a vehicle or a post hides in consecutive views: maximum likelihood for the 285
+markings of eight simulated drives (right_drives, seeds 1030 to 1037)."""
 
 
 def foreign_stretch(
     bundle: Bundle, sightings: Sightings, views: Views, cameras: tuple[Camera, ...]
 ) -> tuple[float, float, float]:
-    """Find when the likeliest stretch begins and ends, s, and by how much it raises the log likelihood.
+    """Begin and end, s, of the most likely foreign segment, and its log-likelihood ratio.
 
-    The markings of both places must be missed where they should be in view, so that neither a lorry that
-    hides some nor paint that is worn makes a stretch: the gain is that of the place that says less.
+    Markings of both places must be missing from the other's views, so that lorries and worn paint make no
+    segment: the gain is the lower of both places'.
     """
     group, image = easy_views(views, bundle.rig, cameras, bundle.corners_map)
     accepted, size = bundle.inliers, int(views.image.max()) + 1
@@ -40,7 +40,7 @@ def foreign_stretch(
     found, view = np.isin(group * size + image, known), np.searchsorted(views.image, image)
     frame = views.frame[view]
     apart = bundle.corners_map[group].mean(axis=1) - bundle.rig.map_from_vehicle[frame, :2, 3]
-    # A miss says the less, the less often others are found from as far.
+    # A miss counts less where markings at that distance are detected less often.
     counted = np.where(found, 1.0, _ease(found, views.camera[view], np.linalg.norm(apart, axis=1)))
     best = 0.0, 0.0, -np.inf
     for visit in np.unique(sightings.visit):
@@ -50,7 +50,7 @@ def foreign_stretch(
             continue
         ends = np.unique(np.linspace(0, len(frames), _ENDS + 1).astype(np.int64))
         groups, number = np.unique(group[own], return_inverse=True)
-        counts = np.zeros((2, len(ends), len(groups)))  # of views until then: that found it, and all
+        counts = np.zeros((2, len(ends), len(groups)))  # cumulative views: with a detection, and all
         step = np.searchsorted(ends, frame[own] - frames[0], side="right")
         for count, views_of_kind in zip(counts, (found[own], counted[own]), strict=True):
             np.add.at(count, (step, number), views_of_kind)
@@ -66,7 +66,7 @@ def foreign_stretch(
 
 
 def _ease(found: BoolArray, camera: IntArray, distance_m: FloatArray) -> FloatArray:
-    """The rate at which markings are found (P,) at their distance from a camera, relative to its best one."""
+    """Detection rate (P,) at a marking's distance from a camera, relative to the camera's best."""
     ease = np.ones(len(found))
     for one in np.unique(camera):
         own = np.flatnonzero(camera == one)
@@ -78,7 +78,7 @@ def _ease(found: BoolArray, camera: IntArray, distance_m: FloatArray) -> FloatAr
 
 
 def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray:
-    """The gains (E,) of stretches, by views (2, E, G) within them that found markings, and all there are."""
+    """Gains (E,) of segments, from views (2, E, G) within them, with detections and in all; and overall."""
     beyond, together = all_over - within, _log_likelihood(all_over, share)
     mistake = np.log([_BY_MISTAKE, 1 - _BY_MISTAKE])
     home, foreign = (
@@ -98,6 +98,6 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
 
 
 def _log_likelihood(counts: FloatArray, share: float) -> FloatArray:
-    """The log likelihood of how often each marking was found in its views, by a beta-binomial."""
+    """Beta-binomial log-likelihood of each marking's detections in its views."""
     a, b = _PSEUDO_VIEWS * share, _PSEUDO_VIEWS * (1 - share)
     return np.asarray(betaln(counts[0] + a, counts[1] - counts[0] + b) - betaln(a, b))

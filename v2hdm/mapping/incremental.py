@@ -1,9 +1,9 @@
-"""The drive mapped as it would be on the vehicle: marking by marking, with nothing known of what comes.
+"""Mapping as on the vehicle: marking by marking, without knowledge of later images.
 
-A track becomes a marking, of the map where it lies on one, as soon as it ends. Map and extrinsics are up to
-date after each (:mod:`v2hdm.adjust.incremental`), under a model that takes poses' errors for noise in the
-image. Whenever the map has grown fourfold, and when the drive ends, all is linked again and solved together
-with the errors of the poses, as the batch does: a constant share of the cost.
+A finished track becomes a marking, or joins the mapped one that it lies on. Map and extrinsics are updated
+after each (:mod:`v2hdm.adjust.incremental`), under a model with pose errors as image noise. Whenever the map
+has grown fourfold, and at the end, everything is re-linked and solved with pose errors, as in the batch: a
+constant factor in cost.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
-"""Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""
+"""Tracks under a rig, coarse or not, and the usable corners (S, 4)."""
 
 Solve = Callable[[Association, BoolArray, Rig], Rig]
-"""The rig that groups of sightings lead to, of usable corners (S, 4), from another."""
+"""The rig solved from groups of sightings and their usable corners (S, 4), starting at another."""
 
-_FIRST_LINK_MARKINGS = 12  # from so many the extrinsics are better than the IPM that they began with
+_FIRST_LINK_MARKINGS = 12  # with as many, the extrinsics are better than the initial IPM
 _LINK_GROWTH = 4
-"""How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
-more than the last time alone."""
+"""Growth of the map at which everything is re-linked and solved: over a drive, a third more work than the
+last time alone."""
 
-_LEAST_CORNERS = 3  # corners that fix a marking: all are parallelograms
+_LEAST_CORNERS = 3  # corners that determine a marking, a parallelogram
 
 
 @dataclass
 class _Place:
-    """A mapped marking: the number of each corner (4,), -1 for none, the images, where it was previewed."""
+    """A mapped marking: index of each corner (4,), -1 for none, its images, and its preview."""
 
     corner: IntArray
     kind: int
@@ -57,7 +57,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Track:
-    """The ``rows`` of one track, its observations, and its corners (4, 2), nan where none is a point."""
+    """The ``rows`` of one track, its observations, and its corners (4, 2), nan unless a point."""
 
     rows: IntArray
     kind: int
@@ -66,7 +66,7 @@ class _Track:
 
 
 class IncrementalMapper:
-    """Takes the tracks of a drive into a map, one after the other."""
+    """Maps the tracks of a drive, one after the other."""
 
     def __init__(
         self,
@@ -79,16 +79,16 @@ class IncrementalMapper:
         solve: Solve,
         model: Model,
     ) -> None:
-        """Begin with an empty map; ``model`` solves for each marking and estimates no pose."""
+        """An empty map; ``model`` is that of single markings, without pose states."""
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
         self._drive = drive_problem(sightings, rig, cameras, model)
         self._begin(rig, 0)
 
     def run(self, progress: Callable[[str], None]) -> tuple[Association, Rig]:
-        """Take up all tracks as they end; returns the markings as groups, and the rig that they lead to.
+        """Map all tracks as they end; returns the markings as groups, and the final rig.
 
-        ``progress`` gets the map's size. Raises MappingError where nothing can be solved for.
+        ``progress`` receives the map's size. Raises MappingError if nothing can be solved.
         """
         tracks, usable = self._link(self._rig, True)
         due, ended = _FIRST_LINK_MARKINGS, False
@@ -104,9 +104,9 @@ class IncrementalMapper:
         return association, replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)
 
     def _begin(self, rig: Rig, known: int) -> None:
-        """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""
+        """Start an empty map from ``rig``; its first ``known`` markings are solved together."""
         self._rig, self._known = rig, known
-        # Only the IPM that the first map starts from may be far off, and all that is located by it.
+        # Only the IPM that the first map starts from, and all that it locates, may be far off.
         self._coarse = rig is self._first_rig
         read_out_s = None if rig.read_out_s is None else np.maximum(rig.read_out_s, 0.0)
         drive = replace(
@@ -120,7 +120,7 @@ class IncrementalMapper:
         self._centres = np.zeros((0, 2))
 
     def _take_up_safely(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
-        """:meth:`_take_up`; where those known cannot be solved at once, without the tracks that spoil it."""
+        """:meth:`_take_up`; if known tracks are unsolvable together, without the harmful ones."""
         try:
             return self._take_up(tracks, usable, most)
         except AdjustError:
@@ -148,7 +148,7 @@ class IncrementalMapper:
         return Association(number, shift, len(self._places)), True
 
     def _take(self, track: _Track, marking: int | None, turn: int) -> bool:
-        """Take a track into the map as a ``marking``, None for a further one; whether that went well."""
+        """Map a track as part of ``marking``, or as a new one if None; returns whether it succeeded."""
         corner, known = (track.seen.corner - turn) % 4, np.isfinite(track.corners_map).all(axis=1)
         place = (
             _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), np.asarray(known), track.corners_map)
@@ -185,7 +185,7 @@ class IncrementalMapper:
         return True
 
     def _corners(self, marking: int) -> FloatArray:
-        """Corners (4, 2) of a marking under the present extrinsics, nan where none was seen as a point."""
+        """Corners (4, 2) of a marking under the present extrinsics, nan unless seen as a point."""
         place = self._places[marking]
         if not self.grown.is_solved(marking):
             return place.preview
@@ -195,7 +195,7 @@ class IncrementalMapper:
         return out
 
     def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
-        """The observations in ``rows`` of corners seen twice; None where they determine no marking."""
+        """Observations in ``rows`` of corners seen twice; None if they do not determine a marking."""
         order = tracks.corner_order()[rows]
         which, corner = np.nonzero(np.take_along_axis(usable[rows], order, axis=1))
         twice = np.bincount(corner, minlength=4) >= 2
@@ -219,13 +219,13 @@ class IncrementalMapper:
         return _Track(rows, kind, replace(seen, corner=corner), corners)
 
     def _same_as(self, track: _Track) -> tuple[int | None, int]:
-        """The mapped marking where a track lies, if any: its corner c is the track's (c + turn) mod 4."""
+        """The mapped marking at a track's position, if any: its corner c is the track's (c + turn) mod 4."""
         corners = track.corners_map
         valid = np.asarray(np.isfinite(corners).all(axis=1))
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
         tolerance_m = max(SHAPE_TOLERANCE * size_m, LEAST_TOLERANCE_M)
-        # How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic.
+        # Tolerance between two sightings of one marking: pose errors, and the extrinsic's remaining error.
         middle = np.nanmean(corners, axis=0)
         frame = self._sightings.frame[track.rows]
         away = middle - self._rig.map_from_vehicle[frame, :2, 3]

@@ -1,10 +1,9 @@
-"""Lanes in the adjustment: cubic splines whose knots are unknowns, seen as lines that pass them.
+"""Lanes in the adjustment: cubic splines with unknown knots, observed as lines through them.
 
-A lane is a Catmull-Rom spline, which runs through its knots. So what an image shows of it is compared with it
-where it passes a knot: the points of a piece of paint about there give the place of one point of the line.
-That is an observation like that of a corner, but for its information, which has rank one: it says nothing of
-where along the line the point lies. Nor is that an unknown; a knot moves across its line only, since a prior
-holds it along the line. All else is as with corners: elimination, robust loss and covariance.
+A lane is a Catmull-Rom spline, which interpolates its knots: a piece of paint near a knot observes one point
+of the line. That observation is a corner's, but with information of rank one: the position along the line is
+unobserved. Nor is it unknown, as a prior holds knots along their line and they move across it alone.
+Elimination, robust loss and covariance are the corners'.
 """
 
 from __future__ import annotations
@@ -37,50 +36,46 @@ from v2hdm.site.options import LaneOptions
 
 _log = logging.getLogger(__name__)
 
-_SPACING_M = 2.0  # distance of knots, m: on a turn of 8 m the spline is a millimetre off the circle
+_SPACING_M = 2.0  # spacing of knots, m: on a turn of 8 m radius the spline is a millimetre off the circle
 
-_HELD_M = 0.01  # sigma along the line of a knot, which nothing observes
-OPEN_END_PX = 1000.0  # sigma along its line of what an image shows as no point: anywhere
-_SLOPE_SIGMA = 0.02  # rad, by which a piece of paint may be turned against the lane that it is of
-_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # cosine from which points are of one line: a crossing one is not
+_HELD_M = 0.01  # sigma of a knot along its line, which nothing observes
+OPEN_END_PX = 1000.0  # sigma along its line of an observation that is no point: anywhere
+_SLOPE_SIGMA = 0.02  # rad, of a piece of paint against its lane
+_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine between points of one line; excludes crossing lines
 
-_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # directions (N, 2) times it are turned to their left
+_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # (N, 2) directions times it are rotated to the left
 
 
 @dataclass(frozen=True)
 class Knots:
-    """The knots of lanes, and where images show a line pass them."""
+    """Knots of lanes, and observations of lines through them."""
 
-    lanes: tuple[Lane, ...]  # as they were drawn under the adjustment without them
-    # (N,), (N,), (N, 2), (N, 2) of each knot: its lane, how far along that it lies, its place on it and the
-    # unit direction there
-    lane: IntArray
+    lanes: tuple[Lane, ...]  # as drawn after the adjustment without them
+    lane: IntArray  # of each of N knots: its lane, then arc length, position and unit direction
     at_m: FloatArray
     points_map: FloatArray
     along: FloatArray
-    unknown: IntArray  # (N,) its number among those that enough images show, -1 where they do not
-    # (K,) of each observation; ``knot`` counts those with a number
-    camera: IntArray
+    unknown: IntArray  # (N,) index among the sufficiently observed knots, -1 for others
+    camera: IntArray  # of each of K observations; ``knot`` is that index
     frame: IntArray
     knot: IntArray
-    # (K, 2), (K, 2, 2) and (K,) of it
-    pinhole_px: FloatArray
+    pinhole_px: FloatArray  # of each observation, with covariance and row share
     covariance_px: FloatArray
     row_share: FloatArray
-    variance_factor: float = 1.0  # what its covariance is to be multiplied by, as residuals say
+    variance_factor: float = 1.0  # of the observations' covariance, from residuals
 
     @property
     def count(self) -> int:
-        """Knots that are unknowns of the adjustment."""
+        """Number of knots that are unknowns of the adjustment."""
         return int(self.unknown.max(initial=-1)) + 1
 
     def observations(self, first: int) -> Observations:
-        """As observations of corners from number ``first``; cameras and frames are those of the rig."""
+        """As observations of corners numbered from ``first``; cameras and frames are the rig's."""
         at, covariance_px = first + self.knot, self.variance_factor * self.covariance_px
         return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
 
     def held(self, first: int) -> ControlPoints:
-        """The prior that keeps the corners from number ``first`` from moving along their lines."""
+        """The prior that holds corners numbered from ``first`` along their lines."""
         own = self.unknown >= 0
         sigma_m = np.tile([_HELD_M, np.inf], (self.count, 1))
         return ControlPoints(first + self.unknown[own], self.points_map[own], sigma_m, self.along[own])
@@ -94,7 +89,7 @@ def find_knots(
     surface: Surface | None,
     options: LaneOptions,
 ) -> Knots | None:
-    """Knots along the lanes that a drive shows under ``rig``, which is over ``cameras``; None without any."""
+    """Knots along a drive's lanes under ``rig``, which is over ``cameras``; None without any."""
     ground, jitter_rad = ground_by_rig(drive, cameras, rig, surface), drive.pose_noise.roll_pitch_rad
     cloud = collect_lane_points(drive, detections, ground, options.max_range_m, jitter_rad)
     lanes = map_lanes(cloud, options)
@@ -122,7 +117,7 @@ def find_knots(
 
 @dataclass(frozen=True)
 class _Course:
-    """Lanes as polylines by length: ``arc_m`` (V,) of ``points_map`` (V, 2), a metre from lane to lane."""
+    """Lanes as polylines by arc length: ``arc_m`` (V,) of ``points_map`` (V, 2), lanes one metre apart."""
 
     arc_m: FloatArray
     points_map: FloatArray
@@ -138,13 +133,13 @@ class _Course:
         return cls(arc_m, np.concatenate([one.points_map for one in lanes]), begin_m, length_m)
 
     def stations(self) -> tuple[IntArray, FloatArray]:
-        """The lane of each knot, and how far along it."""
+        """Lane and arc length of each knot."""
         count = np.maximum(np.round(self.length_m / _SPACING_M), 1).astype(np.int64) + 1
         at_m = [np.linspace(0.0, length, n) for length, n in zip(self.length_m, count, strict=True)]
         return np.repeat(np.arange(len(count)), count), np.concatenate(at_m)
 
     def at(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
-        """The points (N, 2) of lanes (N,), as far along them (N,)."""
+        """Points (N, 2) at arc lengths (N,) of lanes (N,)."""
         arc_m = self.begin_m[lane] + np.clip(at_m, 0.0, self.length_m[lane])
         return np.column_stack([np.interp(arc_m, self.arc_m, axis) for axis in self.points_map.T])
 
@@ -158,7 +153,7 @@ class _Course:
 def _pairs(
     cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Points (P,) and the nearest knots, at most half a spacing away, how far ahead and left of these, m."""
+    """Points (P,) and nearest knots within half a spacing, with offsets ahead and left of these, m."""
     knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
     reach_m = float(np.hypot(_SPACING_M / 2, HALF_WIDTH_M))
     near = cKDTree(cloud.points_map).sparse_distance_matrix(
@@ -186,10 +181,9 @@ def _passing(
     ahead_m: FloatArray,
     off_m: FloatArray,
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
-    """Where images show lines pass knots: image, knot, pinhole pixel, its covariance and row share.
+    """Observations of lines through knots: image, knot, pinhole pixel, its covariance and row share.
 
-    A line is laid through the points of a piece, whose errors are taken for one: neighbouring cells err
-    alike.
+    A line is fitted to the points of a piece, with one common error: neighbouring cells are correlated.
     """
     groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
     (image, at), own = groups.T, own.ravel()
@@ -219,9 +213,9 @@ def _passing(
 
 
 def draw_lanes(knots: Knots, solution: Solution, spacing_m: float = NODE_SPACING_M) -> tuple[Lane, ...]:
-    """The lanes as splines through the adjusted knots, vertices about ``spacing_m`` apart with their sigmas.
+    """The lanes as splines through adjusted knots, with vertices about ``spacing_m`` apart and their sigmas.
 
-    Where no image shows the line, as between dashes, it keeps its course beside the knots around.
+    Unobserved knots, as between dashes, keep their offset from the neighbouring ones.
     """
     return tuple(
         _drawn(lane, knots, np.flatnonzero(knots.lane == number), solution, spacing_m)
@@ -230,7 +224,7 @@ def draw_lanes(knots: Knots, solution: Solution, spacing_m: float = NODE_SPACING
 
 
 def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing_m: float) -> Lane:
-    """One lane, whose knots are those at ``rows``; as it is where none of them is an unknown."""
+    """One lane with the knots ``rows``; unchanged if none of them is an unknown."""
     seen = np.flatnonzero(knots.unknown[rows] >= 0)
     if not len(seen):
         return lane
@@ -242,7 +236,7 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
     drawn_map = by_knot @ (points_map + (by_seen @ moved_m)[:, None] * left)
     along = np.gradient(drawn_map, axis=0)
     left = along / np.linalg.norm(along, axis=1, keepdims=True) @ _TURN
-    # No vertex hangs on more than four neighbouring knots: their joint covariances give those of all.
+    # A vertex depends on at most four neighbouring knots: their joint covariances suffice.
     weight = (by_knot @ by_seen).tocsr()
     weight.sort_indices()
     begin = np.minimum(weight.indices[weight.indptr[:-1]], max(len(seen) - 4, 0))
@@ -258,7 +252,7 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
 
 
 def _between(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
-    """Weights (M, N) of N rising places at M wanted ones: linear between them, the end's beyond."""
+    """Weights (M, N) of N ascending positions at M ``wanted_m``: linear, constant beyond the ends."""
     number = np.interp(wanted_m, at_m, np.arange(len(at_m)))
     low = np.minimum(number.astype(np.int64), max(len(at_m) - 2, 0))
     high = np.minimum(low + 1, len(at_m) - 1)
@@ -268,7 +262,7 @@ def _between(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
 
 
 def _catmull_rom(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
-    """Weights (M, N) of N knots, evenly spaced, at M places along a Catmull-Rom spline through them."""
+    """Weights (M, N) of N evenly spaced knots at M arc lengths of the Catmull-Rom spline through them."""
     last = len(at_m) - 1
     number = wanted_m / (at_m[1] - at_m[0])
     low = np.clip(number.astype(np.int64), 0, last - 1)
@@ -277,7 +271,7 @@ def _catmull_rom(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
         [-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2]
     )
     knot = low + np.arange(-1, 3)[:, None]
-    # Beyond an end it goes on as bent as there, P_-1 = 3 P_0 - 3 P_1 + P_2; straight where there are but two.
+    # Extrapolates the curvature at the ends, P_-1 = 3 P_0 - 3 P_1 + P_2; a straight line for two knots.
     beyond = np.array([3.0, -3.0, 1.0] if last > 1 else [2.0, -1.0, 0.0])
     before, after = knot[0] < 0, knot[3] > last
     value[1:, before] += beyond[:, None] * value[0, before]

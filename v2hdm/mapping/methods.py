@@ -1,7 +1,7 @@
-"""The four methods of the paper, side by side on one set of cameras.
+"""The four methods of the paper on one set of cameras.
 
 CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint optimisation; ONI
-is the naive strategy under the IPM that the optimisation found.
+is the naive strategy under the IPM of Opt.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
-    """The poses of all frames of the drive."""
+    """Poses of all frames of the drive."""
     drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
     sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
     used = bundle.frames
@@ -63,7 +63,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
 
 
 def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
-    """The clock offset of each camera by session: the shift of its images plus the solve's estimate, s."""
+    """Clock offset of each camera by session: the images' earlier shift plus the solve's estimate, s."""
     evidence, drive = outcome.evidence, outcome.inputs.drive
     applied_s = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
     score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
@@ -71,7 +71,7 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
         here, clocks = [one for one in score_tests if one.about in ("", f"in {place.name}")], {}
         for name in outcome.inputs.sightings.cameras:
-            # Of each camera, and of all of them together: a clock of its own may differ by both.
+            # A camera's own clock and one common to all cameras: the offset may differ by both.
             tested = [one.sigma**2 for one in here if name in one.cameras]
             unobserved = 0.0, float(np.sqrt(sum(tested))) if tested else float("inf")
             beyond_s, sigma_s = estimated.get(name, unobserved)
@@ -84,8 +84,7 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
 def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) -> FloatArray:
     """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
 
-    From one marking to another only errors of the adjustment are shared; an unseen corner shares a seen
-    one's.
+    Markings have the adjustment's errors in common; an unseen corner is given a seen one's.
     """
     bundle = optimised.bundle
     index = bundle.corner_index[optimised.groups[marking]]
@@ -93,20 +92,20 @@ def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) 
     number = np.where(own >= 0, own, index.max(axis=1))
     out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
     _state(out, optimised.markings, marking, corner)
-    # Put together from two sources, it may be negative along some direction, by a millimetre squared.
+    # Combined from two sources, it may have negative eigenvalues of about a square millimetre.
     values, vectors = np.linalg.eigh(out)
     return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def stated_covariance(markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> FloatArray:
-    """As :func:`joint_covariance`, of markings from several maps: nothing is shared from one to another."""
+    """As :func:`joint_covariance` for markings of several maps, uncorrelated with each other."""
     out = np.zeros((2 * len(marking), 2 * len(marking)))
     _state(out, markings, marking, corner)
     return out
 
 
 def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> None:
-    """Set the blocks of ``out`` within each marking to its own covariance."""
+    """Set each marking's blocks of ``out`` to its own covariance."""
     rows = 2 * corner[:, None] + np.arange(2)
     for k, own in enumerate(marking.tolist()):
         stated = markings[own].covariance_m2
@@ -116,11 +115,11 @@ def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corn
 
 
 def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
-    """The residuals of accepted observations, of markings and of rejected candidates."""
+    """Residuals of accepted observations, of markings and of rejected candidates."""
     drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, optimised.bundle
     seen, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
     marking = np.zeros(bundle.association.count, dtype=np.int64)
-    # The ids of a map whose markings have none yet: by their order, as its files number them.
+    # Markings without ids are numbered in order, as in the files.
     marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
     images = [drive.images[i] for i in seen.tolist()]
     return Residuals(
@@ -138,7 +137,7 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
 
 
 NAIVE_IPMS: Mapping[str, str] = {"CNI": "calibrated", "ENI": "estimated"}
-"""Naive methods by the name of the IPM that they use."""
+"""Name of the IPM that each naive method uses."""
 
 _log = logging.getLogger(__name__)
 
@@ -152,12 +151,12 @@ def run_methods(
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
 ) -> dict[str, MethodResult]:
-    """Map a drive, whose truth is not looked at, with every method that the IPMs of ``cameras`` allow.
+    """Map a drive, ignoring ground truth, by every method that the cameras' IPMs allow.
 
-    ``progress`` gets the name of each step as it begins. ``base`` is an earlier map that ``Opt`` brings up to
-    date; ``grey`` reads the grey values (H, W) of an image, to look where it has paint. Results are by
-    method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError
-    where there is nothing to map, ConfigError for an option out of range.
+    ``progress`` receives the name of each step at its start. ``Opt`` updates the earlier map ``base``,
+    inspecting images read by ``grey`` (grey values (H, W)). Results are by method: ``CNI`` and ``ENI`` where
+    every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError if there is nothing to map,
+    ConfigError for an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)
@@ -185,7 +184,7 @@ def run_methods(
 
 
 def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:
-    """The naive strategy under one IPM per camera, for instance that of a known extrinsic."""
+    """The naive strategy under one IPM per camera, such as that of a known extrinsic."""
     drive, sightings = inputs.drive, inputs.sightings
     extrinsic = {c: extrinsic_from_ipm(drive.cameras[c].info, matrix) for c, matrix in ipm.items()}
     ground = ground_by_ipm(drive, ipm, extrinsic, inputs.optimiser.initial_rig)
@@ -199,16 +198,16 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
     )
 
 
-_NAIVE_MERGE_M = 1.0  # how far apart the naive methods may put two tracks of one marking
+_NAIVE_MERGE_M = 1.0  # largest distance of two tracks of one marking in the naive methods
 
 
 def _naive_markings(
     inputs: Inputs, ipm: Mapping[str, FloatArray], ground: ImageGround
 ) -> tuple[list[Marking], list[Exclusion]]:
-    """The paper's baseline: back-project by an IPM within its region of interest, and average.
+    """The paper's baseline: back-projection by an IPM within its region of interest, then averaging.
 
-    Recorded poses are taken at their word. Tracks merge where their averages lie within a metre:
-    two cameras whose IPMs disagree by more yield two markings where there is one, the method's own failure.
+    Recorded poses are taken as exact. Tracks merge if their averages are within a metre: where IPMs disagree
+    by more, a marking is mapped twice, as is inherent to the method.
     """
     sightings = inputs.sightings
     cameras = [inputs.drive.cameras[name] for name in sightings.cameras]
@@ -248,7 +247,7 @@ def _naive_markings(
 
 
 def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
-    """Plain mean of each group's corners; the strategy knows of no covariance."""
+    """Mean of each group's corners, without covariance."""
     rows = np.flatnonzero(association.group >= 0)
     corners = association.in_group_order(corners_map)[rows]
     seen = np.bincount(association.group[rows], minlength=association.count)
@@ -290,7 +289,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
-        # A spline has the recorded heights within it.
+        # A spline already contains the recorded heights.
         hd_map = with_heights(hd_map, None, surface.height_m)
         hd_map = replace(hd_map, ground=surface.strips())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)

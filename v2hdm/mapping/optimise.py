@@ -1,9 +1,8 @@
 """The joint optimisation: from sightings under a coarse IPM to a map and the cameras' extrinsics.
 
-A coarse IPM misplaces markings by more than they lie apart, so associating and solving take turns:
-tracks along the drive are solved with steep rays only, which a wrong extrinsic hurts least; under
-the extrinsic found, the tracks are linked anew and those that coincide are merged; then everything
-is solved together, and again without the observations that contradict the rest.
+A coarse IPM displaces markings by more than their spacing, so association and solves alternate: tracks along
+the drive are solved with steep rays only, which suffer least from a wrong extrinsic; under the new extrinsic
+they are re-linked and merged; then everything is solved jointly, and again without outliers.
 """
 
 from __future__ import annotations
@@ -87,18 +86,18 @@ from v2hdm.site.parallax import PointViews, measure_parallax
 _log = logging.getLogger(__name__)
 
 _SETTLED_MODEL = "heave"
-"""Pose model of the solves between which associations still change: it leaves no error of a pose out."""
+"""Pose model of the solves between associations: it omits no error of a pose."""
 
-_STEEP_SINE = 0.15  # sine of a ray's depression from which the coarse stage uses it, unless most are flatter
+_STEEP_SINE = 0.15  # least sine of a ray's depression in the coarse stage, unless most rays are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
-"""How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
+"""Prior sigma of clock offsets, s, once a drive shows them: half a period of a slow receiver."""
 
-_GROUND_ROUNDS = 6  # solves over better and better ground, at most: four are enough for a crown of 4 %
+_GROUND_ROUNDS = 6  # most solves over improving ground; four suffice for a crown of 4 %
 
 _LANE_ROUNDS = 3  # solves with lanes: the stated variance of points may be thirty times the true one
 
-_SETTLED_M = 1e-3  # change of the seen heights, root mean square, from which on the ground is settled
+_SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has converged
 
 
 def silent(step: str) -> None:
@@ -107,7 +106,7 @@ def silent(step: str) -> None:
 
 @dataclass(frozen=True)
 class Optimised:
-    """The outcome of the joint optimisation; errors are root mean squares over the markings' points."""
+    """The result of the joint optimisation; reprojection errors are RMS over the markings' points."""
 
     bundle: Bundle  # the adjusted extrinsics and poses
     groups: IntArray  # of the markings
@@ -120,7 +119,7 @@ class Optimised:
 
 
 class Optimiser:
-    """Takes one set of cameras through association and solving."""
+    """Association and solves of one set of cameras."""
 
     def __init__(
         self,
@@ -131,12 +130,12 @@ class Optimiser:
         options: MappingOptions,
         road: Road | None = None,
     ) -> None:
-        """``pose_noise`` is that of each visit; gates take the largest of each kind."""
+        """``pose_noise`` is by session; gates use the largest of each kind."""
         self._seen, self._views = sightings, views
         self.sightings = sightings
-        """The sightings, moved to where they would be if all that they show lay on a plane."""
+        """The sightings, reduced to the plane."""
         self.surface: Surface | None = None
-        """The surface of the ground, where it is not a plane."""
+        """The ground, unless a plane."""
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._noise_of_visits = pose_noise
         self._pose_noise = largest_noise(self._noise_of_visits)
@@ -156,7 +155,7 @@ class Optimiser:
         return self._track(self.initial_rig, located, IPM_SIGMA_RAD)
 
     def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
-        """Associate and solve by turns, until it is settled which sightings are of one marking."""
+        """Alternate association and solves until the sightings' assignment to markings is stable."""
         progress("coarse solve")
         located = self._locate(self.initial_rig)
         height_m = located.height_m[:, None]
@@ -167,7 +166,7 @@ class Optimiser:
         for number in range(1, self._options.rounds + 1):
             progress(f"joint solve {number}")
             association = self._associate(bundle.rig)
-            # The coarse solve takes the poses at their word, which no test of the inputs may rest on.
+            # The coarse solve fixes the poses, on which no test of the inputs may rest.
             if number > 1 and same_groups(association, bundle.association):
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
@@ -177,9 +176,9 @@ class Optimiser:
     def settle_from(
         self, bundle: Bundle, progress: Callable[[str], None] = silent, surface: Surface | None = None
     ) -> Bundle:
-        """Settle ground and noise of the poses from a ``bundle`` of the same sightings.
+        """Settle ground and pose noise from a ``bundle`` of the same sightings.
 
-        ``surface`` is what that makes likeliest, if it is known (:meth:`likeliest_surface`).
+        ``surface`` is its :meth:`likeliest_surface`, if known.
         """
         bundle = self._fit_ground(bundle, progress, surface)
         progress("noise of the poses")
@@ -191,7 +190,7 @@ class Optimiser:
         progress: Callable[[str], None] = silent,
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
     ) -> Optimised:
-        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
+        """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -202,7 +201,7 @@ class Optimiser:
         knots = find_knots(final.rig, self.surface)
         if knots is not None and knots.count:
             progress("lanes")
-            # By turns: how well lines are seen, only their residuals say.
+            # Alternating: only residuals show the precision of lines.
             for _ in range(_LANE_ROUNDS):
                 count = int(final.corner_index.max(initial=-1)) + 1
                 lanes = final.knots or knots, final.solution.corners_map[:count]
@@ -210,10 +209,10 @@ class Optimiser:
         return self._conclude(final, bundle, inlier, usable)
 
     def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
-        """Classify the candidates of ``final``, solved over the accepted observations ``inlier`` (K,) only.
+        """Classify the candidates of ``final``, solved from the accepted observations ``inlier`` (K,) alone.
 
-        ``ungated`` was over all; ``usable`` (S, 4) are the corners accepted. Raises MappingError where no
-        candidate is accepted.
+        ``ungated`` has all observations; ``usable`` (S, 4) are the accepted corners. Raises MappingError if
+        no candidate is accepted.
         """
         final = self._with_errors_of_ground(final)
         located = locate(self.sightings, final.rig)
@@ -251,7 +250,7 @@ class Optimiser:
             groups=classified.accepted,
             markings=markings,
             excluded=classified.exclusions(),
-            # A camera that saw no marking keeps its start and has no covariance.
+            # A camera without markings keeps its start and has no covariance.
             calibrations={
                 name: Calibration(
                     info=self._cameras[name].info,
@@ -266,7 +265,7 @@ class Optimiser:
         )
 
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
-        """``bundle``, less sure of everything by what is not known of the heights it was solved over."""
+        """``bundle`` with covariances inflated by the uncertainty of its ground's heights."""
         if self.surface is None:
             return bundle
         frame = self._seen.frame[bundle.row]
@@ -278,7 +277,7 @@ class Optimiser:
         return replace(bundle, solution=replace(bundle.solution, covariance=covariance))
 
     def _counts(self, rig: Rig, bundle: Bundle, accepted: BoolArray, corners_map: FloatArray) -> Counts:
-        """How often candidates of corners (G, 4, 2) were seen, by observations (K,), accepted or not."""
+        """Counts of candidates with corners (G, 4, 2), from observations (K,), accepted or not."""
         count = len(corners_map)
         group, image = bundle.group[accepted], self.sightings.image[bundle.row[accepted]]
         shown = np.unique(np.stack([group, image]), axis=1)
@@ -302,7 +301,7 @@ class Optimiser:
         )
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
-        """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
+        """Clock offsets by session and camera from a solve with a weak prior, started at ``bundle``."""
         model = full_model(self._pose_sigma, self._options, "clock", bundle.model.variance_factor)
         model = replace(model, clock_sigma_s=_LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
@@ -315,7 +314,7 @@ class Optimiser:
         ]
 
     def is_curved(self, bundle: Bundle) -> bool:
-        """Whether ``bundle``, over a surface, predicts held-out observations better than the plane."""
+        """Whether ``bundle``, on a surface, predicts held-out observations better than on the plane."""
         problem, own = self._as_stated(bundle), bundle.own_corner
         seen = replace(problem.observations, pinhole_px=self._seen.corners_pinhole_px[bundle.row, own])
         try:
@@ -325,7 +324,7 @@ class Optimiser:
             return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
-        """Map track after track, as the vehicle would, in place of :meth:`settle`; then solve for all."""
+        """Map track after track, as on the vehicle, in place of :meth:`settle`; then solve for all."""
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)
@@ -353,7 +352,7 @@ class Optimiser:
         return self.settle_from(bundle, progress)
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None], surface: Surface | None) -> Bundle:
-        """The solve over the ground that the drive shows, if it is not to be a plane."""
+        """The solve on the drive's ground, unless a plane."""
         if self._options.ground != SURFACE:
             return bundle
         progress("surface of the ground")
@@ -372,7 +371,7 @@ class Optimiser:
         return bundle
 
     def _better_ground(self, bundle: Bundle, surface: Surface | None) -> tuple[Surface, float, float]:
-        """The likeliest ground under ``bundle``, from ``surface`` or level, its gain, and its step, m."""
+        """The most likely ground under ``bundle``, from ``surface`` or level, its gain, and its change, m."""
         paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.visit)
         surface = Surface.level(paths) if surface is None else replace(surface, paths=paths)
         points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
@@ -382,21 +381,21 @@ class Optimiser:
         return better, gain, float(np.sqrt(np.mean(step_m**2)))
 
     def likeliest_surface(self, bundle: Bundle) -> tuple[Surface, float]:
-        """The surface that ``bundle``, over the plane, makes likeliest, and its gain.
+        """The most likely surface under ``bundle``, on the plane, and its gain.
 
-        The gain is how much better it would explain ``bundle``, less what noise would (AIC).
+        The gain is the improvement in cost over that expected from noise (AIC).
         """
         return self._better_ground(bundle, None)[:2]
 
     def _locate(self, rig: Rig) -> Located:
-        """Ground positions, restricted to the range within which sightings make groups."""
+        """Ground positions, restricted to the range within which sightings form groups."""
         located = locate(self.sightings, rig)
         with np.errstate(invalid="ignore"):
             near = located.range_m <= self._options.max_range_m
         return replace(located, valid=located.valid & near, informs=located.informs & near)
 
     def _usable(self, association: Association, rig: Rig) -> BoolArray:
-        """Corners (S, 4) that a joint solve may use, given where their groups are."""
+        """Corners (S, 4) that a joint solve may use, given the groups' positions."""
         jitter_rad = self._pose_noise.roll_pitch_rad
         return in_view(association, locate(self.sightings, rig), self.sightings, rig, jitter_rad)
 
@@ -422,7 +421,7 @@ class Optimiser:
         return self._with_all_that_fit(merged, rig)
 
     def _with_all_that_fit(self, association: Association, rig: Rig) -> Association:
-        """The groups with those sightings without one, however far off, that fit one of them alone."""
+        """The groups plus ungrouped sightings, at any range, that fit exactly one of them."""
         jitter_rad = self._pose_noise.roll_pitch_rad
         fused = fuse_groups(association, self._locate(rig), jitter_rad)
         return attach(association, self.sightings, locate(self.sightings, rig), rig, fused, jitter_rad)
@@ -448,7 +447,7 @@ class Optimiser:
         return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
-        """The solve under the larger of stated and shown noise; that of positions, unseen, as stated."""
+        """The solve under the larger of stated and estimated noise; positions', unobservable, as stated."""
         stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
         self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
@@ -458,26 +457,26 @@ class Optimiser:
 
     @property
     def pose_noise(self) -> dict[str, float]:
-        """How many times as large as stated the drive shows the noise of the poses to be, by kind."""
+        """Estimated over stated pose noise, by kind."""
         own = [self._own_noise, [pose_sigma_of(one) for one in self._noise_of_visits]]
         kinds = ("position_m", "heading_rad", "roll_pitch_rad")
         totals = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in own] for kind in kinds}
         return {kind: found / stated for kind, (found, stated) in totals.items() if stated > 0}
 
     def _reweigh(self, bundle: Bundle) -> None:
-        """Scale the observations' variances as their residuals under ``bundle`` say."""
+        """Scale the observations' variances by their residuals under ``bundle``."""
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
             self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
     def _as_stated(self, bundle: Bundle) -> Problem:
-        """The problem of ``bundle`` from where that ended, with the detector's own covariances."""
+        """The problem of ``bundle``, from its end, with the detector's own covariances."""
         seen = bundle.problem.observations
         stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
         return replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated)
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
-        """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
+        """Name of the model that best predicts held-out observations, from the end of ``bundle``."""
         try:
             selection = select_model(self._as_stated(bundle), bundle.model.solver)
         except AdjustError as failure:
@@ -489,7 +488,7 @@ class Optimiser:
 
 
 def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
-    """``stated``, with the noise of height, attitude or heading that a drive shows where that is larger."""
+    """``stated`` with the estimated noise of height, attitude or heading where larger."""
     kinds = {
         "height_m": ("height_m",),
         "roll_pitch_rad": ("roll_pitch_rad", "roll_pitch_drift"),
@@ -500,14 +499,14 @@ def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
-    """The extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
+    """Extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
     start = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in cameras.values()]
     return Rig(intrinsic, np.stack(start), map_from_vehicle)
 
 
 def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate: bool) -> Rig:
-    """``rig`` with its cameras' read-out times; as it is where all are 0 and none is to be estimated."""
+    """``rig`` with its cameras' read-out times; unchanged if all are 0 and none is estimated."""
     stated_s = read_outs_s(cameras)
     if stated_s is None and not estimate:
         return rig
@@ -517,7 +516,7 @@ def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate:
 
 
 def _scatter(bundle: Bundle) -> FloatArray:
-    """How many times as large as usual the variance of each corner's (G, 4) images is."""
+    """Variance inflation of each corner's (G, 4) images relative to the usual."""
     corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
     freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
     squared, degrees = np.zeros(size), np.full(size, -2.0)
@@ -527,10 +526,9 @@ def _scatter(bundle: Bundle) -> FloatArray:
 
 
 def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
-    """The corners of every group of ``bundle``; one that has lost them all lies where ``ungated`` had it.
+    """Corners of every group of ``bundle``; a group that lost all of them is placed as in ``ungated``.
 
-    Covariances grow with chi^2 per degree of freedom above one: residuals larger than stated make the map
-    less sure.
+    Covariances are scaled by chi^2 per degree of freedom above one.
     """
     known = bundle.corner_index >= 0
     covariance = np.full((len(known), 8, 8), np.nan)
@@ -551,7 +549,7 @@ def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
 
 
 def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:
-    """Residuals (K, 2), px, of the bundle's observations when ``rig`` and its own best corners hold."""
+    """Residuals (K, 2), px, of the bundle's observations under ``rig`` with its own best corners."""
     fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
     camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
     points = fused.corners_map[bundle.group, bundle.corner]
@@ -562,7 +560,7 @@ def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad:
 
 
 def _root_mean_square(residual_px: FloatArray) -> float:
-    """Root mean square length of residuals (K, 2); those that cannot be projected are left out."""
+    """RMS norm of residuals (K, 2), without points that have no projection."""
     squared = np.sum(residual_px**2, axis=1)
     finite = squared[np.isfinite(squared)]
     return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")

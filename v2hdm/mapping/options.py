@@ -1,4 +1,4 @@
-"""The settings of the mapping; every default suits a port and a city street alike."""
+"""Settings of the mapping; the defaults suit ports and city streets."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _RANGES = dict.fromkeys(
 class SizeOptions:
     """Sizes of classes that are painted to a standard, as factors of the joint solve.
 
-    ``by_class_m`` holds length and width, m (diagonals of diamonds, sides of other classes), as in
-    ``{diamond: [1.0, 0.7]}``. The paint matches them to within ``sigma_m``. A marking that is off by more
-    than ``tolerance``, as a fraction of length or width, is not of that size.
+    ``by_class_m`` has length and width, m (diagonals of diamonds, sides of other classes), as in
+    ``{diamond: [1.0, 0.7]}``, with the standard deviation ``sigma_m``. A marking off by more than the
+    fraction ``tolerance`` is not of that size.
     """
 
     by_class_m: dict[str, list[float]] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class SizeOptions:
 class ControlOptions:
     """A surveyed corner of a marking.
 
-    ``id`` is its name in the survey, ``position_map`` its x and y, ``sigma_m`` their standard deviations, m.
+    ``id`` is its name in the survey, ``position_map`` x and y with standard deviations ``sigma_m``, m.
     """
 
     id: str

@@ -1,8 +1,8 @@
-"""Optimise, and where the drive contradicts an input that it can do without, drop that and optimise again.
+"""Optimisation, repeated without inputs that the drive contradicts and does not need.
 
-A survey, a known size or a clock is held against everything else before the result is solved. If contradicted
-it is dropped (clocks: corrected) and reported, never obeyed in silence; what the drive cannot do without,
-such as the focal length, stays and is reported.
+Surveys, known sizes and clocks are tested against everything else before the final solve. A contradicted one
+is dropped (a clock corrected) and reported; indispensable inputs, such as the focal length, stay and are
+reported.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
-CLEAR_SIGMAS = 4.0  # an error so large is seen; in one of 400 right drives one of its forty tests exceeds it
+CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
 
-_PRIOR_ODDS = 1 / 400  # that an input is wrong: one drive in ten of a new vehicle has a wrong one of forty
+_PRIOR_ODDS = 1 / 400  # prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle
 
-_DOUBT = 0.05  # probability of a wrong input that a PASS leaves, which speaks of 95 %
+_DOUBT = 0.05  # probability of a wrong input that a PASS, stated at 95 %, leaves
 
 
 @dataclass(frozen=True)
 class _Size:
-    """Sizes of a fault, in its unit."""
+    """Limits on the size of a fault, in its unit."""
 
-    least: float  # below it an input is as good as a drive needs it, however sure the drive is
-    # up to which a drive observes it, were nothing wrong. A less observable fault is nearly what something
-    # else can be, and takes up what is left of other errors: k1 on a straight street, say.
+    least: float  # smaller errors do not matter
+    # largest model sigma at which a drive observes it. A less observable fault resembles others, and absorbs
+    # remaining errors: k1 on a straight street, for instance.
     sigma: float
-    usual: float  # that it has where an input is wrong: half of all are smaller
-    most: float  # that is physical. What calls for more is wrong in a way that nobody has foreseen.
+    usual: float  # median size where an input is wrong
+    most: float  # largest physical value; beyond it, the cause is unforeseen
 
 
 _SIZES: Mapping[Fault, _Size] = {
@@ -72,34 +72,34 @@ _SIZES: Mapping[Fault, _Size] = {
 }
 
 OBSERVABLE_SIGMA = {fault: size.sigma for fault, size in _SIZES.items()}
-"""Sigma, in the fault's unit, up to which a drive observes it."""
+"""Largest standard deviation, in the fault's unit, at which a drive observes it."""
 
 _LOOSE_CENTRE_SIGMA_M = 10.0
-"""Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
+"""Standard deviation, m, of a surveyed axis after its contradiction: uninformative."""
 
 _AMBIGUOUS_SHARE = 0.8
-"""Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
+"""Fraction of its sigmas from which another camera's fault may be the cause: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_OBSERVABLE_S = 0.004  # sigma of a clock offset, s, up to which a drive observes it: two are 8 ms
+CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two are 8 ms
 
 _CLOCK_CORRECTABLE_S = 0.006
-"""Sigma, s, up to which a contradicted clock is put right: a late clock scatters what tells of it."""
+"""Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
 
-_CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, from which a drive needs its survey: it moves the map
+_CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, above which a drive needs its survey: it shifts the map
 
-_MOST_CORRECTIONS = 4  # inputs that may be dropped one by one; with more of them wrong nothing is reliable
+_MOST_CORRECTIONS = 4  # most inputs dropped one by one; with more of them wrong nothing is reliable
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
-"""Faults that bend what a plane looks like: one that a surface leaves is the likelier cause."""
+"""Faults that deform a plane's image: if a surface leaves one, that is the more likely cause."""
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
-"""Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
+"""Median of a squared Mahalanobis distance: chi-square with two degrees of freedom."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """The inputs of a camera set: as given, or after corrections."""
+    """Inputs of a camera set, as given or corrected."""
 
     drive: Drive
     detections: Sequence[ImageDetections]
@@ -113,13 +113,13 @@ class Inputs:
 
     @cached_property
     def optimiser(self) -> Optimiser:
-        """Of these inputs, not yet run."""
+        """An optimiser of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
         return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, drive.road)
 
     def find_knots(self, rig: Rig, surface: Surface | None) -> Knots | None:
-        """The knots of the lanes that take part in the adjustment, found under ``rig``; None if none does."""
+        """Knots of lanes in the adjustment, found under ``rig``; None if there are none."""
         options = self.options.lanes
         if options.model != JOINT:
             return None
@@ -133,7 +133,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outcome:
-    """An optimised camera set with its inputs, adjusted poses and the evidence for the checks."""
+    """An optimised camera set with its inputs, adjusted poses and evidence for the checks."""
 
     inputs: Inputs
     bundle: Bundle
@@ -141,17 +141,17 @@ class Outcome:
 
 
 def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, Optimised]:
-    """Optimise a drive, as often as inputs have to be dropped; MappingError where there is nothing to map."""
+    """Optimise a drive, dropping contradicted inputs one by one; MappingError if there is nothing to map."""
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
     while True:
-        # 1. Associate and solve, all at once or marking by marking.
+        # 1. Associate and solve, as a batch or marking by marking.
         settled = _settled(inputs, progress)
-        # 2. Where the drive contradicts the plane, and a surface explains all of it, take that.
+        # 2. Switch to a surface where the drive contradicts the plane and a surface explains all of it.
         inputs, settled, found = _over_ground(inputs, settled, progress)
         worst = _worst(found)
         optimiser, drive = inputs.optimiser, inputs.drive
-        # 3. Begin anew without the likeliest wrong input, if the drive can do without; foreign images stay.
+        # 3. Start again without the most likely wrong input, if dispensable; foreign images stay.
         foreign, left = _foreign(inputs, settled, found, progress), None
         if worst is not None and log_odds(worst) > foreign[2] and len(corrected) < _MOST_CORRECTIONS:
             left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
@@ -165,7 +165,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             one.value, one.fault.unit,
         )  # fmt: skip
         inputs = left
-    # 4. Choose the pose model, solve without outliers and conclude.
+    # 4. Choose the pose model, solve without outliers and classify the candidates.
     optimised = optimiser.finish(settled, progress, inputs.find_knots)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
@@ -174,14 +174,14 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
 
 
 def _settled(inputs: Inputs, progress: Callable[[str], None]) -> Bundle:
-    """A solve over all observations, over the plane unless the options ask for a surface."""
+    """A solve of all observations on the plane, or on a surface if the options ask for it."""
     if inputs.options.mode == INCREMENTAL:
         return inputs.optimiser.grow(progress)
     return inputs.optimiser.settle(inputs.tracks, progress)
 
 
 def _tested(inputs: Inputs, settled: Bundle, progress: Callable[[str], None]) -> tuple[ScoreTest, ...]:
-    """The tests of the inputs that ``settled`` was solved with, the likeliest fault first."""
+    """Tests of the inputs of ``settled``, most likely fault first."""
     progress("tests of the inputs")
     found = score_faults(settled.problem, settled.solution)
     stated = (one for one in found if _is_stated(one, settled, inputs.drive))
@@ -195,9 +195,9 @@ def _worst(found: Sequence[ScoreTest]) -> ScoreTest | None:
 def _over_ground(
     inputs: Inputs, settled: Bundle, progress: Callable[[str], None]
 ) -> tuple[Inputs, Bundle, tuple[ScoreTest, ...]]:
-    """The inputs, ``settled`` and its tests, or those over a surface where the drive shows one.
+    """Inputs, ``settled`` and its tests, or those on a surface if the drive shows one.
 
-    A plane is contradicted where the ground surely falls or rises, if only by as little as outliers leave.
+    A fall or rise of the ground contradicts the plane even if only as small as outliers leave it.
     """
     if inputs.options.ground != AUTO:
         return inputs, settled, _tested(inputs, settled, progress)
@@ -221,9 +221,9 @@ def _over_ground(
 def _foreign(
     inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest], progress: Callable[[str], None]
 ) -> tuple[float, float, float]:
-    """The likeliest stretch of foreign images, s, and its log odds as the cause of all that is doubtful.
+    """The most likely segment of foreign images, s, and its log-odds as the cause of all doubts.
 
-    It explains of the corners what a solve without its images leaves less doubtful.
+    It explains the corners, plus the doubts that a solve without its images removes.
     """
     drive, names = inputs.drive, inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
@@ -246,24 +246,24 @@ def _foreign(
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
-    """When the frames (J,) of a bundle's problem were taken, s."""
+    """Times (J,) of the frames of a bundle's problem, s."""
     return sightings.stamp_s[np.unique(sightings.frame[settled.row])]
 
 
 def visit_names(drive: Drive) -> tuple[str, ...]:
-    """The names of a joined drive's visits, none of a single one."""
+    """Names of a joined drive's sessions; none for a single session."""
     return tuple(visit.name for visit in drive.joined)
 
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
-    """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
+    """Whether the suspected input was stated: an unsurveyed centre is a guess."""
     if one.fault not in (Fault.SURVEY, Fault.LEVER):
         return True
     return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
 
 
 def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
-    """False of a surveyed point held to a candidate that did not enter the map, such as a worn marking."""
+    """False for a surveyed point matched to a candidate outside the map, such as a worn marking."""
     if one.fault is not Fault.CONTROL:
         return True
     point_map = next(point.position_map for point in survey.points if point.id == one.about)
@@ -275,7 +275,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
 
 
 def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
-    """A survey that was dropped, off by what the solve without it says; others as they are."""
+    """A dropped survey with its error from the solve without it; others unchanged."""
     if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
         return one
     rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
@@ -308,7 +308,7 @@ def _evidence(
         worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
         clock_s=_clocks(final),
         read_out_s=_read_outs(final),
-        # Noise of a coordinate is a mean of both: along the way alone its variance is twice as large.
+        # A coordinate's noise averages both directions; along the path alone its variance is twice that.
         jitter_s=math.sqrt(2) * stated_m * optimiser.pose_noise.get("position_m", 0.0) / max(speed_mps, 0.1),
         along_over_across=innovations.along_over_across,
     )
@@ -329,45 +329,45 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
 
 
 def is_contradicted(one: ScoreTest) -> bool:
-    """Whether an input is off by more than matters, and this drive observes it, likelier than not."""
+    """Whether an input's error matters, is observable, and is more likely than not."""
     return matters(one) and one.sigmas > even_sigmas(one)
 
 
 def is_doubtful(one: ScoreTest) -> bool:
-    """Whether an input is off by more than matters, if not surely, then with more than 5 % probability."""
+    """Whether an input's error matters, is observable, and has more than 5 % probability."""
     return matters(one) and one.sigmas > even_sigmas(one, _DOUBT / (1 - _DOUBT))
 
 
 def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
-    """The sigmas from which the ``odds`` are that an input is off; errors are Cauchy about the usual size."""
+    """Sigmas at which an input's error reaches ``odds``; errors are Cauchy, scaled by the usual size."""
     return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
 
 
 def doubt(one: ScoreTest) -> float:
-    """Log odds that an input is off, by its sigmas and its size."""
+    """Log-odds of an input's error, from its sigmas and size."""
     return one.sigmas**2 / 2 + _log_spread(one) + math.log(_PRIOR_ODDS)
 
 
 def _log_spread(one: ScoreTest) -> float:
-    """Log of the share of likely errors that lie within the sigma about the value of one."""
+    """Log of the prior probability of an error within one sigma of its value."""
     usual = _SIZES[one.fault].usual
     size = math.sqrt(2 * math.pi) * one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
     return math.log(max(size, 1e-300))
 
 
 def matters(one: ScoreTest) -> bool:
-    """Whether an input is off by more than a drive can bear, as far as this one observes it."""
+    """Whether an observable input's error is larger than a drive tolerates."""
     size = _SIZES[one.fault]
     return one.model_sigma <= size.sigma and abs(one.value) > size.least
 
 
 def is_physical(one: ScoreTest) -> bool:
-    """Whether an input can be off by so much; if not, something else is wrong that nobody has foreseen."""
+    """Whether an error of this size is possible; otherwise the cause is unforeseen."""
     return abs(one.value) <= _SIZES[one.fault].most
 
 
 def log_odds(one: ScoreTest) -> float:
-    """How likely a fault is the cause, by its gain and by its size, which is Cauchy about the usual one."""
+    """Score of a fault as the cause: its gain, and the Cauchy prior of its size."""
     return one.gain - math.log1p((one.value / _SIZES[one.fault].usual) ** 2)
 
 
@@ -388,7 +388,7 @@ def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
 
 
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
-    """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
+    """The inputs without the fault ``worst``; None if the drive needs them."""
     if worst.fault is Fault.CLOCK:
         if worst.sigma > _CLOCK_CORRECTABLE_S:
             return None
@@ -399,8 +399,8 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
         return _without_axis(inputs, _cameras_of(settled, worst), worst.axis)
     options = inputs.options
     if worst.fault is Fault.SIZE:
-        # One wrong size says that the paint is of another standard; the others' corners may only look like
-        # outliers, which a robust loss hides from the tests.
+        # One wrong size means paint of another standard; corners of others may look like outliers, which the
+        # robust loss hides from the tests.
         options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
     elif worst.fault is Fault.CONTROL:
         options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
@@ -412,7 +412,7 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
 
 
 def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
-    """The images of each visit and camera posed for ``later_s`` after the times that they have by now."""
+    """Images posed ``later_s`` after their present times, by session and camera."""
     drive = inputs.drive
     if any(visit.trajectory is None for visit in drive.visits):
         return None
@@ -431,7 +431,7 @@ def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inpu
 
 
 def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | None:
-    """The survey of some cameras' centres known no more along one axis; None where it already is not."""
+    """The survey without one axis of some cameras' centres; None if already unknown."""
     cameras = dict(inputs.drive.cameras)
     for name in names:
         prior = cameras[name].centre_prior
@@ -446,7 +446,7 @@ def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | N
 def _contradictions(
     bundle: Bundle, found: Sequence[ScoreTest], sightings: Sightings, visits: Sequence[str] = ()
 ) -> tuple[Contradiction, ...]:
-    """``found`` in the bundle's problem, in the words of the user's inputs; several ``visits`` are named."""
+    """``found`` for the bundle's problem, in terms of the user's inputs; several ``visits`` are named."""
     frame_s = _frame_s(bundle, sightings)
     return tuple(
         Contradiction(
@@ -462,16 +462,16 @@ def _cameras_of(bundle: Bundle, test: ScoreTest) -> tuple[str, ...]:
 
 
 def _point_of(bundle: Bundle, item: int) -> str:
-    """The name of the surveyed point that a test's ``item`` is."""
+    """Name of the surveyed point of a test's ``item``."""
     control = bundle.problem.control
     assert control is not None
     return name_of(bundle.model.survey, control.points_map[item])
 
 
 def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
-    """How well each camera's observations fit ``bundle``, a solve before anything was left out."""
+    """Fit of each camera's observations in ``bundle``, a solve with all of them."""
     seen, fits = bundle.problem.observations, {}
-    # A corner counts by what it knows: detectors err far, and in the tails, more than they state.
+    # Corners weigh by their information: distant and outlying detections err by more than stated.
     knows = 1 / np.trace(seen.covariance_px, axis1=1, axis2=2)
     for name, c in bundle.camera_index.items():
         own = seen.camera == c
