@@ -92,7 +92,7 @@ def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
         axes.add_collection(PolyCollection(shapes, linewidths=0.8, label="markings", **paint))
         if len(excluded):
             cross: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "ms": 4, "mew": 1.0}
-            axes.plot(*excluded.T, "x", label="left out, with reason", **cross)
+            axes.plot(*excluded.T, "x", label="left out", **cross)
         axes.set_aspect("equal", adjustable="datalim")
         axes.autoscale_view()
         axes.set(xlabel="east (m)", ylabel="north (m)")
@@ -128,9 +128,9 @@ def _histogram_chart(residuals: GroundResiduals) -> str:
             _steps(left, lengths, edges_px, f"{name} ({len(lengths)})", number)
             _steps(right, residuals.distance_sigma[own], edges_sigma, name, number)
         ideal = edges_sigma * np.exp(-0.5 * edges_sigma**2)
-        right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="as the noise model states")
-        left.set(xlabel="distance, projected to observed (px)", ylabel="share of corners per px")
-        right.set_xlabel("the same (standard deviations)")
+        right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="stated noise model")
+        left.set(xlabel="reprojection error (px)", ylabel="fraction of corners per px")
+        right.set_xlabel("reprojection error (σ)")
         for axes in (left, right):
             axes.set_ylim(bottom=0)
             axes.set_xlim(left=0)
@@ -201,8 +201,8 @@ def _range_chart(residuals: GroundResiduals) -> str:
             look = {**_look(number), "marker": _MARKERS[number % len(_MARKERS)], "ms": 3.5}
             for axes, values in ((left, residuals.size_px), (right, ground_cm)):
                 axes.plot(*_rms_by(residuals.range_m[own], values[own], edges), label=name, **look)
-        left.set_ylabel("RMS distance (px)")
-        right.set_ylabel("RMS on the ground (cm)")
+        left.set_ylabel("RMS residual (px)")
+        right.set_ylabel("RMS residual on the ground (cm)")
         for axes in (left, right):
             axes.set_xlabel("distance from the camera (m)")
             axes.set_ylim(bottom=0)
@@ -250,7 +250,7 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
         for axes in panels:
             axes.grid(axis="y")
             axes.set_xlim(0, total)
-        panels[-1].set_xlabel("way driven (m)")
+        panels[-1].set_xlabel("distance driven (m)")
     return out[0]
 
 
@@ -266,8 +266,8 @@ def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
                 np.concatenate([[0], order, [top]]), np.concatenate([[0], share, [100]]), where="post",
                 label=name, **_look(number),
             )  # fmt: skip
-        axes.set(xlabel="95 % of the error lies within (cm)", xlim=(0, max(top, 1e-3)))
-        axes.set(ylabel="share of corners (%)", ylim=(0, 102))
+        axes.set(xlabel="95 % error (cm)", xlim=(0, max(top, 1e-3)))
+        axes.set(ylabel="fraction of corners (%)", ylim=(0, 102))
         axes.grid()
         axes.legend(loc="lower right", fontsize=8.5)
     return out[0]

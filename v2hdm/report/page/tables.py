@@ -100,13 +100,13 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m in total"),
     ]
     for name, values, note in (
-        ("Between neighbours", relative_m(markings), "95 % of a corner’s error, relative"),
-        ("In the map’s frame", half_axes_m(markings), "95 % of a corner’s error, absolute"),
+        ("Between neighbours", relative_m(markings), "median 95 % error of corners, relative"),
+        ("In the map’s frame", half_axes_m(markings), "median 95 % error of corners, absolute"),
     ):
         if len(values):
             figures.append(Figure(name, number(100 * float(np.median(values)), 1), "cm", note))
     if "corner_rmse_m" in best:
-        note = "root mean square of all corners"
+        note = "RMSE of all corners"
         figures.append(Figure("Against the truth", number(best["corner_rmse_m"], 1, 100), "cm", note))
     checked = facts.metrics.get("check_points") or {}
     if "rmse_m" in checked:
@@ -145,7 +145,7 @@ def truth_table(facts: Facts) -> Table | None:
         errors = [number(found.get(key), 2, 100) for key in ("corner_rmse_m", "corner_bias_m")]
         false, inside = number(found.get("false_markings"), 0), number(_inside(own, facts), 0, 100)
         rows.append([name_of(name), str(len(own)), false, number(recall, 1, 100), *errors, inside])
-    errors_of = ("false", "recall (%)", "RMSE (cm)", "bias (cm)", "in their 95 % ellipse (%)")
+    errors_of = ("false", "recall (%)", "RMSE (cm)", "bias (cm)", "inside 95 % ellipse (%)")
     return table(("class", "markings", *errors_of), rows)
 
 
@@ -220,7 +220,7 @@ def content_table(facts: Facts) -> Table | None:
 def reason_table(facts: Facts) -> Table:
     """Why candidates were left out, the most frequent reason first."""
     counts = Counter(one.reason for one in facts.excluded).most_common()
-    return table(("left out because", "candidates"), [[reason, str(count)] for reason, count in counts])
+    return table(("reason", "candidates"), [[reason, str(count)] for reason, count in counts])
 
 
 def method_table(facts: Facts) -> Table | None:
@@ -254,7 +254,7 @@ def timing_table(facts: Facts) -> Table | None:
     seconds = facts.metrics.get("seconds") or {}
     if not seconds:
         return None
-    steps = seconds | {"together": sum(float(one) for one in seconds.values())}
+    steps = seconds | {"total": sum(float(one) for one in seconds.values())}
     return table(("step", "s"), [[name, number(float(value), 1)] for name, value in steps.items()])
 
 
@@ -313,7 +313,7 @@ def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
     if one.read_out_s is not None:
         read_out, sigma = number(one.read_out_s, 1, 1e3), number(one.read_out_sigma_s, 1, 1e3)
         rows.append(["read-out, first row to last", f"{read_out} ms", f"{sigma} ms", "–"])
-    return table(("", "value", "± 1 σ", "changed by"), rows)
+    return table(("", "value", "± 1 σ", "change"), rows)
 
 
 def _change(value: object, factor: float, digits: int, unit: str) -> str:

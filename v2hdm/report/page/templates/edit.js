@@ -1,9 +1,9 @@
-// Corrections by a person, in the page that v2hdm view serves: each is sent at once, and written before it is shown as kept.
+// A person's corrections, in the page of v2hdm view: each is sent at once, and written before it is shown as saved.
 (() => {
   "use strict";
   const { map, things, element, kinds } = window.v2hdmMap;
   const editing = JSON.parse(document.getElementById("editing").textContent);
-  const said = editing.corrections; // by the key of the marking
+  const said = editing.corrections; // by key of the marking
   const handles = L.layerGroup().addTo(map);
   const status = element("p", { class: "editing", role: "status" });
   document.querySelector(".atlas").before(status);
@@ -31,7 +31,7 @@
       tell();
       offer(shape, shape.form);
     } catch (error) {
-      tell(`Not kept: ${error.message || "v2hdm view does not answer; is it still running?"}`);
+      tell(`Not saved: ${error.message || "v2hdm view does not answer; is it still running?"}`);
     }
   }
 
@@ -46,7 +46,7 @@
       made.addEventListener("click", () => send(shape, change()));
       return made;
     };
-    const reason = element("input", { id: "edit-reason", placeholder: "why (a manhole, a shadow)", maxlength: 200 });
+    const reason = element("input", { id: "edit-reason", placeholder: "reason (manhole, shadow)", maxlength: 200 });
     reason.value = own.reason ?? "";
     const kind = element("select", { id: "edit-class" }, ...editing.kinds.map((name) => element("option", { value: name }, name.replaceAll("_", " "))));
     kind.value = own.new_class ?? kindOf(about);
@@ -62,7 +62,7 @@
     if (!about.c || own.says === "rejected") return;
     about.c.forEach(([x, y], n) => {
       const [east, north] = own.moved?.[n + 1] ?? [x, y];
-      const handle = L.marker([north, east], { draggable: true, autoPan: true, title: `corner ${n + 1}: drag it`, icon: L.divIcon({ className: "handle", iconSize: [26, 26] }) });
+      const handle = L.marker([north, east], { draggable: true, autoPan: true, title: `corner ${n + 1}: drag to move`, icon: L.divIcon({ className: "handle", iconSize: [26, 26] }) });
       handle.on("drag", () => {
         const corners = about.c.map((corner) => [corner[1], corner[0]]);
         handles.eachLayer((one) => { corners[one.corner] = one.getLatLng(); });

@@ -1,5 +1,5 @@
 // The map of the report: Leaflet on a canvas, in local metres (CRS.Simple: latitude is north, longitude east).
-// Names of people's files only ever become text nodes.
+// User-supplied names may contain markup: they only become text nodes.
 (() => {
   "use strict";
   const data = JSON.parse(document.getElementById("map-data").textContent);
@@ -11,11 +11,11 @@
   const cm = (metres) => `${number(100 * metres, 1)} cm`;
   const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky"];
   const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
-  const MOST_IN_DETAIL = 1200; // markings in view up to which ellipses and arrows are drawn
-  const LEAST_PX = 3; // half axis of an ellipse below which it would be a dot
-  const NEAR_PX = 6; // pixels of a metre from which ellipses and arrows are drawn
+  const MOST_IN_DETAIL = 1200; // most markings in view with ellipses and arrows
+  const LEAST_PX = 3; // least semi-axis of a drawn ellipse
+  const NEAR_PX = 6; // least pixels per metre for ellipses and arrows
 
-  let pictures = null; // parsed when first needed: most of the page's size
+  let pictures = null; // parsed on first use: they are most of the page
   const picturesOf = (key) => {
     pictures ??= JSON.parse(byId("pictures").textContent);
     return pictures[key] ?? [];
@@ -34,7 +34,7 @@
     attributionControl: false, renderer: L.canvas({ padding: 0.4 }), zoomControl: true,
   });
   L.control.scale({ imperial: false, maxWidth: 140 }).addTo(map);
-  // Only markings answer the pointer; what lies above them lets it through.
+  // Only markings react to the pointer; the panes above them are transparent to it.
   const pane = (name, zIndex) => {
     const made = map.createPane(name);
     made.style.zIndex = zIndex;
@@ -46,7 +46,7 @@
 
   // ---- layers ----
   const layers = {};
-  const small = { noClip: true, smoothFactor: 0 }; // four corners gain nothing by clipping and simplifying
+  const small = { noClip: true, smoothFactor: 0 }; // clipping and simplifying do not pay for four corners
   const still = (renderer) => ({ renderer, interactive: false, smoothFactor: 0.3 });
   for (const [zIndex, name] of ["background", "mosaic"].entries()) {
     if (!data[name]) continue;
@@ -79,7 +79,7 @@
     feature(L.circleMarker(at(one.p), { radius: 6 }), { ...one, key: `c${n}`, what: "check" })));
   const FATES = { moved: "blue", vanished: "vermillion", new: "green" };
   const changed = new Map(data.changes.map((one) => [one.id, one]));
-  // What is still there answers as its marking does; what is gone answers for itself.
+  // Existing markings react themselves; vanished ones need a shape of their own.
   layers.changes = L.featureGroup(data.changes.flatMap(({ before, ...one }) => {
     const dashed = { fate: one.fate, dashArray: "5 4" };
     if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...small, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
@@ -94,10 +94,10 @@
     class: { name: "class" },
     absolute: { name: "95 % error, absolute", of: worst, unit: "cm" },
     relative: { name: "95 % error, relative", of: (one) => one.r ?? NaN, unit: "cm" },
-    truth: { name: "error against the truth", of: (one) => one.t ?? NaN, unit: "cm" },
+    truth: { name: "error against ground truth", of: (one) => one.t ?? NaN, unit: "cm" },
     sightings: { name: "sightings", of: (one) => one.n, unit: "" },
   };
-  // Cividis, which is even in lightness and the same to colour-blind people.
+  // Cividis: uniform in lightness, and safe for colour-blind readers.
   const RAMP = ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8779", "#a69d75", "#c4b56c", "#e4cf5b", "#fee838"];
   const ramp = (share) => RAMP[Math.min(RAMP.length - 1, Math.max(0, Math.round(share * (RAMP.length - 1))))];
   let shade = "class";
@@ -127,7 +127,7 @@
     detail();
   }
 
-  // ---- what is drawn only for what is in view ----
+  // ---- details, for markings in view only ----
   function ring([x, y], [a, b, direction], times) {
     const [c, s] = [Math.cos(direction), Math.sin(direction)];
     return Array.from({ length: 72 }, (_, n) => {
@@ -175,7 +175,7 @@
 
   // ---- the panel ----
   const NAMES = {
-    markings: "markings and symbols", lanes: "lane lines", truth: "truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
+    markings: "markings and symbols", lanes: "lane lines", truth: "ground truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
     recorded: "route, recorded", excluded: "left out", changes: "changes", arrows: "residual arrows", mosaic: "ground mosaic", background: "background picture",
   };
   const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
@@ -228,7 +228,7 @@
       rows.push(element("div", { class: "ends" }, element("span", {}, text(range[0])), element("span", {}, `${text(range[1])} and more`)));
     }
     if (layers.arrows && map.hasLayer(layers.arrows)) {
-      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 3) % SERIES.length]})`, DASHES[n % DASHES.length], "arrow"), `${name}: mean of map minus seen`)));
+      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 3) % SERIES.length]})`, DASHES[n % DASHES.length], "arrow"), `${name}: mean of projected minus observed`)));
     }
     byId("legend").replaceChildren(...rows);
   }
@@ -245,7 +245,7 @@
     if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
     if (Number.isFinite(about.r)) rows.push(["95 %, relative", cm(about.r)]);
     if (Number.isFinite(worst(about))) rows.push(["95 %, absolute", cm(worst(about))]);
-    if (Number.isFinite(about.t)) rows.push(["off the truth", `${cm(about.t)} RMS`]);
+    if (Number.isFinite(about.t)) rows.push(["error against truth", `${cm(about.t)} RMS`]);
     return rows;
   }
   function checked({ off: [dx, dy], inside }) {
@@ -292,9 +292,9 @@
     const shots = element("div", { class: "shots" }, ...picturesOf(about.key).map(shot));
     const side = element("div");
     if (shots.childElementCount) {
-      const what = about.what === "marking" ? "Outline: as the map puts it there. Crosses: corners as they were detected." : "Where the map puts it; something else may stand in front.";
+      const what = about.what === "marking" ? "Outline: the map’s marking, projected. Crosses: detected corners." : "Projected map position; it may be occluded.";
       side.append(element("p", { class: "hint" }, what), shots);
-    } else side.append(element("p", { class: "hint" }, "No picture of it in this report."));
+    } else side.append(element("p", { class: "hint" }, "No picture in this report."));
     byId("details").replaceChildren(element("div", { class: "card", "data-key": about.key }, text, side));
     dispatchEvent(new CustomEvent("v2hdm-selected", { detail: { shape, text } }));
   }
@@ -341,14 +341,14 @@
   map.on("mouseout", () => byId("place").replaceChildren());
 
   // ---- the table of markings ----
-  const SHOWN = 200; // rows at once: a page of thousands is slow, and nobody reads them
+  const SHOWN = 200; // rows at once: thousands would be slow
   const COLUMNS = [
     { name: "marking", of: (one) => one.id, digits: 0 },
     { name: "class", of: (one) => words(data.kinds[one.k]) },
     { name: "sightings", of: (one) => one.n, digits: 0 },
     { name: "relative (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
     { name: "absolute (cm)", of: (one) => 100 * worst(one), digits: 1 },
-    { name: "off the truth (cm)", of: (one) => 100 * (one.t ?? NaN), digits: 1 },
+    { name: "error against truth (cm)", of: (one) => 100 * (one.t ?? NaN), digits: 1 },
     { name: "suspicion p", of: (one) => data.suspicion[one.id] ?? NaN, digits: 3 },
   ].filter((column) => !column.digits || things.some((shape) => Number.isFinite(column.of(shape.about))));
   const listed = things.filter((shape) => ["marking", "symbol"].includes(shape.about.what));
@@ -403,12 +403,12 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
   paint();
   list();
-  addEventListener("DOMContentLoaded", () => { // the pictures stand below this script
+  addEventListener("DOMContentLoaded", () => { // pictures come after this script
     for (const cell of document.querySelectorAll("[data-shots]")) {
       const shots = picturesOf(cell.dataset.shots).slice(0, 1).map(shot);
       if (shots.length) cell.replaceChildren(...shots);
     }
   });
   byId("map").dataset.ready = String(Math.round(performance.now()));
-  window.v2hdmMap = { map, things, element, kinds: data.kinds }; // for tests, and for those who want more of it
+  window.v2hdmMap = { map, things, element, kinds: data.kinds }; // for tests and further scripts
 })();
