@@ -1,1 +1,1 @@
-"""Judging a map: metrics against ground truth, figures and the table that ends a run."""
+"""Reports on a map: metrics against ground truth, figures, tables on the terminal, and the page."""

@@ -1,12 +1,12 @@
 r"""Check points: surveyed corners that no estimate has used, against the map.
 
-The errors of a map's corners are not independent of each other: what is left of the receiver's drift moves
-all of them alike. The test of all points together therefore takes their joint covariance,
+Errors of a map's corners are correlated, since remaining GNSS drift moves all of them. The joint test of all
+points therefore uses their joint covariance,
 
 .. math:: T = e' (C_\text{map} + C_\text{survey})^{-1} e,
 
-which is chi-square with as many degrees of freedom as there are coordinates, where map and survey are as good
-as they say. T over these is the normalised estimation error squared (NEES), 1 on average.
+which is chi-square with one degree of freedom per coordinate if both covariances are right. T per degree of
+freedom is the normalised estimation error squared (NEES), 1 on average.
 """
 
 from __future__ import annotations
@@ -25,21 +25,20 @@ from v2hdm.io.maps.features import features_of
 from v2hdm.records import FloatArray, HdMap, JointCovariance
 from v2hdm.store.files import replace_csv
 
-INSIDE = 0.95  # probability of the ellipse that a point is reported to lie in or not
+INSIDE = 0.95  # probability of the reported confidence ellipse
 
 COLUMNS: tuple[str, ...] = (
     *("id", "description", "x_map_m", "y_map_m", "marking", "class", "corner"),
     *("dx_m", "dy_m", "distance_m", "sigma_x_m", "sigma_y_m", "map_sigma_x_m", "map_sigma_y_m"),
     *("normalised_error", "inside_95_percent", "dz_m", "not_compared_because"),
 )
-"""Differences are map minus survey. ``corner`` counts from 1. ``sigma_...`` are those of the difference: of
-map and survey together. ``normalised_error`` is the difference in its standard deviations, both axes in
-one."""
+"""Differences are map minus survey; ``corner`` counts from 1. ``sigma_...`` combine map and survey.
+``normalised_error`` is the Mahalanobis distance over both axes."""
 
 
 @dataclass(frozen=True)
 class CheckedPoint:
-    """One check point beside the corner of the map that is nearest to it."""
+    """One check point and the nearest corner of the map."""
 
     point: SurveyedPoint
     marking: int
@@ -47,8 +46,8 @@ class CheckedPoint:
     kind: str
     corner: int  # 0 to 3
     off_m: FloatArray  # (2,) map minus survey
-    map_covariance_m2: FloatArray  # (2, 2) of the map's corner
-    off_height_m: float | None  # map minus survey; None where one of them has no height
+    map_covariance_m2: FloatArray  # (2, 2)
+    off_height_m: float | None  # map minus survey; None without both heights
 
     @property
     def covariance_m2(self) -> FloatArray:
@@ -57,25 +56,25 @@ class CheckedPoint:
 
     @property
     def distance_m(self) -> float:
-        """How far apart they are."""
+        """Horizontal distance."""
         return float(np.linalg.norm(self.off_m))
 
     @property
     def normalised(self) -> float:
-        """The difference in its standard deviations."""
+        """Mahalanobis distance."""
         return float(np.sqrt(self.off_m @ np.linalg.solve(self.covariance_m2, self.off_m)))
 
     @property
     def is_inside(self) -> bool:
-        """Whether it is within its ellipse of 95 %."""
+        """Whether it is inside its 95 % ellipse."""
         return bool(self.normalised**2 <= chi2.ppf(INSIDE, 2))
 
 
 @dataclass(frozen=True)
 class CheckTable:
-    """All check points of a survey against a map: ``compared`` have a corner of it, ``unmatched`` a reason.
+    """Check points of a survey: ``compared`` ones with a map corner, ``unmatched`` ones with a reason.
 
-    ``covariance_m2`` (2N, 2N) is the joint one of the differences, stacked x0, y0, x1, ...
+    ``covariance_m2`` (2N, 2N) is the differences' joint covariance, stacked x0, y0, x1, ...
     """
 
     compared: tuple[CheckedPoint, ...]
@@ -89,12 +88,12 @@ class CheckTable:
 
     @property
     def rmse_m(self) -> float:
-        """Root of the mean squared distance."""
+        """Root mean square distance."""
         return float(np.sqrt(np.mean(np.sum(self.off_m**2, axis=1))))
 
     @property
     def squared(self) -> float:
-        """T of all differences together."""
+        """T of all differences."""
         return squared(self.off_m.ravel(), self.covariance_m2)
 
     def figures(self) -> dict[str, Any]:
@@ -131,7 +130,7 @@ class CheckTable:
 
     @property
     def headline(self) -> str:
-        """All of it in one line for a reader."""
+        """One line on all check points."""
         total = len(self.compared) + len(self.unmatched)
         if not self.compared:
             return f"check points: none of {total} has a map corner within reach"
@@ -148,7 +147,7 @@ class CheckTable:
 
 
 def squared(off_m: FloatArray, covariance_m2: FloatArray) -> float:
-    """Stacked differences (2N,) in their joint standard deviations, squared: chi-square of 2N degrees."""
+    """Squared Mahalanobis distance of stacked differences (2N,): chi-square with 2N degrees of freedom."""
     return float(off_m @ np.linalg.solve(covariance_m2, off_m))
 
 
@@ -159,7 +158,7 @@ def compare(
     joint: JointCovariance,
     route_map: FloatArray,
 ) -> CheckTable:
-    """Hold check points against the corners of a map within ``reach_m``; ``route_map`` (F, 2) was driven."""
+    """Compare check points with a map's corners within ``reach_m``; ``route_map`` (F, 2) is the route."""
     corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 2)
     positions = np.array([point.position_map for point in points]).reshape(-1, 2)
     off_m, nearest = KDTree(corners).query(positions)
@@ -216,5 +215,5 @@ def write_check_points(table: CheckTable, path: Path) -> None:
 
 
 def _metres(values: Sequence[float] | FloatArray) -> list[str]:
-    """To a tenth of a millimetre."""
+    """Lengths as text, to 0.1 mm."""
     return [f"{value:.4f}" for value in values]

@@ -1,7 +1,7 @@
-"""How far a map and a calibration are from the truth, as ``metrics.json`` states it.
+"""Errors of a map and a calibration against ground truth, for ``metrics.json``.
 
-Only this package and the pipeline's evaluation step read ground truth. All lengths are metres in
-the map frame unless a name says otherwise.
+Only this package and the pipeline's evaluation read ground truth. Lengths are metres in the map frame unless
+named otherwise.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from v2hdm.geometry.planar import inside_convex, length_along, points_along
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
 
-MATCH_GATE_M = 2.0  # a mapped marking farther than this from every true one of its class is false
-MIN_SIGHTINGS = 3  # images that show all of a marking in the region of interest, for it to be driven past
+MATCH_GATE_M = 2.0  # a mapped marking farther from every true one of its class is false
+MIN_SIGHTINGS = 3  # images with the whole marking in the region of interest that count as driven past
 _TWO_SIDED_95 = 1.96  # standard deviations to either side
-FULLY_VISIBLE = 0.99  # visible fraction from which a marking counts as unoccluded
+FULLY_VISIBLE = 0.99  # visible fraction of an unoccluded marking
 
 
 @dataclass(frozen=True)
 class MarkingMetrics:
-    """Mapped markings of one class, or of all, against the true ones; nan where nothing matched."""
+    """Mapped markings of one class, or all, against the true ones; nan without matches."""
 
     markings: int
     false_markings: int  # without a true counterpart
     expected: int  # true ones driven past within the region of interest
-    recall: float  # their mapped share
+    recall: float  # mapped fraction of these
     corner_rmse_m: float
     corner_bias_m: float  # length of the corners' mean error vector
 
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
-    """Which true markings (J,) the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
+    """True markings (J,) that the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
     plan, heights = (
         np.array([np.zeros(4) if one is None else one for one in ours], dtype=np.float64)
         for ours in ((m.corners_map for m in truth.map.markings), (m.heights_m for m in truth.map.markings))
@@ -59,7 +59,7 @@ def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray
 def marking_metrics(
     hd_map: HdMap, truth: Truth, expected: BoolArray, kind: str | None = None
 ) -> MarkingMetrics:
-    """Compare the markings of ``kind`` (all where None) with the truth; see :class:`MarkingMetrics`."""
+    """Compare markings of ``kind``, all if None, with the truth; see :class:`MarkingMetrics`."""
     mapped = [m for m in hd_map.markings if kind is None or m.kind == kind]
     true_index = [j for j, m in enumerate(truth.map.markings) if kind is None or m.kind == kind]
     true = [truth.map.markings[j] for j in true_index]
@@ -81,14 +81,14 @@ def marking_metrics(
 def match_markings(
     mapped: Sequence[Marking], true: Sequence[Marking], gate_m: float = MATCH_GATE_M
 ) -> tuple[list[int], list[int]]:
-    """One-to-one pairs (indices into both) of the same class, by least total centre distance."""
+    """One-to-one pairs (indices into both) within a class, of least total centre distance."""
     if not mapped or not true:
         return [], []
     centres = np.array([m.corners_map.mean(axis=0) for m in mapped])
     true_centres = np.array([m.corners_map.mean(axis=0) for m in true])
     distance = np.linalg.norm(centres[:, None] - true_centres[None], axis=2)
     kinds_differ = np.array([m.kind for m in mapped])[:, None] != np.array([m.kind for m in true])[None]
-    # Beyond the gate all pairs cost the same, so that they never push a near pair apart.
+    # A constant cost beyond the gate, so that distant pairs never separate a near one.
     cost = np.where(kinds_differ | (distance > gate_m), gate_m * 1e3, distance)
     rows, columns = linear_sum_assignment(cost)
     keep = cost[rows, columns] <= gate_m
@@ -103,7 +103,7 @@ def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatAr
 
 
 def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[str, float]:
-    """RMSE, m, of paired corners' heights and the share within 1.96 sigmas; nothing that is not known."""
+    """RMSE, m, of paired corners' heights, and the fraction within 1.96 sigmas, where known."""
     off, inside = [], []
     for one, other, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
         if one.heights_m is None or other.heights_m is None:
@@ -116,7 +116,7 @@ def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[s
 
 
 def _first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
-    """By how many corners each marking of pairs is turned to agree best with the true one."""
+    """Cyclic shift of each pair's corners with the least error."""
     shifts = []
     for one, other in zip(mapped, true, strict=True):
         off = [np.roll(one.corners_map, s, axis=0) - other.corners_map for s in range(4)]
@@ -125,7 +125,7 @@ def _first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[i
 
 
 def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> dict[str, float]:
-    """The angle (deg) between two camera orientations (4, 4) and the distance (m) of the camera centres."""
+    """Angle (deg) between two camera orientations (4, 4), and distance (m) of their centres."""
     turn = Rotation.from_matrix(cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T)
     shift_m = camera_centre(cam_from_vehicle) - camera_centre(true_cam_from_vehicle)
     angle_deg, distance_m = np.rad2deg(turn.magnitude()), np.linalg.norm(shift_m)
@@ -133,12 +133,12 @@ def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: Float
 
 
 def rms(errors: FloatArray) -> float:
-    """Root mean square length of vectors (N, 2), nan where there are none."""
+    """RMS norm of vectors (N, 2), nan for none."""
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else float("nan")
 
 
-SAMPLE_STEP_M = 0.1  # polylines are compared at points this far apart
-LATERAL_GATE_M = 0.3  # a mapped lane this near to a true one maps it
+SAMPLE_STEP_M = 0.1  # sampling interval of polylines for comparison
+LATERAL_GATE_M = 0.3  # largest distance of a mapped from a true lane
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
 
 
 def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
-    """Distance (N,) of points to a densely sampled line, between its two nearest samples: lateral."""
+    """Distance (N,) of points to a densely sampled line, perpendicular between the two nearest samples."""
     if not len(points):
         return np.empty(0)
     if len(line) < 2:
@@ -194,14 +194,14 @@ def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
     span = second - first
     length2 = np.maximum((span**2).sum(axis=1), 1e-18)
     share = np.clip(((points - first) * span).sum(axis=1) / length2, 0.0, 1.0)
-    # Samples of two different lines are farther apart than a step: do not join those.
+    # Samples more than a step apart are of different lines and are not joined.
     joined = np.sqrt(length2) <= 1.5 * SAMPLE_STEP_M
     lateral = np.linalg.norm(points - (first + share[:, None] * span), axis=1)
     return np.asarray(np.where(joined, lateral, distance[:, 0]))
 
 
 def runs(points: FloatArray, keep: BoolArray) -> list[FloatArray]:
-    """The maximal stretches of a polyline whose vertices are all kept."""
+    """Maximal runs of a polyline's vertices in ``keep``."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(int), [0]])))
     return [points[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
@@ -211,14 +211,14 @@ def _stack(pieces: Iterable[FloatArray]) -> FloatArray:
     return np.concatenate(arrays) if arrays else np.empty((0, 2))
 
 
-_MAIN_REASONS = 3  # reasons of exclusion that a headline names
+_MAIN_REASONS = 3  # number of reasons for exclusion in a headline
 
 
 def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
-    """Figures of one map: against the truth where there is one, counts always.
+    """Figures of one map: counts, and errors if there is ground truth.
 
-    Counts and errors are of markings of all classes; ``recall`` and ``expected`` are those of the
-    diamonds, the site's landmarks, where it has any. ``by_class`` holds every figure of each class.
+    They are of all classes, except ``recall`` and ``expected``: of diamonds, the site's landmarks, where it
+    has any. ``by_class`` has every figure of each class.
     """
     figures: dict[str, Any] = {"markings": len(hd_map.markings)}
     if truth is not None and expected is not None:
@@ -242,9 +242,9 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
 
 
 def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArray | None) -> dict[str, float]:
-    """How far an extrinsic (4 x 4) moved from its start and, where known, how far it is from truth.
+    """Change of an extrinsic (4, 4) from its start and, if known, its error.
 
-    Turns are about the vehicle's axes, deg: yaw to the left, pitch nose down, roll to the right.
+    Rotations are about the vehicle's axes, deg: yaw to the left, pitch nose down, roll to the right.
     """
     turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
     yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)
@@ -257,7 +257,7 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
 
 
 def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
-    """The result of one camera set in one sentence."""
+    """One sentence on the result of one camera set."""
     best = results.get("Opt", {})
     start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
     if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
@@ -270,7 +270,7 @@ def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _own_words(figures: Mapping[str, Any]) -> str:
-    """The size of a map, its accuracy, and the main reasons why candidates are not in it."""
+    """Size and accuracy of a map, and the main reasons for exclusion."""
     words = f"{figures.get('markings', 0)} markings"
     if np.isfinite(figures.get("median_sigma_m", np.nan)):
         words += f" (sigma of a corner {100 * figures['median_sigma_m']:.1f} cm)"

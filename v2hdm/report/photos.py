@@ -1,4 +1,4 @@
-"""Lines on photographs: ground grids, horizons and the map, visible on paint and asphalt, with a legend."""
+"""Overlays on photographs: ground grids, horizons and the map, with a legend."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from v2hdm.report.metrics import runs
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
 
-_SUBPIXELS = 4  # bits of a pixel's fraction in which OpenCV takes coordinates
-_LARGEST_PX = 1e4  # farther out nothing is drawn, and OpenCV's integers would overflow
+_SUBPIXELS = 4  # fractional bits of OpenCV's coordinates
+_LARGEST_PX = 1e4  # limit of drawn coordinates, below the overflow of OpenCV's integers
 _HALO_BGR = (25, 25, 25)
 _STRIP_BGR = (250, 250, 250)
 _TEXT_BGR = (35, 35, 35)
@@ -29,7 +29,7 @@ _FONT = cv2.FONT_HERSHEY_DUPLEX
 
 @dataclass(frozen=True)
 class Pen:
-    """How a line is drawn: ``colour`` as #rrggbb; ``dash_px``, length of dash and gap, None for solid."""
+    """Line style: ``colour`` as #rrggbb; ``dash_px``, length of dash and gap, None for solid."""
 
     colour: str
     dash_px: tuple[float, float] | None = None
@@ -37,13 +37,13 @@ class Pen:
 
     @property
     def bgr(self) -> tuple[int, int, int]:
-        """The colour as OpenCV takes it."""
+        """The colour in OpenCV's order."""
         value = int(self.colour[1:], 16)
         return value & 255, value >> 8 & 255, value >> 16
 
 
 def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> None:
-    """Draw polylines (N, 2) px, with a dark edge, so that they are seen on paint and on asphalt."""
+    """Draw polylines (N, 2), px, with a dark edge for contrast on paint and on asphalt."""
     pieces = [piece for line in lines for piece in (_dashes(line, *pen.dash_px) if pen.dash_px else [line])]
     clipped = [np.clip(piece, -_LARGEST_PX, _LARGEST_PX) for piece in pieces]
     fixed = [np.round(piece * (1 << _SUBPIXELS)).astype(np.int32) for piece in clipped]
@@ -52,7 +52,7 @@ def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> Non
 
 
 def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]:
-    """The dashes of a polyline: pieces of it that are ``dash_px`` long."""
+    """Pieces of a polyline, ``dash_px`` long, ``gap_px`` apart."""
     way = length_along(line)
     out = []
     for start in np.arange(0.0, way[-1], dash_px + gap_px):
@@ -64,7 +64,7 @@ def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]
 
 
 def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -> np.ndarray:
-    """The picture (H, W, 3) with a strip below it that names each pen; text alone has none."""
+    """The picture (H, W, 3) with a legend of the pens below it; entries without pen are text alone."""
     width = canvas.shape[1]
     size = float(np.clip(width / 1900, 0.4, 0.75))
     row_px, sample_px = round(44 * size), round(64 * size)
@@ -88,17 +88,17 @@ def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -
     return np.vstack([canvas, strip])
 
 
-_FARTHEST_M = 40.0  # lines farther along the view lie on top of each other near the horizon
+_FARTHEST_M = 40.0  # farther lines overlap near the horizon
 
 _ALONG_M, _ACROSS_M = 5.0, 2.0  # spacing of the grid along and across the vehicle
-_HALF_WIDTH_M = 8.0  # how far the grid reaches to either side of the camera
-_NEAREST_M = 0.3  # ground nearer than this to the camera's plane has no place in an image
+_HALF_WIDTH_M = 8.0  # half width of the grid about the camera
+_NEAREST_M = 0.3  # least depth of ground in an image
 
 PENS: Mapping[str, Pen] = {
     "guess": Pen(OKABE_ITO["orange"], dash_px=(8.0, 5.0), width=1),
     "ground": Pen(OKABE_ITO["sky"], width=1),
 }
-"""How the grid is drawn under each mounting: the guess, and the one found from bare ground."""
+"""Line styles of the grid by mounting: the guess, and the estimate from bare ground."""
 
 _WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "from bare ground"}
 
@@ -110,7 +110,7 @@ _SMALL_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 def save_grid(
     path: Path, image: np.ndarray, camera: Camera, mountings: Mapping[str, FloatArray], caption: str
 ) -> None:
-    """Draw horizon, ground grid and ROI, by ``mountings`` of :data:`PENS`, into an image (H, W, 3) BGR."""
+    """Draw horizon, ground grid and ROI for ``mountings`` of :data:`PENS` into an image (H, W, 3) BGR."""
     canvas = image.copy()
     legend: list[tuple[Pen | None, str]] = [(None, caption)]
     for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
@@ -122,8 +122,8 @@ def save_grid(
     _write_image(path, with_legend(canvas, legend), cv2.IMWRITE_JPEG_QUALITY, 88)
 
 
-_ARROW_SHARE = 0.06  # length of the longest arrow of a right point, as a share of the image's width
-_MOST_TIMES = 1000.0  # arrows are not magnified further
+_ARROW_SHARE = 0.06  # length of the longest inlier's arrow, relative to the image's width
+_MOST_TIMES = 1000.0  # limit of the arrows' magnification
 _RIGHT, _WRONG = Pen(OKABE_ITO["blue"]), Pen(OKABE_ITO["vermillion"])
 
 
@@ -135,10 +135,10 @@ def save_points(
     roi_vehicle: FloatArray,
     points: Sequence[tuple[str, FloatArray, FloatArray, bool]],
 ) -> None:
-    """Draw grid, ROI and clicked points into an image (H, W, 3) BGR, or on blank paper of its size.
+    """Draw grid, ROI and clicked points into an image (H, W, 3) BGR, or on a blank one of its size.
 
-    Of each point ``points`` has the label, the pixel (2,), how far (2,), px, that is off the predicted one,
-    and whether it is right. Arrows lead to the predicted pixels, those of right points magnified.
+    ``points`` are label, pixel (2,), residual (2,), px, and whether it is an inlier. Arrows point to the
+    predicted pixels, magnified for inliers.
     """
     canvas = np.full((info.height, info.width, 3), 255, np.uint8) if image is None else image.copy()
     _draw_grid(canvas, info, cam_from_vehicle, PENS["ground"], to_the_left=False)
@@ -166,7 +166,7 @@ def save_points(
 def _draw_grid(
     canvas: np.ndarray, info: CameraInfo, cam_from_vehicle: FloatArray, pen: Pen, to_the_left: bool
 ) -> None:
-    """The ground's grid with its coordinates, and the horizon, under a mounting."""
+    """Draw the ground grid with its coordinates, and the horizon, under a mounting."""
     for line in _grid_lines(cam_from_vehicle):
         draw_lines(canvas, project_line(info, cam_from_vehicle, line), pen)
     draw_lines(canvas, [_horizon(info, cam_from_vehicle)], replace(pen, width=2))
@@ -176,19 +176,19 @@ def _draw_grid(
 def project_line(
     info: CameraInfo, cam_from_vehicle: FloatArray, line_vehicle: FloatArray
 ) -> list[FloatArray]:
-    """The pieces (N, 2), recorded px, of a dense ground line (M, 2) that lie in and near the image."""
+    """Pieces (N, 2), recorded px, of a dense ground line (M, 2) in and near the image."""
     pinhole, depth_m = project_ground(info.intrinsic, cam_from_vehicle, line_vehicle)
     return _visible_pieces(info, pinhole, depth_m > _NEAREST_M, 0.15)
 
 
 def project_outline(info: CameraInfo, cam_from_vehicle: FloatArray, outline: FloatArray) -> list[FloatArray]:
-    """The pieces (N, 2), recorded px, of a polygon (M, 2) of the ground that lie in and near the image."""
+    """Pieces (N, 2), recorded px, of a ground polygon (M, 2) in and near the image."""
     sides = zip(outline, np.roll(outline, -1, axis=0), strict=True)
     return project_line(info, cam_from_vehicle, np.concatenate([np.linspace(a, b, 40) for a, b in sides]))
 
 
 def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
-    """The camera's foot, the vehicle axis (0 or 1) that it looks along most, and to which side."""
+    """The camera's nadir, the vehicle axis (0 or 1) nearest to its view, and the sign along it."""
     foot = camera_centre(cam_from_vehicle)[:2]
     view = cam_from_vehicle[2, :2]
     along = int(np.argmax(np.abs(view)))
@@ -196,7 +196,7 @@ def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
 
 
 def _marks(cam_from_vehicle: FloatArray) -> FloatArray:
-    """Coordinates of the lines across the view, in the vehicle frame."""
+    """Coordinates, in the vehicle frame, of the grid lines across the view."""
     foot, along, side = _axes(cam_from_vehicle)
     ends = np.sort([foot[along], foot[along] + side * _FARTHEST_M])
     return np.arange(np.ceil(ends[0] / _ALONG_M), np.floor(ends[1] / _ALONG_M) + 1) * _ALONG_M
@@ -213,7 +213,7 @@ def _grid_lines(cam_from_vehicle: FloatArray) -> list[FloatArray]:
         line[:, other] = np.linspace(sides[0], sides[-1], 60)
         lines.append(line)
     for mark in sides:
-        # Denser where it is near: the same number of points to each doubling of the distance.
+        # Uniform in the logarithm of distance.
         line = np.full((300, 2), mark)
         line[:, along] = foot[along] + side * np.geomspace(0.2, _FARTHEST_M, 300)
         lines.append(line)
@@ -221,7 +221,7 @@ def _grid_lines(cam_from_vehicle: FloatArray) -> list[FloatArray]:
 
 
 def _horizon(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
-    """Where level directions within 60 deg of the view are seen, recorded px (N, 2)."""
+    """The horizon within 60 deg of the view, recorded px (N, 2)."""
     heading = np.arctan2(cam_from_vehicle[2, 1], cam_from_vehicle[2, 0])
     angles = heading + np.deg2rad(np.linspace(-60, 60, 241))
     rays = np.column_stack([np.cos(angles), np.sin(angles)]) @ cam_from_vehicle[:3, :2].T
@@ -233,7 +233,7 @@ def _horizon(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
 def _label(
     canvas: np.ndarray, info: CameraInfo, cam_from_vehicle: FloatArray, pen: Pen, to_the_left: bool
 ) -> None:
-    """Write the lines' coordinates in metres beside the middle of the view."""
+    """Write the grid's coordinates, m, beside the middle of the view."""
     foot, along, _ = _axes(cam_from_vehicle)
     last_v = np.inf
     for mark in sorted(_marks(cam_from_vehicle), key=lambda mark: abs(mark - foot[along])):
@@ -257,9 +257,9 @@ def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int
 
 _OVERLAY_RANGE_M = 30.0
 
-_BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # how the map is drawn by what a run began with
+_BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # the map under the initial calibration
 
-OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}  # how it is drawn by what the run found
+OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}  # the map under the results
 
 
 def save_overlay(
@@ -270,10 +270,10 @@ def save_overlay(
     position_map: FloatArray,
     views: Mapping[str, Callable[[FloatArray], FloatArray]],
 ) -> None:
-    """Draw a map into an image, as recorded, as several calibrations and poses project it.
+    """Draw a map into a recorded image, projected by several calibrations and poses.
 
-    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` give by name the pinhole
-    px (N, 2) of ground points (N, 2), nan behind the camera.
+    Markings far from the vehicle's ``position_map`` (2,) are omitted. ``views`` maps names to functions from
+    ground points (N, 2) to pinhole px (N, 2), nan behind the camera.
     """
     canvas = image.copy()
     outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
@@ -282,7 +282,7 @@ def save_overlay(
     for name, view in views.items():
         pen = OVERLAY.get(name, _BEFORE)
         for line in lines:
-            # Densified, for lenses bend it.
+            # Densified: the lens bends lines.
             dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
             near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
             pieces = _visible_pieces(info, view(dense), near, 0.1)
@@ -295,7 +295,7 @@ def save_overlay(
 def _visible_pieces(
     info: CameraInfo, pinhole_px: FloatArray, visible: BoolArray, margin: float
 ) -> list[FloatArray]:
-    """The visible pieces, recorded px, of a line in and near the image, by a share of the image's size."""
+    """Visible pieces, recorded px, of a line within the image plus ``margin``, relative to its size."""
     size = np.array([info.width, info.height])
     visible = visible & ((pinhole_px > -margin * size) & (pinhole_px < (1 + margin) * size)).all(axis=1)
     return [distort_points(info, piece) for piece in runs(pinhole_px, visible)]

@@ -1,4 +1,4 @@
-"""One look for all figures: colours by role, no chart junk."""
+"""Common style of all figures: colours by role."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ OKABE_ITO = {
     "vermillion": "#d55e00",
     "purple": "#cc79a7",
 }
-"""Colours that colour-blind people tell apart: Okabe and Ito, Color Universal Design, 2008."""
+"""Colours safe for colour-blind readers: Okabe and Ito, Color Universal Design, 2008."""
 
 PAINT = "#dfe4e8"  # filling of true markings
 GRID = "#e6eaed"
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
 WORDS = {"CNI": "orange", "ENI": "vermillion", "Opt": "blue", "ONI": "green"}
-"""Colour of each method in words, the same in every figure."""
+"""Colour name of each method, the same in every figure."""
 
 METHOD = {method: OKABE_ITO[colour] for method, colour in WORDS.items()}
 
@@ -54,7 +54,7 @@ RC: dict[Any, Any] = {
 
 @contextmanager
 def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Iterator[Figure]:
-    """A figure, with a canvas of its own, that is saved to ``path``, whole, when the block ends."""
+    """A figure that is saved atomically to ``path`` at the end of the block."""
     with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
         FigureCanvasAgg(fig)
@@ -66,8 +66,8 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
 def draw_arrows(
     axes: Axes, places: FloatArray, arrows: FloatArray, longest: float, span: float, **look: Any
 ) -> None:
-    """Draw arrows (N, 2) at places (N, 2) so that the ``longest`` spans ``span``, with a key in px above."""
-    if not len(places):  # matplotlib cannot draw the key of no arrows
+    """Draw arrows (N, 2) at places (N, 2), the ``longest`` spanning ``span``, with a key in px above."""
+    if not len(places):  # matplotlib cannot draw a key without arrows
         return
     longest = max(longest, 1e-3)
     drawn = axes.quiver(*places.T, *arrows.T, angles="xy", scale_units="xy", scale=longest / span, **look)

@@ -14,7 +14,7 @@ from rich.table import Table
 from v2hdm.progress import progress_lines
 
 DriveProgress = Callable[[str, str, int, int], None]
-"""Called with a drive, its stage, and how many of the stage's steps are done, of how many."""
+"""Called with a drive, its stage, and the stage's completed and total steps."""
 
 METHODS: Mapping[str, str] = {
     "CNI": "naive map, manually calibrated IPM",
@@ -38,7 +38,7 @@ WITHOUT_TRUTH: Mapping[str, _Column] = {
 
 
 def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
-    """Method x camera set: markings, recall and corner errors, from ``metrics.json``'s ``results``."""
+    """Markings, recall and corner errors by method and camera set, from ``results`` in ``metrics.json``."""
     has_truth = any("recall" in row for rows in results.values() for row in rows.values())
     columns = AGAINST_TRUTH if has_truth else WITHOUT_TRUTH
     table = new_table(title, ("method", "cameras"), ("markings", *columns))
@@ -56,7 +56,7 @@ def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, fl
 def new_table(
     title: str | None, words: Sequence[str], numbers: Sequence[str], before: Sequence[str] = ()
 ) -> Table:
-    """An empty table whose columns of numbers, ``before`` among them, are set to the right."""
+    """An empty table with right-aligned columns of numbers, ``before`` included."""
     table = Table(title=title, title_justify="left", header_style="bold")
     for heading in (*before, *words, *numbers):
         table.add_column(heading, justify="left" if heading in words else "right")
@@ -68,7 +68,7 @@ def _number(value: float | None, digits: int, factor: float) -> str:
 
 
 def changes_table(changes: Mapping[str, Any]) -> Table:
-    """The fate of an earlier map's markings that moved, are gone or are new, one per row."""
+    """Moved, vanished and new markings with respect to an earlier map, one per row."""
     counts = ", ".join(f"{number} {fate}" for fate, number in changes["counts"].items() if number)
     numbers = ("by (cm)", "sigma (cm)", "odds", "seen / should be")
     table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))
@@ -92,7 +92,7 @@ def changes_table(changes: Mapping[str, Any]) -> Table:
 
 @contextmanager
 def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[DriveProgress]:
-    """A bar for each drive in work, until its stage is one of ``endings``; without a terminal, lines."""
+    """A bar per running drive, until its stage is one of ``endings``; lines if there is no terminal."""
     if not console.is_terminal:
         lines = progress_lines(lambda line: plain(console, line))
         yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
@@ -115,5 +115,5 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
 
 
 def plain(console: Console, line: str) -> None:
-    """Print a line as it is, however long."""
+    """Print a line without wrapping."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)

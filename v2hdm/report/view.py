@@ -1,8 +1,8 @@
-"""A result as a page of this machine alone, in which a person corrects its markings.
+"""A result as a page on this machine, for corrections by a person.
 
-The page is the report with a script more; what it sends is checked and written at once, whole, to a file
-beside the result, which is never changed. Only a page that knows the address, with the secret in it, can send
-anything: names that lead here from elsewhere (``Host``) and other pages (``Origin``) are refused.
+The page is the report plus a script. Corrections are validated and written atomically to a file beside the
+result, which is never changed. The address has a secret; requests under other host names (``Host``) or from
+other pages (``Origin``) are refused.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from v2hdm.records import Drive
 from v2hdm.report.page.document import json_text, page_text
 from v2hdm.report.page.facts import Facts, read_facts
 
-_SAME_M = 0.01  # a correction is of what lies where it says, m
+_SAME_M = 0.01  # largest distance, m, between a correction and its feature
 _MOST_BYTES = 100_000  # of one correction
 
 
 def file_beside(folder: Path) -> Path:
-    """Where the corrections of a result are kept unless another place is named."""
+    """Default path of a result's corrections."""
     return folder.resolve().with_name(f"{folder.resolve().name}.corrections.yaml")
 
 
 @dataclass
 class Session:
-    """The corrections of the result in ``folder`` by key of what they are of, kept in the file ``path``."""
+    """Corrections of the result in ``folder`` by key of the feature, stored in the file ``path``."""
 
     folder: Path
     path: Path
@@ -45,12 +45,12 @@ class Session:
 
     @classmethod
     def begun(cls, folder: Path, path: Path, facts: Facts) -> Session:
-        """With what the file holds already; raises MapFileError where it is no file of corrections."""
+        """Start from the file's content; raises MapFileError if it is no file of corrections."""
         corrections = read_corrections(path) if path.exists() else []
         return cls(folder, path, {_key(one, facts) or f"old{n}": one for n, one in enumerate(corrections)})
 
     def take(self, sent: bytes) -> None:
-        """Keep a correction, or drop it, and write the file; raises MapFileError where it is none."""
+        """Store or remove a correction and write the file; raises MapFileError if malformed."""
         try:
             content = json.loads(sent)
             key, entry = str(content["key"]), content["correction"]
@@ -60,13 +60,13 @@ class Session:
             now = {name: one for name, one in self.corrections.items() if name != key}
             if entry is not None:
                 now[key] = correction_of(entry, key)
-            # The file was read when the command began, and is written all the same: it is gone on with.
+            # This command read the file at its start, and continues after writing it.
             Context().run(write_corrections, list(now.values()), str(self.folder), self.path)
             self.corrections = now
 
 
 def _key(one: Correction, facts: Facts) -> str | None:
-    """The key in the page of what a correction is of; None where that is not in the map."""
+    """Key in the page of a correction's feature; None if not in the map."""
     hd_map = facts.hd_map
     places = {f"x{n}": out.position_map[None] for n, out in enumerate(facts.excluded)}
     if hd_map is not None:
@@ -80,7 +80,7 @@ def _key(one: Correction, facts: Facts) -> str | None:
 
 
 def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingHTTPServer, str, Session]:
-    """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its corrections."""
+    """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its session."""
     facts = read_facts(folder, drive)
     if facts.hd_map is None:
         raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
@@ -92,7 +92,7 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingH
         timeout = 30
 
         def log_message(self, *_: object) -> None:
-            """Say nothing: what went wrong is in the answer."""
+            """No log: errors are in the answer."""
 
         def do_GET(self) -> None:
             if not self._is_ours() or self.path != f"/{secret}/":

@@ -1,6 +1,6 @@
-"""The report of a run: one page that opens in any browser, offline, with the map in it.
+"""The report of a run: one self-contained page with the map, for any browser, offline.
 
-``facts`` reads a result folder and, where it is at hand, the drive; ``tables``, ``charts``, ``layers`` and
-``pictures`` make of them what the page shows; ``document`` puts it together and ``write`` fills the
-templates. Everything that the page says stands in a file of the folder or comes from the drive's images.
+``facts`` reads a result folder and, if available, the drive; ``tables``, ``charts``, ``layers`` and
+``pictures`` prepare the content; ``document`` assembles it and fills the templates. All content comes from
+files of the folder or the drive's images.
 """

@@ -1,4 +1,4 @@
-"""The report's charts as SVG, whose colours the page's style replaces by those of its light or dark theme."""
+"""The report's charts as SVG; the page's style replaces their colours in its light and dark themes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from v2hdm.report.page.layers import SIGMAS_95
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
 INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
-"""Colours of text, axes, grid and background: those that ``page.css`` replaces by its theme's."""
+"""Colours of text, axes, grid and background, which ``page.css`` replaces by its theme's."""
 
 _ORDER = ("blue", "vermillion", "green", "purple", "orange", "sky")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), "-", "--")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
-CELLS = (9, 16)  # rows and columns that an image is divided into for the mean residual of each
-_SINGLE_IN = 5.0  # width of a chart alone in its row: its words can be read on a phone
-_LEAST_IN_CELL = 10  # observations from which a mean is drawn: its error is a third of one's
+CELLS = (9, 16)  # rows and columns of the cells for mean residuals
+_SINGLE_IN = 5.0  # width of a chart alone in its row: legible on a phone
+_LEAST_IN_CELL = 10  # least observations of a mean: its error is a third of a single one's
 
 _RC: dict[Any, Any] = RC | {
     "axes.titleweight": "normal",
@@ -55,7 +55,7 @@ _RC: dict[Any, Any] = RC | {
 
 @contextmanager
 def _chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figure, list[str]]]:
-    """A figure, and the list that holds its SVG when the block has ended."""
+    """A figure, and the list that receives its SVG at the end of the block."""
     out: list[str] = []
     with mpl.rc_context({**_RC, "svg.hashsalt": name}):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
@@ -70,12 +70,12 @@ def _chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figur
 
 
 def _look(number: int) -> dict[str, Any]:
-    """Colour and dashes of series ``number``: they differ without colour, too."""
+    """Colour and dashes of series ``number``, distinguishable without colour."""
     return {"color": OKABE_ITO[_ORDER[number % len(_ORDER)]], "linestyle": _DASHES[number % len(_DASHES)]}
 
 
 def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
-    """The whole map from above, for paper: markings, lane lines, the route, what was left out (N, 2)."""
+    """Plan view of the map, for paper: markings, lane lines, route, excluded candidates (N, 2)."""
     way = np.empty((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
     shapes, lanes = [m.corners_map for m in hd_map.markings], [one.points_map for one in hd_map.lanes]
     spread = np.ptp(np.concatenate([*shapes, *lanes, way]), axis=0) + 10.0
@@ -101,7 +101,7 @@ def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
 
 
 def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
-    """Residuals as a histogram, over the image, over range and along the route."""
+    """Charts of residuals: histogram, over the image, over range, along the route."""
     infos = {name: one.calibration.info for name, one in facts.cameras.items()}
     assert facts.route is not None
     return {
@@ -113,7 +113,7 @@ def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
 
 
 def _histogram_chart(residuals: GroundResiduals) -> str:
-    """Residuals in px, and in standard deviations beside what they would be if the noise model were right."""
+    """Residuals in px, and in standard deviations with their distribution under the noise model."""
     with (
         _chart("histogram", 3.5, 2.5) as (figure, first),
         _chart("histogram in sigmas", 3.5, 2.5) as (other, second),
@@ -146,7 +146,7 @@ def _steps(axes: Axes, values: FloatArray, edges: FloatArray, label: str, number
 
 
 def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]) -> str:
-    """The mean residual over each camera's image, by ``sizes`` (width, height) in px."""
+    """Mean residual over each camera's image; ``sizes`` are (width, height), px."""
     names = residuals.cameras
     fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
     longest = max([float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)] or [0.1])
@@ -164,7 +164,7 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
             axes.set(
                 xlim=(0, width_px), ylim=(height_px, 0), xlabel="u (px)", ylabel="v (px)", aspect="equal"
             )
-            axes.set_title(name, pad=14)  # room for the key of the arrows, which the layout overlooks
+            axes.set_title(name, pad=14)  # room for the arrows' key, which the layout ignores
             for side in ("top", "right"):
                 axes.spines[side].set_visible(True)
         charts += out[0]
@@ -172,7 +172,7 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
 
 
 def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Centres (N, 2) of the cells of an image that saw enough, and the mean residual (N, 2) of each, px."""
+    """Centres (N, 2) of image cells with enough observations, and mean residuals (N, 2), px."""
     own = (residuals.camera == camera) & residuals.is_point
     place, off = residuals.observed_px[own], residuals.residual_px[own]
     rows, columns = CELLS
@@ -187,7 +187,7 @@ def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tu
 
 
 def _range_chart(residuals: GroundResiduals) -> str:
-    """Residuals against the distance from the camera: in the image and on the ground."""
+    """RMS residual by range, in the image and on the ground."""
     with (
         _chart("range", 3.5, 2.5) as (figure, first),
         _chart("range on the ground", 3.5, 2.5) as (other, second),
@@ -212,7 +212,7 @@ def _range_chart(residuals: GroundResiduals) -> str:
 
 
 def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Middles of the bins that hold enough values, and the root mean square of each."""
+    """Centres of bins with enough values, and their RMS."""
     bin_of = np.clip(np.searchsorted(edges, place, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(bin_of, minlength=len(edges) - 1)
     squared = np.bincount(bin_of, values**2, len(edges) - 1)
@@ -222,7 +222,7 @@ def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[F
 
 
 def _route_chart(route: Route, residuals: GroundResiduals) -> str:
-    """Along the way: the residuals, and what was taken off the recorded poses."""
+    """Residuals, and corrections of the recorded poses, along the route."""
     rows = 1 if route.recorded is None else 2
     with _chart("route", _SINGLE_IN, 1.7 * rows + 0.3) as (figure, out):
         panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
@@ -255,7 +255,7 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
 
 
 def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
-    """How many corners are known how well: shares of corners by the 95 % ellipse's larger half axis."""
+    """Cumulative distribution of corners by semi-major axis of the 95 % ellipse."""
     with _chart("ellipse", _SINGLE_IN, 2.2) as (figure, out):
         axes = figure.subplots()
         top = max((float(values.max(initial=0.0)) for values in semi_axes_cm.values()), default=1.0)

@@ -1,4 +1,4 @@
-"""From a result folder to its ``report.html``: one file with everything in it."""
+"""From a result folder to ``report.html``, a single file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from v2hdm.store.files import replace_text
 
 
 def document(facts: Facts) -> SimpleNamespace:
-    """The content of the page by the names of its templates; parts that a run lacks are None or empty."""
+    """Content of the page by template names; missing parts are None or empty."""
     metrics, verdict = facts.metrics, facts.metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
     findings = {which: tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")}
@@ -88,16 +88,15 @@ def _ellipses(facts: Facts) -> str:
 
 FILE = "report.html"  # name of the page in a result folder
 _ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
-"""Scripts and styles that stand in the page as they are, by the folder that holds them."""
+"""Scripts and styles that the page embeds, by folder."""
 
 
 def write_page(folder: Path, drive: Drive | None, background: Path | None = None) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
-    ``drive`` is the one that was mapped, for pictures, recorded route and truth; ``background`` a GeoTIFF or
-    a folder of XYZ tiles under the map. Where either is None, what the report that is there shows of it is
-    kept. Raises MapFileError where the folder is no result, or a file in it or the background is damaged,
-    DriveError where an image or the truth of the drive is damaged.
+    ``drive`` supplies pictures, recorded route and truth; ``background`` is a GeoTIFF or a folder of XYZ
+    tiles. If either is None, its content is taken from an existing report. Raises MapFileError for an invalid
+    folder, file or background, DriveError for a damaged image or truth.
     """
     replace_text(folder / FILE, page_text(folder, drive, background=background))
     return folder / FILE
@@ -109,7 +108,7 @@ def page_text(
     editing: Mapping[str, object] | None = None,
     background: Path | None = None,
 ) -> str:
-    """The page of :func:`write_page`; ``editing`` is what its script for corrections has to know."""
+    """The page of :func:`write_page`; ``editing`` is the data of the script for corrections."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
         autoescape=True,
@@ -138,8 +137,8 @@ def page_text(
 
 
 def _kept(path: Path, name: str) -> dict[str, Any]:
-    """The data ``name`` of an earlier report, made while more of its sources were at hand."""
-    # Not one of the inputs, which are never written over: the new report takes its place.
+    """Data ``name`` of an earlier report, whose sources may be unavailable now."""
+    # The old report is not an input: the new one replaces it.
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     kept = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
     try:
@@ -149,13 +148,13 @@ def _kept(path: Path, name: str) -> dict[str, Any]:
 
 
 def json_text(content: object) -> str:
-    """JSON that may stand in a script element: nothing in it ends the element or begins a comment."""
+    """JSON that is safe in a script element: it neither ends the element nor opens a comment."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def _suspicious(facts: Facts) -> dict[str, list[str]]:
-    """The most suspicious markings, the worst first: cells of a row by the key of their pictures."""
+    """Most suspicious markings, worst first: table cells by the key of their pictures."""
     kinds = {one.id: one.kind for one in facts.hd_map.markings} if facts.hd_map else {}
     rows = {}
     for one in facts.best.get("suspicious") or []:

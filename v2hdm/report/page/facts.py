@@ -1,4 +1,4 @@
-"""The facts of a run: the files of its result folder, its drive, and its residuals on the ground."""
+"""The data of a run: files of its result folder, its drive, and its residuals on the ground."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HdMap, IntArray, Truth
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
 
-BEST = "Opt"  # the method whose map is the run's result, as metrics.json names it
+BEST = "Opt"  # method of the run's result, as in metrics.json
 
 
 @dataclass(frozen=True)
@@ -35,23 +35,23 @@ class Route:
     stamp_s: FloatArray  # (F,) rising
     map_from_vehicle: FloatArray  # (F, 4, 4) adjusted, in the frame of the recorded poses
     recorded: FloatArray | None  # (F, 4, 4) as recorded, None without the drive
-    flat: FloatArray  # (F, 4, 4) adjusted, with the road laid flat as the map is, if the drive is there
+    flat: FloatArray  # (F, 4, 4) adjusted, on the flattened road of the map, if there is a drive
     sigma: FloatArray  # (F, 6) forward, left, up in m, roll, pitch, heading in rad
-    seen: BoolArray  # (F,) whether a marking was seen then
+    seen: BoolArray  # (F,) whether a marking was seen
 
     @property
     def way_m(self) -> FloatArray:
-        """How far the vehicle has driven (F,), m."""
+        """Distance driven (F,), m."""
         return length_along(self.map_from_vehicle[:, :2, 3])
 
     def frames_of(self, residuals: Residuals) -> IntArray:
-        """The pose (I,) of each of the images."""
+        """Index (I,) of the pose of each image."""
         return np.searchsorted((self.stamp_s[1:] + self.stamp_s[:-1]) / 2, residuals.taken_s)
 
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """One camera's calibration; its clock offset, read-out time and their sigmas, s, None where not known."""
+    """Calibration of a camera; clock offset, read-out time and their sigmas, s, None if unknown."""
 
     calibration: Calibration
     clock_offset_s: float | None
@@ -62,13 +62,13 @@ class CameraFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """A result folder, read; what is not in it is None or empty."""
+    """The content of a result folder; missing parts are None or empty."""
 
     folder: Path
     metrics: Mapping[str, Any]
     config: str
     hd_map: HdMap | None
-    excluded: tuple[Exclusion, ...]  # that the map of all cameras left out
+    excluded: tuple[Exclusion, ...]  # candidates excluded by the map of all cameras
     cameras: Mapping[str, CameraFacts]
     route: Route | None
     surface: Surface | None  # under the poses of ``route``, None for a plane
@@ -79,18 +79,18 @@ class Facts:
 
     @property
     def results(self) -> Mapping[str, Any]:
-        """The figures of the methods with all cameras; empty where no map came."""
+        """Figures of the methods with all cameras; empty without a map."""
         sets = self.metrics.get("results") or {}
         return list(sets.values())[-1] if sets else {}
 
     @property
     def best(self) -> Mapping[str, Any]:
-        """The figures of the result."""
+        """Figures of the result."""
         return dict(self.results.get(BEST, {}))
 
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
-    """Read the result folder of a run, and what is known by its ``drive``; MapFileError where damaged."""
+    """Read a run's result folder and the data of its ``drive``; MapFileError for damaged files."""
     if not (folder / "metrics.json").is_file():
         raise MapFileError(f"{folder}: not a result of v2hdm map (no metrics.json); give its folder")
     metrics = load_json(folder / "metrics.json", MapFileError)
@@ -118,7 +118,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
-    """The calibrations of a result folder by camera; raises MapFileError where a file is damaged."""
+    """Calibrations of a result folder by camera; raises MapFileError for damaged files."""
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
         content, calibration = load_yaml(path, MapFileError), read_calibration(path)
@@ -154,7 +154,7 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
 
 
 def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
-    """The ground of a result under vehicles at poses (F, 4, 4), None where plane; MapFileError if damaged."""
+    """The ground of a result under vehicle poses (F, 4, 4), None for a plane; MapFileError if damaged."""
     path = folder / GROUND
     if not path.is_file():
         return None
@@ -177,17 +177,17 @@ class GroundResiduals:
     observed_px: FloatArray
     residual_px: FloatArray
     distance_sigma: FloatArray
-    range_m: FloatArray  # (K,) from the camera's foot to the corner, as observed
+    range_m: FloatArray  # (K,) from the camera's nadir to the observed corner
     ground_m: FloatArray  # (K, 2) projected minus observed, in the map
 
     @property
     def size_px(self) -> FloatArray:
-        """Lengths (K,) of the residuals."""
+        """Norms (K,) of the residuals."""
         return np.asarray(np.linalg.norm(self.residual_px, axis=1))
 
 
 def ground_residuals(facts: Facts) -> GroundResiduals | None:
-    """The residuals of a run that has any, of the cameras whose calibration is known; else None."""
+    """Residuals of a run for its calibrated cameras; None without any."""
     if facts.residuals is None or facts.route is None or not len(facts.residuals):
         return None
     residuals = facts.residuals
@@ -224,7 +224,7 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
 
 
 def cams_from_map(residuals: Residuals, route: Route, calibrations: Mapping[str, Calibration]) -> FloatArray:
-    """Where each image (I, 4, 4) was taken from, by the adjusted poses; nan for cameras not calibrated."""
+    """``cam_from_map`` (I, 4, 4) of each image under the adjusted poses; nan for uncalibrated cameras."""
     nearest = route.frames_of(residuals)
     out = np.full((len(residuals.image), 4, 4), np.nan)
     for i, name in enumerate(residuals.camera):

@@ -1,4 +1,4 @@
-"""The map in the page as one JSON document in local metres, and the mosaic of the ground below it."""
+"""The map in the page: one JSON document in local metres, and the ground mosaic below it."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def jpeg(pixels: np.ndarray, quality: int) -> str:
 
 
 def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
-    """An image of ``factor`` times the size, at least a pixel of it."""
+    """An image scaled by ``factor``, at least one pixel large."""
     size = (max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor)))
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def jpeg_of(path: Path, widest_px: int, quality: int) -> str | None:
-    """A picture's file as JPEG in base64, at most so wide; None where there is none."""
+    """A picture file as JPEG in base64, at most ``widest_px`` wide; None if there is none."""
     pixels = cv2.imread(str(path)) if path.is_file() else None
     return None if pixels is None else jpeg(shrunk(pixels, min(1.0, widest_px / pixels.shape[1])), quality)
 
@@ -43,7 +43,7 @@ def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
 
 EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 
-LARGEST_BYTES = 3_500_000  # budget of the mosaic, as text in the page
+LARGEST_BYTES = 3_500_000  # limit of the mosaic, as text in the page
 _QUALITY = 72
 
 
@@ -65,25 +65,25 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
 
 
 def _webp(pixels: np.ndarray) -> str:
-    """An image as WebP in base64, shrunk until it is within the budget."""
+    """An image as WebP in base64, scaled down to the limit."""
     while len(text := _coded(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, _QUALITY)) > LARGEST_BYTES:
         pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
     return text
 
 
-_BACKGROUND_PX = 3000  # longer side of the background: at most 20 cm a pixel over 600 m
+_BACKGROUND_PX = 3000  # longer side of the background: 20 cm per pixel over 600 m
 _FINEST_M = 0.05
-_HALF_WORLD_M = 20037508.342789244  # half a side of Web Mercator's square
+_HALF_WORLD_M = 20037508.342789244  # half the side of Web Mercator's square
 _TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{ending}</ServerUrl></Service>
 <DataWindow><UpperLeftX>-{half}</UpperLeftX><UpperLeftY>{half}</UpperLeftY><LowerRightX>{half}</LowerRightX>
 <LowerRightY>-{half}</LowerRightY><TileLevel>{finest}</TileLevel><TileCountX>1</TileCountX>
 <TileCountY>1</TileCountY><YOrigin>top</YOrigin></DataWindow><Projection>EPSG:3857</Projection>
 <BlockSizeX>{px}</BlockSizeX><BlockSizeY>{px}</BlockSizeY><BandsCount>4</BandsCount>
-<OverviewCount>{coarser}</OverviewCount></GDAL_WMS>"""  # GDAL's description of tiles, here of a folder
+<OverviewCount>{coarser}</OverviewCount></GDAL_WMS>"""  # GDAL's description of tiles, here in a folder
 
 
 def _source(path: Path) -> dict[str, Any]:
-    """The source that rasterio opens: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
+    """Source for rasterio: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
     levels = sorted(int(one.name) for one in path.glob("*") if one.name.isdecimal())
     tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
     if tile is None:
@@ -94,7 +94,7 @@ def _source(path: Path) -> dict[str, Any]:
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
-    """A GeoTIFF or XYZ tiles of the user's own, as :func:`mosaic_layer`; MapFileError if they do not fit."""
+    """The user's GeoTIFF or XYZ tiles as a layer like :func:`mosaic_layer`; MapFileError if unusable."""
     rasterio, warped = (
         need(name, "gis", "a background", MapFileError) for name in ("rasterio", "rasterio.vrt")
     )
@@ -104,7 +104,7 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     (west, south), (east, north) = _extent(facts)
     step = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
     size = {"width": int(np.ceil((east - west) / step)), "height": int(np.ceil((north - south) / step))}
-    # The mosaic's projection is the map's frame to a millimetre.
+    # The mosaic's projection agrees with the map frame to a millimetre.
     frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
     frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
     try:
@@ -129,7 +129,7 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
 
 
 def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
-    """South-west and north-east (2,), m, of what the map holds and 50 m around it."""
+    """South-west and north-east (2,), m, of the map with a margin of 50 m."""
     assert facts.hd_map is not None
     places = [one.corners_map for one in facts.hd_map.markings]
     places += [one.points_map for one in facts.hd_map.lanes]
@@ -139,21 +139,21 @@ def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
 
 
 def comparison(folder: Path) -> str | None:
-    """The same ground before and after the optimisation, JPEG in base64; None where the folder has none."""
+    """The ground before and after the optimisation, JPEG in base64; None if not in the folder."""
     return jpeg_of(folder / COMPARISON, 1400, 84)
 
 
 SIGMAS_95 = 2.4477
-"""Half axes of the ellipse that holds 95 % of a normal error in two dimensions, in standard deviations: the
-root of the chi-square quantile of two degrees of freedom."""
+"""Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
+chi-square quantile with two degrees of freedom."""
 
 _LEAST_ARROW_SIGHTINGS = 4
 _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum", ".yaml", ".json", ".log")
-"""Endings of the files of a result that the page names."""
+"""Suffixes of the result files that the page links."""
 
 
 def ellipses(marking: Marking) -> FloatArray | None:
-    """The 95 % ellipse of each corner: half axes a >= b in m and direction of a in rad, (4, 3)."""
+    """95 % ellipses (4, 3) of the corners: semi-axes a >= b, m, and direction of a, rad."""
     if marking.covariance_m2 is None:
         return None
     blocks = marking.covariance_m2.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
@@ -164,7 +164,7 @@ def ellipses(marking: Marking) -> FloatArray | None:
 
 
 def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
-    """The document of the map: markings, lanes, symbols, truth, route, what was left out, a mosaic."""
+    """The map document: markings, lanes, symbols, truth, route, excluded candidates, mosaic."""
     hd_map = facts.hd_map
     if hd_map is None:
         return {}
@@ -218,7 +218,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
 
 
 def _systems(facts: Facts) -> list[dict[str, Any]]:
-    """Coordinates beside local metres, to a millimetre: by system cubics in x and y; none without origin."""
+    """Coordinate systems besides local metres, to a millimetre: cubics in x and y; none without origin."""
     hd_map = facts.hd_map
     if hd_map is None or hd_map.origin is None:
         return []
@@ -246,13 +246,13 @@ def _feature(
 
 
 def rounded(points: FloatArray, digits: int = 3) -> list[list[float]]:
-    """Points (N, 2) as lists: metres to a millimetre unless said otherwise."""
+    """Points (N, 2) as lists, by default rounded to a millimetre."""
     out: list[list[float]] = np.round(points, digits).tolist()
     return out
 
 
 def _errors(facts: Facts) -> dict[int, float]:
-    """Root mean square corner error, m, by the number of each marking that has a true counterpart."""
+    """RMS corner error, m, of each marking with a true counterpart, by id."""
     if facts.truth is None or facts.hd_map is None:
         return {}
     mapped, true = facts.hd_map.markings, facts.truth.map.markings
@@ -261,7 +261,7 @@ def _errors(facts: Facts) -> dict[int, float]:
 
 
 def _checks(facts: Facts) -> list[dict[str, Any]]:
-    """The surveyed check points: where, and by how much the map differs."""
+    """Surveyed check points: position, and map minus survey."""
     checks = []
     for one in facts.check_points:
         place = [_number(one.get(key)) for key in ("x_map_m", "y_map_m")]
@@ -273,7 +273,7 @@ def _checks(facts: Facts) -> list[dict[str, Any]]:
 
 
 def _changes(facts: Facts) -> list[dict[str, Any]]:
-    """The differences from the map that this one was built on, as ``metrics.json`` lists them."""
+    """Changes from the base map, as listed in ``metrics.json``."""
     return [
         {name: one[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
         | {"k": one["class"], "n": one["found"], "p": one["after_map"] or one["before_map"]}
@@ -290,9 +290,9 @@ def _number(text: str | None) -> float | None:
 
 
 def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
-    """By marking an arrow a camera: its number, mean of projected minus observed on the ground, m, count.
+    """Arrows by marking, one per camera: its index, mean of projected minus observed ground, m, and count.
 
-    A pixel covers ground that grows with the squared range, so observations count by its inverse, squared.
+    Ground sampling distance grows with the squared range, so observations weigh by its inverse square.
     """
     if residuals is None:
         return {}

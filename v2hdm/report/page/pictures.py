@@ -1,4 +1,4 @@
-"""Small pictures of what is in the map and what was left out, cut from the drive's images."""
+"""Small pictures of the map's features and of excluded candidates, cut from the drive's images."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, jpeg_of, rounded, shrunk
 
-BUDGET_BYTES = 8_000_000  # budget of all pictures together, as text in the page: a report stays below 15 MB
-PER_CAMERA = 2  # pictures of a marking: the nearest one, and one from the middle of its sightings
-_USUAL_BYTES = 5_000  # of one picture; no more are cut than could fit
+BUDGET_BYTES = 8_000_000  # limit of all pictures, as text in the page: reports stay below 15 MB
+PER_CAMERA = 2  # pictures per marking and camera: the nearest, and one from the middle of its sightings
+_USUAL_BYTES = 5_000  # of one picture, to estimate how many fit
 _LONGEST_PX = 320
 _LEAST_PX = 96
-_MARGIN = 0.45  # share of a marking's size that is shown around it
+_MARGIN = 0.45  # margin around a marking, relative to its size
 _QUALITY = 72
 
-_NEAR_M, _FAR_M = 3.0, 14.0  # how far ahead of a camera something that is no marking is looked for
+_NEAR_M, _FAR_M = 3.0, 14.0  # range ahead of a camera for features other than markings
 
 
 @dataclass(frozen=True)
 class _Cut:
-    """A piece of an image to be cut, of the feature ``key``; ``rank`` 0 is the best one of it."""
+    """A cut of an image for the feature ``key``; ``rank`` 0 is its best."""
 
     key: str
     rank: int
     image: str
     row: int
     shape_map: FloatArray  # (N, 2)
-    seen_px: FloatArray  # (M, 2) corners as they were detected, recorded px
+    seen_px: FloatArray  # (M, 2) detected corners, recorded px
 
 
 def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
-    """Pictures by feature, the best first: ``m`` or ``s`` and the id, ``x`` and a number for one left out.
+    """Pictures by feature, best first: keys ``m`` or ``s`` and the id, ``x`` and an excluded one's number.
 
-    Each has ``src`` (JPEG as base64), ``size``, ``camera``, ``image``, ``t`` (s), the shape as the map puts
-    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture. Empty
-    without the drive; raises DriveError where an image of it cannot be read.
+    Each has ``src`` (JPEG in base64), ``size``, ``camera``, ``image``, ``t`` (s), the projected shape
+    (``map``) and the detected corners (``seen``), in px of the picture. Empty without the drive; raises
+    DriveError for an unreadable image.
     """
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
@@ -67,7 +67,7 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
             picture = _cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
             if picture is not None:
                 made.append((cut, {**picture, "image": name}))
-    # The best picture of everything first, then the second best, until the budget is spent.
+    # The best picture of every feature first, then the second best, up to the limit.
     out: dict[str, list[dict[str, Any]]] = {}
     spent = 0
     for cut, picture in sorted(made, key=lambda one: one[0].rank):
@@ -79,7 +79,7 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
 
 
 def _of_markings(facts: Facts) -> Iterable[_Cut]:
-    """Cuts of the sightings by which markings were mapped: nearest first, one camera at a time."""
+    """Cuts of the markings' sightings: nearest first, alternating cameras."""
     residuals = facts.residuals
     assert residuals is not None
     assert facts.hd_map is not None
@@ -110,7 +110,7 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
 
 
 def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
-    """Cuts that look at a place from near, one per camera; other things may stand in the way."""
+    """Cuts of a place from near, one per camera, occluded or not."""
     residuals = facts.residuals
     assert residuals is not None
     centre = shape_map.mean(axis=0)
@@ -131,7 +131,7 @@ def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: Float
 def _cut_out(
     pixels: np.ndarray, facts: Facts, image: Image, cam_from_map: FloatArray, cut: _Cut
 ) -> dict[str, Any] | None:
-    """The piece of an image around a feature, no larger than it needs to be; None where it shows nothing."""
+    """The smallest useful cut around a feature; None if it is out of the image."""
     info = facts.cameras[image.camera].calibration.info
     shape_map = cut.shape_map
     if facts.surface is not None and facts.residuals is not None and facts.route is not None:
@@ -144,7 +144,7 @@ def _cut_out(
     shown = np.concatenate([shape_px, cut.seen_px])
     low, high = shown.min(axis=0), shown.max(axis=0)
     half = np.maximum((0.5 + _MARGIN) * (high - low), _LEAST_PX / 2)
-    # No flatter and no higher than 3 to 1, so that the pictures of a row look alike.
+    # An aspect ratio of at most 3, so that pictures in a row look alike.
     half = np.maximum(half, half[::-1] / 3)
     middle = 0.5 * (low + high)
     first = np.clip(np.floor(middle - half), 0, [info.width - 1, info.height - 1]).astype(int)
@@ -160,13 +160,13 @@ def _cut_out(
         "size": [piece.shape[1], piece.shape[0]],
         "camera": image.camera,
         "t": round(float(image.stamp_s), 3),
-        # The centre of a pixel is at its whole number; that of a drawing's first one at a half.
+        # Pixel centres are at integers in the image, at halves in SVG.
         "map": rounded((shape_px - first + 0.5) * factor, 1),
         "seen": rounded((cut.seen_px - first + 0.5) * factor, 1),
     }
 
 
 def overlays(facts: Facts) -> Mapping[str, str]:
-    """By camera the folder's ``overlay_<camera>.png`` as JPEG in base64, where there is one."""
+    """The folder's ``overlay_<camera>.png`` by camera, as JPEG in base64."""
     found = {name: jpeg_of(facts.folder / f"overlay_{name}.png", 1200, 82) for name in facts.cameras}
     return {name: picture for name, picture in found.items() if picture is not None}

@@ -1,4 +1,4 @@
-"""The report's tables, figures of merit and cameras as texts with their units: what the templates set."""
+"""The report's tables, key figures and cameras as text with units, for the templates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from v2hdm.report.terminal import AGAINST_TRUTH, METHODS, WITHOUT_TRUTH
 
 
 class Table(NamedTuple):
-    """Rows of texts under their headings; ``numeric`` columns are set to the right."""
+    """Rows of text under headings; ``numeric`` columns are right-aligned."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -28,7 +28,7 @@ class Table(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """One number that a reader asks for: what, how much with its unit, and what it means."""
+    """One key figure: name, value, unit and meaning."""
 
     name: str
     value: str
@@ -37,12 +37,12 @@ class Figure(NamedTuple):
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> Table:
-    """A table whose first ``words`` columns are words and whose others are numbers."""
+    """A table with ``words`` columns of text, then numbers."""
     return Table(headings, rows, [n >= words for n in range(len(headings))])
 
 
 def number(value: object, digits: int | None = None, factor: float = 1.0) -> str:
-    """A number as text, with three significant digits unless told; a dash where there is none."""
+    """A number as text, with three significant digits by default; a dash if there is none."""
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         return "–"
     if digits is None:
@@ -51,7 +51,7 @@ def number(value: object, digits: int | None = None, factor: float = 1.0) -> str
 
 
 def name_of(kind: str) -> str:
-    """A class as people write it."""
+    """A class name for readers."""
     return kind.replace("_", " ")
 
 
@@ -61,7 +61,7 @@ def in_words(count: int, what: str) -> str:
 
 
 def pair_table(content: Mapping[str, Any]) -> Table | None:
-    """Names and values as they stand in ``metrics.json``."""
+    """Names and values as in ``metrics.json``."""
     rows = [[name_of(str(key)), _plain(value)] for key, value in content.items() if value is not None]
     return table(("", ""), rows, words=2) if rows else None
 
@@ -72,24 +72,24 @@ def _plain(value: object) -> str:
     return number(value) if isinstance(value, float) else str(value)
 
 
-_LEAST_FOR_SHARE = 20  # corners from which a share of them is stated
+_LEAST_FOR_SHARE = 20  # least number of corners for a percentage
 
 _Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
 
 
 def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
-    """The larger half axis (4 M,), m, of the 95 % ellipse of every corner that has one."""
+    """Semi-major axis (4 M,), m, of the 95 % ellipse of every corner that has one."""
     found = [ellipses(one) for one in markings]
     return np.concatenate([one[:, 0] for one in found if one is not None] or [np.empty(0)])
 
 
 def relative_m(markings: Iterable[Marking]) -> FloatArray:
-    """The 95 % radius (M,), m, of what a marking adds to the error of a distance to its neighbours."""
+    """95 % radius (M,), m, of a marking's contribution to the error of a distance to neighbours."""
     return np.array([SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None])
 
 
 def key_figures(facts: Facts) -> tuple[Figure, ...]:
-    """The figures at the top of the page."""
+    """Key figures at the top of the page."""
     if facts.hd_map is None:
         return ()
     markings, best = facts.hd_map.markings, facts.best
@@ -120,7 +120,7 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
 
 
 def accuracy_table(facts: Facts) -> Table | None:
-    """By class how well the corners are known: half of them within, 95 % of them within."""
+    """Formal corner accuracy by class: median and 95th percentile."""
     if facts.hd_map is None or not len(half_axes_m(facts.hd_map.markings)):
         return None
     by_kind = _by_kind(facts.hd_map.markings)
@@ -134,7 +134,7 @@ def accuracy_table(facts: Facts) -> Table | None:
 
 
 def truth_table(facts: Facts) -> Table | None:
-    """By class the errors against the ground truth, and how many lie inside their ellipses."""
+    """Errors against ground truth by class, and the fraction inside their ellipses."""
     if facts.truth is None or facts.hd_map is None:
         return None
     by_class = facts.best.get("by_class", {})
@@ -150,7 +150,7 @@ def truth_table(facts: Facts) -> Table | None:
 
 
 def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
-    """Share of the corners whose true place lies inside their 95 % ellipse."""
+    """Fraction of the corners whose true position is inside their 95 % ellipse."""
     assert facts.truth is not None
     rows, columns = match_markings(markings, facts.truth.map.markings)
     squared: list[float] = []
@@ -177,11 +177,11 @@ _CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
     "dz_m": ("up (cm)", 100.0, 1),
     "not_compared_because": ("not compared because", None, 0),
 }
-"""Heading, factor (None for words) and digits of columns of ``check_points.csv``."""
+"""Heading, factor (None for text) and digits of columns of ``check_points.csv``."""
 
 
 def check_point_table(facts: Facts) -> Table | None:
-    """Surveyed points that no estimate has seen, beside the map: what ``check_points.csv`` says of them."""
+    """Independent surveyed points against the map, from ``check_points.csv``."""
     rows = facts.check_points
     shown = {name: one for name, one in _CHECK_COLUMNS.items() if any(row.get(name) for row in rows)}
     if not shown:
@@ -201,7 +201,7 @@ def _check_cell(text: str, factor: float | None, digits: int) -> str:
 
 
 def content_table(facts: Facts) -> Table | None:
-    """The content of the map by class: how many or how long, and how often seen."""
+    """Content of the map by class: count, length and sightings."""
     if facts.hd_map is None:
         return None
     rows = []
@@ -218,13 +218,13 @@ def content_table(facts: Facts) -> Table | None:
 
 
 def reason_table(facts: Facts) -> Table:
-    """Why candidates were left out, the most frequent reason first."""
+    """Reasons for exclusion, most frequent first."""
     counts = Counter(one.reason for one in facts.excluded).most_common()
     return table(("reason", "candidates"), [[reason, str(count)] for reason, count in counts])
 
 
 def method_table(facts: Facts) -> Table | None:
-    """The methods of the paper beside each other, for all cameras together."""
+    """The paper's methods side by side, with all cameras."""
     if not facts.results:
         return None
     has_truth = any("recall" in row for row in facts.results.values())
@@ -238,7 +238,7 @@ def method_table(facts: Facts) -> Table | None:
 
 
 def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:
-    """Status, check, what it is about, measured, limit and sentence of the findings ``which``."""
+    """Status, check, subject, measured value, limit and sentence of the findings ``which``."""
     rows = []
     for one in verdict.get(which) or []:
         unit = f" {one['unit']}" if one.get("unit") else ""
@@ -250,7 +250,7 @@ def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...
 
 
 def timing_table(facts: Facts) -> Table | None:
-    """How long each step took."""
+    """Duration of each step."""
     seconds = facts.metrics.get("seconds") or {}
     if not seconds:
         return None
@@ -259,7 +259,7 @@ def timing_table(facts: Facts) -> Table | None:
 
 
 def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
-    """By class, the most frequent one first."""
+    """Features by class, most frequent first."""
     found: dict[str, list[_Mapped]] = {}
     for one in own:
         found.setdefault(one.kind, []).append(one)
@@ -267,7 +267,7 @@ def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
 
 
 class CameraPage(NamedTuple):
-    """One camera in the report: its words, its table, its picture (JPEG in base64)."""
+    """One camera in the report: summary, table, and picture (JPEG in base64)."""
 
     name: str
     words: str
@@ -277,7 +277,7 @@ class CameraPage(NamedTuple):
 
 
 def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage, ...]:
-    """One for each camera that was calibrated."""
+    """One entry per calibrated camera."""
     extrinsics = facts.metrics.get("extrinsics") or {}
     out = []
     for name, one in facts.cameras.items():
