@@ -198,7 +198,7 @@ class Observability:
         )
 
     def sentence(self, camera: str) -> str:
-        """Summary for the driver: what is determined how well, and what would help."""
+        """One sentence for the driver: the precision of the extrinsic, and how to improve it."""
         turns = np.rad2deg(self.sigma[3:])
         rotation = f"rotation known to {turns.max():.3f} deg"
         if not self.unobserved:
