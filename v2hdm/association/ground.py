@@ -27,12 +27,9 @@ _HORIZON_M2 = 1e4  # smaller variance of a ground point, m^2, from which it coun
 OUTLINE_SIGMA_PX = 2.5
 """Standard deviation of the network's outline from the edge of paint, px: 1 to 3 on renders."""
 
-_RUN_ON_M = 1.0  # beyond a dash, m, nothing is painted: gaps are at least as long as dashes
-_SURE_M = 0.2  # sigma up to which a point of a line tells on what line it is: a fifth of that
-_LONG, _PARALLEL = (
-    2.0,
-    0.9,
-)  # length by breadth of what may be a line's piece; cosine of two ways that are one
+_RUN_ON_M = 1.0  # length, m, beyond a dash without paint: gaps are at least as long as dashes
+_SURE_M = 0.2  # largest sigma, m, of a point that identifies its line
+_LONG, _PARALLEL = 2.0, 0.9  # least length over width of a line's piece, and cosine between it and the line
 
 BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
@@ -128,9 +125,9 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
 
 
 def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
-    """In how many images a solid line goes on within a metre of an end of each long quadrilateral (G, 4, 2).
+    """Number (G,) of images with a solid line within a metre of an end of long quadrilaterals (G, 4, 2).
 
-    Worn through, the start of such a line is a dash to look at.
+    The worn start of such a line looks like a dash.
     """
     count, images = (
         np.zeros(len(corners_map), dtype=np.int64),
@@ -159,7 +156,7 @@ def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntAr
 
 
 def _middle_lines(corners_map: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of quadrilaterals (G, 4, 2) the centres, the longer middle lines (G, 2) and the breadths (G,), m."""
+    """Centres and longer middle lines (G, 2), and widths (G,), m, of quadrilaterals (G, 4, 2)."""
     sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
     across = sides[:, 2:] - sides[:, :2]
     length_m = np.linalg.norm(across, axis=2)

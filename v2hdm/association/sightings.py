@@ -98,7 +98,7 @@ def collect_lines(
     camera_index: Mapping[str, int],
     frame_of_image: IntArray,
 ) -> Symbols:
-    """The pieces of solid lines that the images show, their centre lines in the place of outlines."""
+    """Pieces of solid lines in the images, with centre lines for outlines."""
     pieces = [
         (found.image, lane.kind, lane.points_px.astype(np.float64), np.zeros(0, dtype=np.bool_))
         for found in detections
@@ -115,7 +115,7 @@ def _as_symbols(
     camera_index: Mapping[str, int],
     frame_of_image: IntArray,
 ) -> Symbols:
-    """Images, classes, recorded pixels and seen sides as :class:`Symbols`."""
+    """Outlines (image, class, recorded pixels, seen sides) as :class:`Symbols`."""
     image = np.array([one[0] for one in outlines], dtype=np.int64)
     names = [drive.images[i].camera for i in image.tolist()]
     infos = [drive.cameras[name].info for name in names]

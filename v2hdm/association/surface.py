@@ -523,7 +523,7 @@ class Surface:
         return self._meet(view, frame, pixels, partial(self.seen_height_m, frame=frame))
 
     def _flat_with_jacobian(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
-        """:meth:`flattened_px` and rows of its derivative (K, 3, 2), by planes that touch the ground."""
+        """Rows (K, 3, 2) of :meth:`flattened_px` and its Jacobian, for planes tangent to the ground."""
         points, found = self._shown(view, frame, pixels)
         flat = np.where(found[:, None], view.on_plane_px(points, found), pixels)
         height_m, slope = self.seen_height_m(points, frame), np.empty_like(points)

@@ -32,7 +32,7 @@ def cross(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def turned_left(vectors: FloatArray) -> FloatArray:
-    """Vectors (..., 2) turned by 90 degrees from x towards y: to the left of headings in the map."""
+    """Vectors (..., 2) rotated by 90 degrees from x towards y: to the left of headings in the map."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
