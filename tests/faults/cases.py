@@ -332,6 +332,14 @@ def names() -> Iterator[Case]:
         if text:
             change = described(lambda content, text=text: content.update(name=text))
             yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
+        words = ("c.yaml", "--format", "urdf", "--output", "there")
+        yield Case(
+            f"calibration's camera: {name}",
+            "v2hdm export",
+            words,
+            _calibrated(text),
+            f"{says}|expected a text",
+        )
         if isinstance(text, str):
             yield exported(f"class in a map: {name}", _map_of_class(text), says)
         words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
@@ -512,6 +520,15 @@ def _folder_with(folder: str, name: str) -> Prepare:
 def _calibration(root: Path) -> None:
     info = camera_info("front", 320, 240)
     write_calibration(Calibration(info, looking_forward()), root / "c.yaml")
+
+
+def _calibrated(name: object) -> Prepare:
+    def prepare(root: Path) -> None:
+        _calibration(root)
+        content = yaml.safe_load((root / "c.yaml").read_text()) | {"camera_name": name}
+        (root / "c.yaml").write_text(yaml.safe_dump(content))
+
+    return prepare
 
 
 def _linked_map(root: Path) -> None:

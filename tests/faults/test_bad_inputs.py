@@ -14,9 +14,11 @@ from tests.faults.cases import all_cases, chunk_of_4_gb, damaged_inside
 from tests.faults.judge import HYDRA_DOORS, Case, judge
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
-from v2hdm.errors import DriveError, V2hdmError
+from v2hdm.errors import ConfigError, DriveError, V2hdmError
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text, shown, take_name
+from v2hdm.store.files import replace_text
+from v2hdm.store.inputs import protected_inputs
 
 CASES = all_cases()
 QUICK = [case for number, case in enumerate(CASES) if case.door not in HYDRA_DOORS or number % 8 == 0]
@@ -147,6 +149,18 @@ def test_what_is_whole_is_read(tmp_path, name):
     write, read = READERS[name]
     write(tmp_path / "file")
     assert read(tmp_path / "file") is not None
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_a_command_reads_it_does_not_write_over(tmp_path, name):
+    write, read = READERS[name]
+    write(tmp_path / "file")
+    before = (tmp_path / "file").read_bytes()
+    with protected_inputs():
+        read(tmp_path / "file")
+        with pytest.raises(ConfigError, match="is one of the inputs"):
+            replace_text(tmp_path / "file", "ours")
+    assert (tmp_path / "file").read_bytes() == before
 
 
 @pytest.mark.parametrize("read", [lambda path: read_text(path, DriveError), read_header])

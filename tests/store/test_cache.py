@@ -188,7 +188,8 @@ def test_neither_pickles_nor_arrays_of_objects_are_read(tmp_path):
         def __reduce__(self):
             return (Path.touch, (tmp_path / "escaped",))
 
-    for data in (pickle.dumps(Evil()), msgspec.msgpack.encode(["|O", [1], pickle.dumps(Evil())])):
+    texts = msgspec.msgpack.encode(["<U2", [1], b"12345678"])  # numpy itself would read these
+    for data in (pickle.dumps(Evil()), msgspec.msgpack.encode(["|O", [1], pickle.dumps(Evil())]), texts):
         with pytest.raises(CodecError):
             decode(data, np.ndarray)
     assert not list(tmp_path.iterdir())
