@@ -197,10 +197,10 @@ def flipped_png() -> bytes:
     return bytes(data)
 
 
-def chunk_of_4_gb() -> bytes:
-    """A PNG with an end, and before it a chunk that says it is longer than the file."""
+def chunk_of_4_gb(kind: bytes = b"IDAT") -> bytes:
+    """A PNG with a chunk that says it is longer than the file: one before the end, or the end itself."""
     data = picture(".png")
-    begin = data.index(b"IDAT") - 4
+    begin = data.index(kind) - 4
     return data[:begin] + struct.pack(">I", 0xF3002000) + data[begin + 4 :]
 
 
@@ -250,6 +250,7 @@ IMAGES: dict[str, tuple[bytes, str]] = {
     "half a jpeg": (picture()[:700], "truncated"),
     "half a png": (picture(".png")[:700], "truncated"),
     "png with a chunk of 4 GB": (chunk_of_4_gb(), "damaged"),
+    "png with an end of 4 GB": (chunk_of_4_gb(b"IEND"), "damaged"),
     "png with a flipped bit": (flipped_png(), "damaged"),
     "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
     "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),

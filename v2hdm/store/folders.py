@@ -229,7 +229,7 @@ def new_entry(folder: Path) -> Iterator[Path]:
     partial = folder.with_name(f".{folder.name}.{_WRITER}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        for left in folder.parent.glob(f".{folder.name}.*.part"):
+        for left in folder.parent.glob(f".{folder.name}.*-{'[0-9a-f]' * 8}.part"):
             if left == partial or is_stale(left):
                 shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
