@@ -394,6 +394,8 @@ def images() -> Iterator[Case]:
         for ending in (".mp4", ".avi", ".mkv"):
             files = both(write("a.mp4", SHORT_VIDEO), write(f"v{ending}", text))
             yield detects(f"video: {name}, {ending}", f"v{ending}", files, "nor a video|holds no")
+    named = both(write("a.mp4", SHORT_VIDEO), write("concat:a.mp4", "x"))
+    yield detects("video: a name that FFmpeg takes for a protocol", "concat:a.mp4", named, "nor a video")
 
 
 def _imgs(change: Change) -> Prepare:
